@@ -1,0 +1,58 @@
+"""Differentiable liquid-tank rigs and the controllers of five papers.
+
+    import jaxtank
+    from jaxtank import presets
+
+    case = presets.load("gouta2015").cases["backstepping"]
+    trajectory = jaxtank.simulate(case.loop, case.clock, save_every=10)
+    values = jaxtank.evaluate(case.loop, case.clock, ["rms_error_total", "max_level"])
+
+The one side effect of importing this package is an XLA option. A closed loop is a long scan over a handful of numbers, and
+XLA's CPU runtime dispatches every operation of such a loop by itself unless the loop counts as small; the option
+``xla_cpu_small_while_loop_byte_threshold`` lets any loop count as small, so that it is compiled to one function
+(about sixteen times faster in float64). It is appended to ``XLA_FLAGS`` and leaves what is there alone. Set
+``JAXTANK_XLA_OPTION=0`` before the import to leave XLA as it is.
+"""
+
+import importlib
+
+from jaxtank import _xla
+
+__version__ = "0.1.0"
+
+_xla.enable_small_loop_compilation()
+
+# Names are imported when they are first used: `jaxtank --help` must not wait for jax.
+_HOMES = {
+    "InputError": "jaxtank.errors",
+    "NonFiniteError": "jaxtank.errors",
+    "EquilibriumError": "jaxtank.errors",
+    "parameters": "jaxtank.tree",
+    "with_values": "jaxtank.tree",
+    "component": "jaxtank.tree",
+    "leaf": "jaxtank.tree",
+    "static": "jaxtank.tree",
+    "Clock": "jaxtank.records",
+    "Trajectory": "jaxtank.records",
+    "ClosedLoop": "jaxtank.loop",
+    "simulate": "jaxtank.loop",
+    "evaluate": "jaxtank.loop",
+    "sensitivities": "jaxtank.loop",
+    "check": "jaxtank.loop",
+}
+_ROOMS = ("analysis", "actuators", "controllers", "loop", "measures", "numerics", "observers", "plants", "plotting", "presets",
+          "records", "rig", "sensors", "signals", "tree")
+
+__all__ = [*_HOMES, *_ROOMS]
+
+
+def __getattr__(name):
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    if name in _ROOMS:
+        return importlib.import_module(f"jaxtank.{name}")
+    raise AttributeError(f"module 'jaxtank' has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted([*globals(), *__all__])

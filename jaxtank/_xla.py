@@ -1,0 +1,52 @@
+"""The XLA option that compiles a closed loop to one function."""
+
+import os
+import sys
+import warnings
+
+SWITCH = "JAXTANK_XLA_OPTION"
+KEY = "xla_cpu_small_while_loop_byte_threshold"
+OPTION = f"{KEY}=100000000000"
+_FLAG = "--xla_backend_extra_options="
+
+
+def append_option(flags):
+    """`flags` (the text of XLA_FLAGS) with the option added; what the user set, this option included, stays as it is."""
+    if KEY in flags:
+        return flags
+    words = flags.split()
+    for i in reversed(range(len(words))):  # XLA keeps the last of several such flags, so the option joins that one
+        if words[i].startswith(_FLAG):
+            words[i] = f"{words[i]},{OPTION}" if words[i] != _FLAG else _FLAG + OPTION
+            return " ".join(words)
+    return " ".join([*words, _FLAG + OPTION])
+
+
+def backend_started():
+    """True if jax has already read XLA_FLAGS, so that a change would come too late."""
+    if "jax" not in sys.modules:
+        return False
+    try:  # a private function: if it moves, the test of the compiled loop still tells whether the option took
+        from jax._src import xla_bridge
+
+        return bool(xla_bridge.backends_are_initialized())
+    except (ImportError, AttributeError):
+        return False
+
+
+def enable_small_loop_compilation():
+    """Append the option to XLA_FLAGS; warn once if jax has already started and cannot see it."""
+    if os.environ.get(SWITCH, "1").lower() in ("0", "off", "false", "no"):
+        return
+    before = os.environ.get("XLA_FLAGS", "")
+    after = append_option(before)
+    if after == before:
+        return
+    if backend_started():
+        warnings.warn(
+            "jax had started before jaxtank was imported, so the XLA option for fast loops could not be set: runs are correct but "
+            f"about 16 times slower. Import jaxtank before the first jax computation, or set {SWITCH}=0 to silence this.",
+            stacklevel=3,
+        )
+        return
+    os.environ["XLA_FLAGS"] = after

@@ -1,0 +1,128 @@
+"""What the pumps make of a command: saturation or allocation, dead zone, lag, transport delay, in this order."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.numerics import clip
+from jaxtank.tree import component, leaf, static
+
+SATURATIONS = ("clip", "boxqp")
+DEAD_ZONES = ("plain", "hysteresis", "pulse")
+
+
+class ActuatorState(NamedTuple):
+    """Memory of the pumps: tuples with one entry per pump, empty where a feature is off."""
+
+    running: tuple  # 1.0 while a pump with hysteresis turns
+    owed: tuple  # volt-seconds the pulse compensation still owes [V s]
+    lagged: tuple  # voltage behind the lag [V]
+    line: tuple  # (delay samples,) ring buffer of each pump [V]
+    head: Any  # where the ring buffers are read and written
+
+
+@component
+class PumpBank:
+    """m pumps: what reaches the plant for a command u.
+
+    1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
+       best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
+    2. Dead zone: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V; 0: none). "hysteresis": a pump that turns stops
+       below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
+       volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
+    3. Lag: first order with time constant `lag` [s], exact over a sample.  4. Transport delay: `delay` [s], whole samples.
+
+    The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its edge, and through "pulse" it is
+    that of the mean flow, 1.
+    """
+
+    low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
+    high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
+    dead_zone: np.ndarray = leaf("V", "(m,) voltage at or below which a pump stands still; 0: none", low=0.0)
+    stop: np.ndarray = leaf("V", "(m,) voltage below which a turning pump stops (hysteresis)", low=0.0)
+    pulse: np.ndarray = leaf("V", "(m,) voltage of the pulses that replace a dead zone (pulse)", low=0.0, strict=True)
+    lag: np.ndarray = leaf("s", "(m,) time constant of each pump; 0: none", low=0.0)
+    initial: np.ndarray = leaf("V", "(m,) voltage at which the pumps ran before t = 0")
+    delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
+    saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")
+    dead_zone_kind: str = static("-", "what the dead zone does", choices=DEAD_ZONES, default="plain")
+
+    @property
+    def pumps(self):
+        """Number of pumps m [-]."""
+        return np.shape(self.low)[-1]
+
+    def init(self, clock):
+        """State before the first sample: pumps turning steadily at `initial`."""
+        pumps, delay = range(self.pumps), round(self.delay / clock.dt)
+        start = tuple(self.initial[i] for i in pumps)
+        zero = tuple(0.0 * s for s in start)
+        return ActuatorState(
+            running=tuple(z + 1.0 for z in zero) if self.dead_zone_kind == "hysteresis" else (),
+            owed=zero if self.dead_zone_kind == "pulse" else (),
+            lagged=start,
+            line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
+            head=jnp.int32(0),
+        )
+
+    def step(self, state, command, metric, dt):
+        """((m) voltages at the plant [V], new state) for a command (m) [V]; metric: (g11, g12, g22) for "boxqp", or None."""
+        if self.saturation == "boxqp":
+            u = allocate(command, metric, self.low, self.high)
+        else:
+            u = tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+        u, state = self._dead_zone(state, u, dt)
+        # a lag of 0 s follows at once: exp(-dt/lag) is taken at a harmless lag and dropped
+        slow = [self.lag[i] > 0 for i in range(self.pumps)]
+        keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
+        u = tuple(u[i] + keep[i] * (state.lagged[i] - u[i]) for i in range(self.pumps))
+        state = state._replace(lagged=u)
+        if state.line:
+            head = state.head
+            out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)
+            line = tuple(jax.lax.dynamic_update_index_in_dim(line, v, head, 0) for line, v in zip(state.line, u))
+            state = state._replace(line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1))
+            u = out
+        return u, state
+
+    def _dead_zone(self, state, u, dt):
+        if self.dead_zone_kind == "hysteresis":
+            running = tuple(
+                jnp.where(jnp.where(r > 0.5, v >= self.stop[i], v > self.dead_zone[i]), 1.0, 0.0)
+                for i, (v, r) in enumerate(zip(u, state.running))
+            )
+            return tuple(jnp.where(r > 0.5, v, 0.0) for v, r in zip(u, running)), state._replace(running=running)
+        if self.dead_zone_kind == "pulse":
+            paid, owed = [], []
+            for i, v in enumerate(u):
+                due = v + state.owed[i] / dt
+                turning = v > self.dead_zone[i]
+                pay = jnp.where(turning, v, jnp.where(due >= self.pulse[i], self.pulse[i], 0.0))
+                owed.append(jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt)))
+                paid.append(v + jax.lax.stop_gradient(pay - v))
+            return tuple(paid), state._replace(owed=tuple(owed))
+        return tuple(jnp.where((v > self.dead_zone[i]) | (self.dead_zone[i] <= 0), v, 0.0) for i, v in enumerate(u)), state
+
+
+def allocate(command, metric, low, high):
+    """The voltages in the box that are best by the law's cost: argmin over w in [low, high]^2 of (w - u)' G (w - u).
+
+    command: u (2) [V]; metric: (g11, g12, g22), G positive definite; low, high: (2,) [V]. For the predictive law of gouta2015
+    G = b'b makes this the exact constrained minimiser of its cost (eq. 21; spec 5.4). Solved by trying the four faces of the
+    box and keeping the cheapest; a command inside the box is kept. Raises ValueError for other than two pumps.
+    """
+    if len(command) != 2:
+        raise ValueError(f"allocation by box QP is for two pumps, not {len(command)}")
+    (a, b), (g11, g12, g22) = command, metric
+    best_x, best_y, best = clip(a, low[0], high[0]), clip(b, low[1], high[1]), jnp.inf
+    inside = (a >= low[0]) & (a <= high[0]) & (b >= low[1]) & (b <= high[1])
+    faces = [(x, clip(b - g12 / g22 * (x - a), low[1], high[1])) for x in (low[0], high[0])]
+    faces += [(clip(a - g12 / g11 * (y - b), low[0], high[0]), y) for y in (low[1], high[1])]
+    for x, y in faces:
+        p, q = x - a, y - b
+        cost = g11 * p * p + 2.0 * g12 * p * q + g22 * q * q
+        better = cost < best
+        best_x, best_y, best = jnp.where(better, x, best_x), jnp.where(better, y, best_y), jnp.where(better, cost, best)
+    return jnp.where(inside, a, best_x), jnp.where(inside, b, best_y)

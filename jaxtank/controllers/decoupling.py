@@ -1,0 +1,95 @@
+"""The inner inversion that both laws of gouta2015 share: from demanded output accelerations to voltages."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.errors import InputError
+from jaxtank.numerics import at_least
+from jaxtank.plants.network import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
+from jaxtank.signals import Constant, Ramps
+
+
+class Coefficients(NamedTuple):
+    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (spec E1) [cm^0.5/s]; c8, c10 [cm/(V s)]."""
+
+    c1: Any
+    c2: Any
+    c3: Any
+    c4: Any
+    c5: Any
+    c6: Any
+    c7: Any
+    c8: Any
+    c9: Any
+    c10: Any
+
+    @property
+    def alpha(self):
+        """alpha = (c2 c6 - c3 c5) / 2 [cm/s^2], the determinant of the decoupling matrix without its roots."""
+        return 0.5 * (self.c2 * self.c6 - self.c3 * self.c5)
+
+
+def coefficients(model):
+    """The paper's c1 .. c10 of a state-coupled `TankNetwork`."""
+    s31, s32, s41, s42 = (model.orifice[i] for i in range(4))
+    a1, a2, a3, a4 = (model.area[i] for i in range(4))
+    w = jnp.sqrt(2.0 * model.gravity)
+    return Coefficients(
+        c1=model.drain[0] * w / a1,
+        c2=s31 * w / a1,
+        c3=s41 * w / a1,
+        c4=model.drain[1] * w / a2,
+        c5=s32 * w / a2,
+        c6=s42 * w / a2,
+        c7=(s31 + s32) * w / a3,
+        c8=model.pump_gain[0] / a3,
+        c9=(s41 + s42) * w / a4,
+        c10=model.pump_gain[1] / a4,
+    )
+
+
+def floored_roots(levels, floor):
+    """sqrt(max(h, floor)) of each level. The floor keeps roots and their inverses finite where a tank is dry or noise makes a
+    level negative. The law multiplies by the roots of the upper levels, so with a dry tank its command is zero and stays so: a
+    floor of about 1 cm lets it restart (spec 9)."""
+    return tuple(jnp.sqrt(at_least(h, floor)) for h in levels)
+
+
+def decouple(c, s3, s4, v1, v2):
+    """Voltages (u1, u2) that give the outputs the accelerations v (gouta2015 eqs. 28, 48): b^-1 (v - g), division-free.
+
+        u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8,   u2 likewise
+
+    c: Coefficients; s3, s4: roots of the upper levels [cm^0.5]; v1, v2 [cm/s^2] without the terms of the lower outlets.
+    Never forms b, whose entries grow as 1/sqrt(h) while its inverse stays finite.
+    """
+    a = c.alpha
+    u1 = s3 * ((c.c6 * v1 - c.c3 * v2) / a + c.c7) / c.c8
+    u2 = s4 * ((c.c2 * v2 - c.c5 * v1) / a + c.c9) / c.c10
+    return u1, u2
+
+
+def input_metric(c, s3, s4):
+    """(g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10) (gouta2015 eq. 26; spec 5.4)."""
+    p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
+    return p * p * (c.c2**2 + c.c5**2), p * q * (c.c2 * c.c3 + c.c5 * c.c6), q * q * (c.c3**2 + c.c6**2)
+
+
+def check_state_coupled(model, reference):
+    """Raise InputError unless `model` is a state-coupled four-tank and the reference stays above zero (the laws take sqrt(r))."""
+    if model.links != STATE_COUPLED_LINKS or model.feeds != STATE_COUPLED_FEEDS or model.outputs != (0, 1):
+        raise InputError("controller.model must be a state-coupled four-tank (plants.state_coupled_four_tank): this law inverts it")
+    c = coefficients(model)
+    determinant, scale = 2.0 * float(c.alpha), float(abs(c.c2 * c.c6) + abs(c.c3 * c.c5))
+    if not abs(determinant) > 1e-9 * scale:
+        raise InputError(
+            f"controller.model.orifice = {np.asarray(model.orifice)} cm^2: the upper tanks pour into the lower ones in the same "
+            "proportion, so the outputs cannot be moved apart"
+        )
+    named = {Ramps: ("initial", "targets"), Constant: ("level",)}.get(type(reference), ())
+    for field in named:
+        for i, level in enumerate(np.asarray(getattr(reference, field), dtype=float)):
+            if not level > 0:
+                raise InputError(f"reference.{field}[{i}] = {level:g} cm: must be above 0 cm (the law takes its square root)")

@@ -1,0 +1,39 @@
+"""Nonlinear generalised predictive control (gouta2015, sec. 3)."""
+
+from jaxtank.controllers.base import Controller
+from jaxtank.controllers.decoupling import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.plants.base import Plant
+from jaxtank.tree import component, leaf
+
+
+@component
+class NGPC(Controller):
+    """Closed-form predictive law of gouta2015, eq. (28), for the state-coupled four-tank.
+
+        v_i = r''_i - K1 e_i - K2 e'_i + c_i z'_i / (2 sqrt(h_i)),   e = h - r,  K1 = 10/(3 Tp^2),  K2 = 5/(2 Tp)
+
+    followed by the inversion of `decoupling.decouple`. z'_i is the level rate the model predicts (no differentiation). Without
+    saturation the loop is exactly e'' + K2 e' + K1 e = 0: damping 0.685, natural frequency 1.826/Tp.
+    """
+
+    model: Plant
+    Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
+    level_floor: float = leaf("cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True)
+
+    def step(self, state, tick, estimate):
+        c = coefficients(self.model)
+        (h1, h2, _, _), (r1, r2) = estimate.x, tick.r
+        s1, s2, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        k1, k2 = (10.0 / 3.0) / (self.Tp * self.Tp), 2.5 / self.Tp  # K1 [1/s^2], K2 [1/s]
+        z1 = c.c2 * s3 + c.c3 * s4 - c.c1 * s1  # modelled h1' [cm/s]
+        z2 = c.c5 * s3 + c.c6 * s4 - c.c4 * s2  # modelled h2'
+        v1 = tick.ddr[0] - k1 * (h1 - r1) - k2 * (z1 - tick.dr[0]) + 0.5 * c.c1 * z1 / s1
+        v2 = tick.ddr[1] - k1 * (h2 - r2) - k2 * (z2 - tick.dr[1]) + 0.5 * c.c4 * z2 / s2
+        return decouple(c, s3, s4, v1, v2), state
+
+    def input_metric(self, estimate):
+        _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
+        return input_metric(coefficients(self.model), s3, s4)
+
+    def check(self, reference):
+        check_state_coupled(self.model, reference)

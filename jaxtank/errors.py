@@ -1,0 +1,29 @@
+"""Errors at the door: one line that names the thing, its value, what is allowed, and the nearest valid name."""
+
+import difflib
+
+
+class InputError(ValueError):
+    """Something a user gave cannot be used. The message is one line; the command line ends with exit code 2."""
+
+
+class EquilibriumError(InputError):
+    """No steady state has the outputs asked for. The message names the tank or pump in the way."""
+
+
+class NonFiniteError(ArithmeticError):
+    """A run produced NaN or infinity. The message gives the time, the tank and the parameters of the run."""
+
+
+def nearest(name, names, count=3):
+    """The `count` names closest to `name`, as the tail of an error message."""
+    names = list(names)
+    close = difflib.get_close_matches(name, names, n=count, cutoff=0.3) or sorted(
+        names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio()
+    )[:count]
+    return f"; nearest: {', '.join(close)}" if close else ""
+
+
+def unknown(kind, name, names):
+    """An InputError for an unknown name, with the nearest valid ones."""
+    return InputError(f"unknown {kind} {name!r}{nearest(name, names)}")

@@ -1,0 +1,260 @@
+"""What is said of a run in numbers, folded into the time loop: memory does not grow with the number of samples.
+
+A measure reads accumulators at the end of a run. An accumulator starts from a state, is updated at every sample, and holds tuples of
+scalars. Only the accumulators that the requested measures need are carried.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxtank.errors import unknown
+from jaxtank.numerics import at_least
+
+BAND = 0.05
+"""Half width of the settling band, as a share of the step [-]."""
+
+
+class Run(NamedTuple):
+    """Sizes and constants of a run, for accumulators and measures."""
+
+    tanks: int
+    outputs: int
+    pumps: int
+    samples: int
+    dt: float  # [s]
+    low: tuple  # lower limit of each pump [V]
+    high: tuple  # upper limit of each pump [V]
+    rim: tuple  # rim of each tank [cm]
+    zero: Any  # 0.0 of the run's type
+
+
+class Accumulator(NamedTuple):
+    """start(run) -> state; update(run, state, sample, window) -> state, at every sample."""
+
+    start: Callable
+    update: Callable
+
+
+class Measure(NamedTuple):
+    """A named number or list: read(run, {accumulator: state}) -> scalar or array."""
+
+    unit: str  # with "cm" standing for the rig's length unit
+    per: str  # "run", "output", "tank" or "pump"
+    needs: tuple  # names of accumulators
+    read: Callable
+    doc: str
+    windows: bool = False  # needs Ramps.windows: the target and step each sample refers to
+
+
+def _filled(run, count, value):
+    return (run.zero + value,) * count
+
+
+def _sum(size, term):
+    """Accumulator of sums over the run: `term(run, sample)` gives one number per output, tank or pump."""
+
+    def update(run, state, sample, window):
+        return tuple(s + v for s, v in zip(state, term(run, sample)))
+
+    return Accumulator(lambda run: _filled(run, size(run), 0.0), update)
+
+
+def _extreme(size, pick, better, worst):
+    """Accumulator of (extreme, time it was reached), one pair per output, tank or pump; the first sample wins a tie."""
+
+    def update(run, state, sample, window):
+        new = []
+        for (value, time), v in zip(state, pick(run, sample, window)):
+            take = better(v, value)
+            new.append((jnp.where(take, v, value), jnp.where(take, sample.t, time)))
+        return tuple(new)
+
+    return Accumulator(lambda run: tuple((run.zero + worst, run.zero) for _ in range(size(run))), update)
+
+
+def _excess(run, command):
+    """How far a command is outside its limits [V], 0 inside."""
+    return tuple(
+        jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0)) for v, low, high in zip(command, run.low, run.high)
+    )
+
+
+def _saturation_excess(run, sample):
+    # x/(1+x) of x = excess / span: spec 10 of gouta2015; bounded, so that one wild sample does not rule a cost
+    span = tuple(high - low for low, high in zip(run.low, run.high))
+    return tuple(x / (s + x) for x, s in zip(_excess(run, sample.command), span))
+
+
+def _outside(run, sample):
+    return tuple(
+        jnp.where((v < low) | (v > high), 1.0, 0.0) for v, low, high in zip(sample.command, run.low, run.high)
+    )
+
+
+def _overshoot(run, sample, window):
+    """Level past the target in the direction of the step, as a share of the step [-]; -1 where there is no step yet."""
+    return tuple(
+        jnp.where(step == 0.0, -1.0, (r + e - target) / jnp.where(step == 0.0, 1.0, step))
+        for (target, step, _), r, e in zip(window, sample.r, sample.e)
+    )
+
+
+def _unsettled(run, sample, window):
+    """Time since the change ended, while the output is outside the band [s]; a large negative number inside it."""
+    return tuple(
+        jnp.where((step != 0.0) & (jnp.abs(r + e - target) > BAND * jnp.abs(step)), since, -1e9)
+        for (target, step, since), r, e in zip(window, sample.r, sample.e)
+    )
+
+
+def _start_rise(run):
+    return tuple((run.zero, run.zero - 1.0, run.zero - 1.0, run.zero) for _ in range(run.outputs))
+
+
+def _update_rise(run, state, sample, window):
+    """Per output (target now, time of the first 10 %, time of the first 90 %, longest rise so far)."""
+    new = []
+    for (old, t10, t90, longest), (target, step, _), r, e in zip(state, window, sample.r, sample.e):
+        fresh = target != old
+        t10, t90 = jnp.where(fresh, -1.0, t10), jnp.where(fresh, -1.0, t90)
+        done = jnp.where(step == 0.0, 0.0, 1.0 + (r + e - target) / jnp.where(step == 0.0, 1.0, step))
+        t10 = jnp.where((t10 < 0) & (done >= 0.1), sample.t, t10)
+        reached = (t90 < 0) & (done >= 0.9)
+        t90 = jnp.where(reached, sample.t, t90)
+        longest = jnp.where(reached & (sample.t - t10 > longest), sample.t - t10, longest)
+        new.append((target, t10, t90, longest))
+    return tuple(new)
+
+
+def _update_travel(run, state, sample, window):
+    previous, total, first = state
+    step = tuple(jnp.abs(v - p) for v, p in zip(sample.u, previous))
+    return sample.u, tuple(s + jnp.where(first, 0.0, d) for s, d in zip(total, step)), jnp.zeros_like(first)
+
+
+ACCUMULATORS = {
+    "e2": _sum(lambda run: run.outputs, lambda run, s: tuple(e * e for e in s.e)),
+    "abs_e": _sum(lambda run: run.outputs, lambda run, s: tuple(jnp.abs(e) for e in s.e)),
+    "u2": _sum(lambda run: run.pumps, lambda run, s: tuple(u * u for u in s.u)),
+    "estimate2": _sum(lambda run: run.tanks, lambda run, s: tuple((a - b) * (a - b) for a, b in zip(s.x_hat, s.x))),
+    "outside": _sum(lambda run: run.pumps, _outside),
+    "saturation_excess": _sum(lambda run: run.pumps, _saturation_excess),
+    "over_rim2": _sum(lambda run: run.tanks, lambda run, s: tuple(at_least(x - h, 0.0) ** 2 for x, h in zip(s.x, run.rim))),
+    "spilled": _sum(lambda run: run.tanks, lambda run, s: s.spilled),
+    "max_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a > b, -jnp.inf),
+    "min_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf),
+    "max_error": _extreme(lambda run: run.outputs, lambda run, s, w: tuple(jnp.abs(e) for e in s.e), lambda a, b: a > b, -jnp.inf),
+    "overshoot": _extreme(lambda run: run.outputs, _overshoot, lambda a, b: a > b, -1.0),
+    "unsettled": _extreme(lambda run: run.outputs, _unsettled, lambda a, b: a > b, -1e9),
+    "rise": Accumulator(_start_rise, _update_rise),
+    "travel": Accumulator(
+        lambda run: (_filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0), _update_travel
+    ),
+}
+
+
+def _mean(run, values):
+    return tuple(v / run.samples for v in values)
+
+
+def _list(values):
+    return jnp.stack([jnp.asarray(v) for v in values])
+
+
+def _root_mean(name):
+    return lambda run, acc: jnp.sqrt(_list(_mean(run, acc[name])))
+
+
+def _extremes(name, index=0):
+    return lambda run, acc: _list([pair[index] for pair in acc[name]])
+
+
+def _per_run(name, scale):
+    return lambda run, acc: _list([s * scale(run) for s in acc[name]])
+
+
+def _settling(run, acc):
+    settled = _list([pair[0] for pair in acc["unsettled"]])
+    return jnp.where(settled < -1e8, jnp.nan, settled)
+
+
+def _rise(run, acc):
+    longest = _list([state[3] for state in acc["rise"]])
+    return jnp.where(longest > 0, longest, jnp.nan)
+
+
+def _overshoot_percent(run, acc):
+    return 100.0 * at_least(_extremes("overshoot")(run, acc), 0.0)
+
+
+MEASURES = {
+    "rms_error": Measure("cm", "output", ("e2",), _root_mean("e2"), "root mean square tracking error"),
+    "rms_error_total": Measure(
+        "cm", "run", ("e2",), lambda run, acc: jnp.sqrt(sum(_mean(run, acc["e2"]))), "root of the mean squared errors of all outputs, summed"
+    ),
+    "ise": Measure("cm^2 s", "output", ("e2",), _per_run("e2", lambda run: run.dt), "integral of the squared error"),
+    "iae": Measure("cm s", "output", ("abs_e",), _per_run("abs_e", lambda run: run.dt), "integral of the absolute error"),
+    "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
+    "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square voltage"),
+    "input_travel": Measure("V", "pump", ("travel",), lambda run, acc: _list(acc["travel"][1]), "sum of the absolute changes of voltage"),
+    "saturated_fraction": Measure(
+        "-", "pump", ("outside",), _per_run("outside", lambda run: 1.0 / run.samples), "share of samples commanded outside the limits"
+    ),
+    "saturation_excess": Measure(
+        "-", "run", ("saturation_excess",), lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
+        "mean of x/(1+x), x = voltage commanded outside the limits over their span",
+    ),
+    "max_level": Measure("cm", "tank", ("max_level",), _extremes("max_level"), "highest level"),
+    "min_level": Measure("cm", "tank", ("min_level",), _extremes("min_level"), "lowest level"),
+    "rms_over_rim": Measure(
+        "cm", "run", ("over_rim2",), lambda run, acc: jnp.sqrt(at_least(sum(_mean(run, acc["over_rim2"])), 1e-30)),
+        "root of the mean squared rise past the rims, summed over tanks",
+    ),
+    "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
+    "overshoot_percent": Measure(
+        "%", "output", ("overshoot",), _overshoot_percent, "worst overshoot of a change, in percent of it", windows=True
+    ),
+    "rise_time": Measure("s", "output", ("rise",), _rise, "longest time from 10 % to 90 % of a change", windows=True),
+    "settling_time": Measure(
+        "s", "output", ("unsettled",), _settling,
+        "longest time from the end of a change until its last sample outside +-5 % of it; negative: in the band before the change ended",
+        windows=True,
+    ),
+    "estimation_rms": Measure("cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"),
+    "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
+}
+
+
+def check_names(names):
+    """Raise InputError for a name that is no measure."""
+    for name in names:
+        if name not in MEASURES:
+            raise unknown("measure", name, MEASURES)
+
+
+def needs(names):
+    """The accumulators that `names` need, in a fixed order."""
+    wanted = {a for name in names for a in MEASURES[name].needs}
+    return tuple(a for a in ACCUMULATORS if a in wanted)
+
+
+def wants_windows(names):
+    """True if a measure in `names` refers to the reference's changes."""
+    return any(MEASURES[name].windows for name in names)
+
+
+def start(run, names):
+    """{accumulator: state} before the first sample."""
+    return {a: ACCUMULATORS[a].start(run) for a in needs(names)}
+
+
+def update(run, states, sample, window):
+    """{accumulator: state} after `sample`."""
+    return {a: ACCUMULATORS[a].update(run, state, sample, window) for a, state in states.items()}
+
+
+def read(run, states, names):
+    """{measure: value} at the end of a run."""
+    return {name: MEASURES[name].read(run, states) for name in names}

@@ -1,0 +1,5 @@
+"""Observers: what the law believes the levels are."""
+
+from jaxtank.observers.base import Direct, Observer
+
+__all__ = ["Direct", "Observer"]

@@ -1,0 +1,35 @@
+"""The papers, one file each: rigs, cases, published numbers, what may be tuned, what is uncertain, departures.
+
+    preset = presets.load("gouta2015")
+    case = preset.cases["backstepping"]     # .loop .clock .limits
+"""
+
+import importlib
+
+from jaxtank.errors import InputError, unknown
+from jaxtank.presets.base import Case, Free, Preset
+
+PAPERS = ("gouta2015",)
+
+
+def load(paper):
+    """The Preset of `paper`, one of PAPERS. Raises InputError for another name."""
+    if paper not in PAPERS:
+        raise unknown("paper", paper, PAPERS)
+    return importlib.import_module(f"jaxtank.presets.{paper}").preset()
+
+
+def names():
+    """Every case as "paper/case", in the order of the papers."""
+    return [f"{paper}/{case}" for paper in PAPERS for case in load(paper).cases]
+
+
+def find(name):
+    """The Case of "paper/case". Raises InputError for an unknown one, with the nearest names."""
+    paper, _, case = name.partition("/")
+    if paper in PAPERS and case in (cases := load(paper).cases):
+        return cases[case]
+    raise unknown("case", name, names())
+
+
+__all__ = ["PAPERS", "Case", "Free", "InputError", "Preset", "find", "load", "names"]

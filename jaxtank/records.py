@@ -1,0 +1,93 @@
+"""The records that cross rooms, and the clock."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+
+from jaxtank.errors import InputError
+
+INTEGRATORS = ("rk4", "midpoint")
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Clock:
+    """When the law samples and how the plant is integrated between samples.
+
+    dt: sampling period of the law (Ts) [s]; duration: length of the run [s]; substeps: integrator steps per sample [-];
+    integrator: "rk4" (fourth order) or "midpoint" (second order). Sample k is at t_k = k dt, k = 0 .. duration/dt.
+    """
+
+    dt: float = 0.01
+    duration: float = 1200.0
+    substeps: int = 1
+    integrator: str = "rk4"
+
+    @property
+    def samples(self):
+        """Number of samples of a run, both ends included [-]."""
+        return round(self.duration / self.dt) + 1
+
+
+CLOCK_UNITS = {"dt": "s", "duration": "s", "substeps": "-", "integrator": "-"}
+LARGEST_RUN = 100_000_000  # samples
+
+
+def check_clock(clock):
+    """Raise InputError unless the clock describes a run."""
+    for name in ("dt", "duration"):
+        value = getattr(clock, name)
+        if not (isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")):
+            raise InputError(f"clock.{name} = {value!r} s: must be a finite number above 0 s")
+    if clock.dt > clock.duration:
+        raise InputError(f"clock.dt = {clock.dt:g} s: must be at most clock.duration = {clock.duration:g} s")
+    if clock.samples > LARGEST_RUN:
+        raise InputError(f"clock.duration / clock.dt = {clock.samples - 1} samples: must be at most {LARGEST_RUN}")
+    if not isinstance(clock.substeps, int) or isinstance(clock.substeps, bool) or not 1 <= clock.substeps <= 1000:
+        raise InputError(f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 1000")
+    if clock.integrator not in INTEGRATORS:
+        raise InputError(f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
+
+
+class Tick(NamedTuple):
+    """What a law is told at sample k besides the estimate: tuples of scalars, one per output."""
+
+    t: Any  # time [s]
+    r: tuple  # setpoint r [cm]
+    dr: tuple  # its rate r' [cm/s]
+    ddr: tuple  # its second derivative r'' [cm/s^2]
+
+
+class Estimate(NamedTuple):
+    """What an observer hands to a law: tuples of scalars."""
+
+    x: tuple  # level estimate, one per tank [cm]
+
+
+class Sample(NamedTuple):
+    """The world at t_k, before it moves: tuples of scalars."""
+
+    t: Any  # time [s]
+    x: tuple  # levels, one per tank [cm]
+    y: tuple  # measured levels, one per tank [cm]
+    x_hat: tuple  # estimated levels, one per tank [cm]
+    r: tuple  # setpoint, one per output [cm]
+    e: tuple  # tracking error of the true output, x - r, one per output [cm]
+    command: tuple  # what the law asked for, one per pump [V]
+    u: tuple  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
+    spilled: tuple  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
+
+
+class Trajectory(NamedTuple):
+    """A run for people: arrays with one row per saved sample. Row k is the world at t_k before it moves."""
+
+    t: Any  # (rows,) [s]
+    x: Any  # (rows, tanks) [cm]
+    y: Any  # (rows, tanks) [cm]
+    x_hat: Any  # (rows, tanks) [cm]
+    r: Any  # (rows, outputs) [cm]
+    e: Any  # (rows, outputs) [cm]
+    command: Any  # (rows, pumps) [V]
+    u: Any  # (rows, pumps) [V]
+    spilled: Any  # (rows, tanks) volume lost over the rim since the start [cm^3]

@@ -1,0 +1,38 @@
+"""What the computer sees of the levels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.numerics import clip, quantise
+from jaxtank.tree import component, leaf, static
+
+
+@component
+class LevelSensor:
+    """One level sensor per tank: noise, then an ADC where `bits` is not 0.
+
+        y = h + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale], rounded to full_scale / 2^bits
+
+    The ADC's slope is that of the line through its staircase (numerics.quantise).
+    """
+
+    gain: np.ndarray = leaf("cm/V", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
+    noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
+    full_scale: np.ndarray = leaf("V", "range of the ADC", low=0.0, strict=True)
+    bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
+
+    def draw(self, key, samples):
+        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key."""
+        if key is None:
+            return None
+        deviates = jax.random.normal(key, (np.shape(self.noise)[-1], samples), dtype=jnp.result_type(float))
+        return tuple(deviates[i] for i in range(deviates.shape[0]))
+
+    def read(self, x, xi):
+        """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or None."""
+        y = x if xi is None else tuple(x[i] + self.noise[i] * xi[i] for i in range(len(x)))
+        if self.bits == 0:
+            return y
+        step = self.full_scale / 2**self.bits
+        return tuple(quantise(clip(y[i] / self.gain[i], 0.0, self.full_scale), step) * self.gain[i] for i in range(len(y)))

@@ -1,0 +1,147 @@
+"""References and disturbances as functions of time, sampled before the time loop starts.
+
+A signal answers `sample(clock)` with three tuples (value, rate, second derivative), one array (samples,) per channel. The
+samples are inputs of the loop: interpolating inside it would cost more than the plant does.
+"""
+
+import abc
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.errors import InputError
+from jaxtank.tree import component, leaf, number, static
+
+SHAPES = ("linear", "quintic")
+
+
+def sample_times(clock):
+    """(samples,) times t_k = k dt [s], from the integer k: no drift over long runs."""
+    return jnp.arange(clock.samples) * clock.dt
+
+
+class Signal(abc.ABC):
+    """A signal of one or more channels."""
+
+    @property
+    @abc.abstractmethod
+    def channels(self):
+        """Number of channels [-]."""
+
+    @abc.abstractmethod
+    def sample(self, clock):
+        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel."""
+
+
+@component
+class Constant(Signal):
+    """A signal that does not change."""
+
+    level: np.ndarray = leaf("cm", "(channels,) value")
+
+    @property
+    def channels(self):
+        return np.shape(self.level)[0]
+
+    def sample(self, clock):
+        zero = jnp.zeros(clock.samples)
+        flat = (zero,) * self.channels
+        return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
+
+
+@component
+class Ramps(Signal):
+    """Plateaus joined by ramps or S-curves: the trapezoidal benchmark of gouta2015 (sec. 5, Fig. 5).
+
+        r(t) = initial + sum_j (target_j - value before) S((t - t_j) / D)
+
+    S(x) is x (shape "linear"; rate Delta/D on [t_j, t_j + D), second derivative 0, the impulses at the corners left out) or
+    10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held at 0 before and 1 after. D = 0 gives steps.
+    """
+
+    initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
+    targets: np.ndarray = leaf("cm", "(changes,) value after each change")
+    changes: tuple = static(doc="((time [s], channel), ...) in order of time")
+    ramp: float = static("s", "duration D of every change", low=0.0, default=60.0)
+    shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
+
+    @property
+    def channels(self):
+        return np.shape(self.initial)[0]
+
+    def sample(self, clock):
+        t = sample_times(clock)
+        last = [self.initial[i] for i in range(self.channels)]
+        value = [level + jnp.zeros_like(t) for level in last]
+        rate = [jnp.zeros_like(t) for _ in last]
+        second = [jnp.zeros_like(t) for _ in last]
+        for j, (start, i) in enumerate(self.changes):
+            delta = self.targets[j] - last[i]
+            s, ds, dds = _course((t - start) + 1e-7 * clock.dt, self.ramp, self.shape)
+            value[i], rate[i], second[i] = value[i] + delta * s, rate[i] + delta * ds, second[i] + delta * dds
+            last[i] = self.targets[j]
+        return tuple(value), tuple(rate), tuple(second)
+
+    def windows(self, clock):
+        """Per channel (target, step, time since the change ended), each (samples,): what overshoot and settling refer to.
+
+        Before a channel's first change the step is 0. Times in s, levels in cm.
+        """
+        t = sample_times(clock)
+        last = [self.initial[i] for i in range(self.channels)]
+        target = [level + jnp.zeros_like(t) for level in last]
+        step = [jnp.zeros_like(t) for _ in last]
+        since = [jnp.zeros_like(t) for _ in last]
+        for j, (start, i) in enumerate(self.changes):
+            after = t >= start - 1e-7 * clock.dt
+            target[i] = jnp.where(after, self.targets[j], target[i])
+            step[i] = jnp.where(after, self.targets[j] - last[i], step[i])
+            since[i] = jnp.where(after, t - (start + self.ramp), since[i])
+            last[i] = self.targets[j]
+        return tuple(zip(target, step, since))
+
+    def plateaus(self):
+        """(plateaus, channels) the values between changes, as host numbers: each change taken as finished."""
+        values, now = [], np.array(self.initial, dtype=float)
+        values.append(now.copy())
+        by_time = {}
+        for j, (start, i) in enumerate(self.changes):
+            by_time.setdefault(start, []).append((i, float(self.targets[j])))
+        for start in sorted(by_time):
+            for i, target in by_time[start]:
+                now[i] = target
+            values.append(now.copy())
+        return np.array(values)
+
+
+def ramps(initial, changes, ramp=60.0, shape="linear"):
+    """A `Ramps` from a list of (time [s], channel, target [cm]). Raises InputError for a bad time, channel or shape."""
+    changes = sorted(changes, key=lambda change: change[0])
+    for time, channel, _ in changes:
+        if not 0 <= channel < len(initial):
+            raise InputError(f"reference change at {time:g} s names channel {channel}: there are {len(initial)}, counted from 0")
+        if not time >= 0:
+            raise InputError(f"reference change at {time} s: must be at or after 0 s")
+    if shape not in SHAPES:
+        raise InputError(f"reference.shape = {shape!r}: must be one of {', '.join(SHAPES)}")
+    return Ramps(
+        initial=number(initial),
+        targets=number([target for _, _, target in changes]),
+        changes=tuple((float(time), int(channel)) for time, channel, _ in changes),
+        ramp=float(ramp),
+        shape=shape,
+    )
+
+
+def _course(since, duration, shape):
+    """S(x), S', S'' of a change that began `since` seconds ago (negative: not yet)."""
+    if duration == 0.0:
+        return jnp.where(since >= 0, 1.0, 0.0), jnp.zeros_like(since), jnp.zeros_like(since)
+    inside = (since >= 0) & (since < duration)
+    x = jnp.where(inside, since / duration, jnp.where(since < 0, 0.0, 1.0))
+    if shape == "linear":
+        return x, jnp.where(inside, 1.0 / duration, 0.0), jnp.zeros_like(x)
+    s = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+    ds = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration
+    dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / duration**2
+    return s, ds, dds

@@ -1,0 +1,190 @@
+"""Components, leaves and dotted names.
+
+A component is a frozen keyword-only dataclass that JAX sees as a pytree. Each field is a leaf (a number or an array that may be
+differentiated, with a unit and an allowed range), a static value (hashable: sizes, switching times, topologies), or another
+component. Dotted names reach every leaf: "controller.k1", "plant.drain[0]".
+
+JAX rebuilds components through `__init__` with whatever it carries (tracers, batches, placeholders), so there is no
+`__post_init__`: conversion belongs in a constructor function, checks in `check_leaves`.
+"""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.errors import InputError, unknown
+
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)$")
+
+
+def leaf(unit="-", doc="", *, low=None, high=None, strict=False, default=dataclasses.MISSING):
+    """A differentiable field: its unit, what it is, and the range in which it means something.
+
+    low, high: allowed range, or None; strict: the value `low` itself is excluded.
+    """
+    meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict}
+    return dataclasses.field(metadata=meta, default=default)
+
+
+def static(unit="-", doc="", *, low=None, high=None, strict=False, choices=None, default=dataclasses.MISSING):
+    """A field that is part of the compiled program: hashable, never an array. Ranges and choices as in `leaf`."""
+    meta = {"kind": "static", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "choices": choices}
+    return dataclasses.field(metadata=meta, default=default)
+
+
+def component(cls):
+    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data."""
+    cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+    data = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") != "static"]
+    meta = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") == "static"]
+    return jax.tree_util.register_dataclass(cls, data, meta)
+
+
+def is_component(value):
+    """True for an instance of a class made by `component`."""
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
+
+
+def number(value):
+    """`value` as a host array of the default float: the form in which constructors store leaves."""
+    return np.asarray(value, dtype=np.float64)
+
+
+def walk(tree, prefix="", kind="leaf"):
+    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`."""
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{prefix}{field.name}"
+        if is_component(value):
+            yield from walk(value, f"{name}.", kind)
+        elif field.metadata.get("kind") == kind:
+            yield name, value, field.metadata
+
+
+def parameters(tree):
+    """{dotted name: value} of every leaf of a component (a loop, a plant, a law)."""
+    return {name: value for name, value, _ in walk(tree)}
+
+
+def describe(tree, name):
+    """The metadata (unit, doc, low, high, strict) of the leaf or static field `name`; InputError if there is none."""
+    base = name.split("[")[0]
+    for kind in ("leaf", "static"):
+        for other, _, meta in walk(tree, kind=kind):
+            if other == base:
+                return meta
+    raise unknown("parameter", name, _all_names(tree))
+
+
+def get_value(tree, name):
+    """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if there is none."""
+    base, index = split_index(name)
+    values = parameters(tree)
+    if base not in values:
+        raise unknown("parameter", name, _all_names(tree))
+    return _entry(values[base], index, name)
+
+
+def with_values(tree, values):
+    """A copy of `tree` with the leaves named in `values` replaced.
+
+    values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf fills it.
+    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name (with the three closest)
+    and for a value of the wrong shape.
+    """
+    for name, value in values.items():
+        base, index = split_index(name)
+        path = base.split(".")
+        try:
+            tree = _replace(tree, path, index, value, name)
+        except LookupError:
+            raise unknown("parameter", name, _all_names(tree)) from None
+    return tree
+
+
+def split_index(name):
+    """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError for a malformed name."""
+    parts = name.split(".")
+    if not all(_STEP.match(p) for p in parts) or any("[" in p for p in parts[:-1]):
+        raise InputError(f"{name!r} is not a parameter name: write component.field or component.field[i]")
+    base, bracket = _STEP.match(parts[-1]).groups()
+    index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()
+    return ".".join([*parts[:-1], base]), index
+
+
+def check_leaves(tree, names=None):
+    """Raise InputError if a concrete leaf is not finite or out of its range. Traced leaves are passed over."""
+    for name, value, meta in walk(tree):
+        if names is not None and name not in names:
+            continue
+        if isinstance(value, jax.core.Tracer):
+            continue
+        check_value(name, value, meta)
+
+
+def check_value(name, value, meta):
+    """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
+    array = np.asarray(value)
+    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+    for index in np.ndindex(array.shape):
+        entry = array[index]
+        label = name + (f"[{','.join(map(str, index))}]" if index else "")
+        if not np.isfinite(entry):
+            raise InputError(f"{label} = {entry}{unit}: must be a finite number")
+        low, high = meta["low"], meta["high"]
+        if low is not None and (entry < low or (meta["strict"] and entry == low)):
+            raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
+        if high is not None and entry > high:
+            raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
+
+
+def _all_names(tree):
+    return [name for kind in ("leaf", "static") for name, _, _ in walk(tree, kind=kind)]
+
+
+def _entry(value, index, name):
+    if not index:
+        return value
+    if len(index) != np.ndim(value) or any(i >= n for i, n in zip(index, np.shape(value))):
+        raise InputError(f"{name!r} does not exist: {split_index(name)[0]} has shape {np.shape(value)}")
+    return value[index]
+
+
+def _replace(tree, path, index, value, name):
+    head, rest = path[0], path[1:]
+    fields = {f.name: f for f in dataclasses.fields(tree)}
+    if head not in fields:
+        raise LookupError(name)
+    child = getattr(tree, head)
+    if rest:
+        if not is_component(child):
+            raise LookupError(name)
+        return dataclasses.replace(tree, **{head: _replace(child, rest, index, value, name)})
+    if is_component(child) or fields[head].metadata.get("kind") == "static":
+        raise LookupError(name)
+    return dataclasses.replace(tree, **{head: _fitted(child, index, value, name)})
+
+
+def _fitted(old, index, value, name):
+    """`value` in the shape and type of the leaf `old`; a number fills, an index sets one entry."""
+    on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
+    try:
+        value = jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {value!r}: must be a number{'' if np.ndim(old) == 0 else ' or a list of numbers'}") from None
+    shape = np.shape(old)
+    if index:
+        _entry(old, index, name)
+        if np.ndim(value) != 0:
+            raise InputError(f"{name} takes one number, not shape {np.shape(value)}")
+        # `where` with a constant mask, not `.at[].set`: a scatter inside the time loop would break its compilation to one function
+        mask = np.zeros(shape, dtype=bool)
+        mask[index] = True
+        return jnp.where(mask, value, old) if on_device else np.where(mask, value, old)
+    if np.shape(value) == shape:
+        return value
+    if np.ndim(value) == 0:
+        return jnp.broadcast_to(value, shape) if on_device else np.full(shape, value)
+    raise InputError(f"{name} has shape {np.shape(value)}: must be a number or shape {shape}")
