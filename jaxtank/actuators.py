@@ -14,7 +14,7 @@ DEAD_ZONES = ("plain", "hysteresis", "pulse")
 
 
 class ActuatorState(NamedTuple):
-    """Memory of the pumps: tuples with one entry per pump, empty where a feature is off."""
+    """Memory of the pumps: tuples with one entry per pump, empty where a feature is not in use."""
 
     running: tuple  # 1.0 while a pump with hysteresis turns
     owed: tuple  # volt-seconds the pulse compensation still owes [V s]
@@ -29,10 +29,10 @@ class PumpBank:
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
        best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
-    2. Dead zone: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V; 0: none). "hysteresis": a pump that turns stops
+    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "hysteresis": a pump that turns stops
        below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
        volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
-    3. Lag: first order with time constant `lag` [s], exact over a sample.  4. Transport delay: `delay` [s], whole samples.
+    3. Lag, if given: first order with time constant `lag` [s], exact over a sample.  4. Transport delay: `delay` [s], whole samples.
 
     The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its edge, and through "pulse" it is
     that of the mean flow, 1.
@@ -40,10 +40,10 @@ class PumpBank:
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    dead_zone: np.ndarray = leaf("V", "(m,) voltage at or below which a pump stands still; 0: none", low=0.0)
+    dead_zone: np.ndarray | None = leaf("V", "(m,) voltage at or below which a pump stands still", low=0.0, like="low")
     stop: np.ndarray = leaf("V", "(m,) voltage below which a turning pump stops (hysteresis)", low=0.0)
     pulse: np.ndarray = leaf("V", "(m,) voltage of the pulses that replace a dead zone (pulse)", low=0.0, strict=True)
-    lag: np.ndarray = leaf("s", "(m,) time constant of each pump; 0: none", low=0.0)
+    lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low")
     initial: np.ndarray = leaf("V", "(m,) voltage at which the pumps ran before t = 0")
     delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
     saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")
@@ -60,9 +60,9 @@ class PumpBank:
         start = tuple(self.initial[i] for i in pumps)
         zero = tuple(0.0 * s for s in start)
         return ActuatorState(
-            running=tuple(z + 1.0 for z in zero) if self.dead_zone_kind == "hysteresis" else (),
-            owed=zero if self.dead_zone_kind == "pulse" else (),
-            lagged=start,
+            running=tuple(z + 1.0 for z in zero) if self.dead_zone is not None and self.dead_zone_kind == "hysteresis" else (),
+            owed=zero if self.dead_zone is not None and self.dead_zone_kind == "pulse" else (),
+            lagged=start if self.lag is not None else (),
             line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
             head=jnp.int32(0),
         )
@@ -73,12 +73,14 @@ class PumpBank:
             u = allocate(command, metric, self.low, self.high)
         else:
             u = tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
-        u, state = self._dead_zone(state, u, dt)
-        # a lag of 0 s follows at once: exp(-dt/lag) is taken at a harmless lag and dropped
-        slow = [self.lag[i] > 0 for i in range(self.pumps)]
-        keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
-        u = tuple(u[i] + keep[i] * (state.lagged[i] - u[i]) for i in range(self.pumps))
-        state = state._replace(lagged=u)
+        if self.dead_zone is not None:
+            u, state = self._dead_zone(state, u, dt)
+        if self.lag is not None:
+            # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
+            slow = [self.lag[i] > 0 for i in range(self.pumps)]
+            keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
+            u = tuple(keep[i] * state.lagged[i] + (1.0 - keep[i]) * u[i] for i in range(self.pumps))
+            state = state._replace(lagged=u)
         if state.line:
             head = state.head
             out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)
@@ -103,7 +105,7 @@ class PumpBank:
                 owed.append(jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt)))
                 paid.append(v + jax.lax.stop_gradient(pay - v))
             return tuple(paid), state._replace(owed=tuple(owed))
-        return tuple(jnp.where((v > self.dead_zone[i]) | (self.dead_zone[i] <= 0), v, 0.0) for i, v in enumerate(u)), state
+        return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
 
 
 def allocate(command, metric, low, high):

@@ -5,6 +5,7 @@ Row k of a run is the world at t_k before it moves: y_k is read, u_k is decided,
 derivatives of the measures along with the run. All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
 """
 
+import dataclasses
 import functools
 import math
 import warnings
@@ -19,6 +20,7 @@ from jaxtank import measures as ms
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError, NonFiniteError
+from jaxtank.invariants import scan
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.records import Clock, Sample, Tick, Trajectory, check_clock
@@ -50,7 +52,6 @@ class State(NamedTuple):
     controller: Any
     actuator: Any
     bad_step: Any  # first sample with a level that is not finite, or -1
-    bad_tank: Any  # its tank, or -1
 
 
 class Inputs(NamedTuple):
@@ -98,7 +99,7 @@ def simulate(loop, clock, key=None, save_every=1):
     if not isinstance(save_every, int) or save_every < 1:
         raise InputError(f"save_every = {save_every!r}: must be a whole number of at least 1 sample")
     trajectory, bad = _simulate(loop, clock, key, save_every)
-    _report_bad(bad, loop, clock)
+    _report_bad(bad, loop, clock, key)
     return trajectory
 
 
@@ -111,7 +112,7 @@ def evaluate(loop, clock, measures, key=None):
     names = _names(measures)
     check(loop, clock, key)
     values, bad = _evaluate(loop, clock, names, key, False)
-    _report_bad(bad, loop, clock)
+    _report_bad(bad, loop, clock, key)
     return values
 
 
@@ -163,7 +164,6 @@ def initial(loop, clock):
         controller=loop.controller.init(),
         actuator=jax.tree.map(lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, loop.actuator.init(clock)),
         bad_step=jnp.int32(-1),
-        bad_tank=jnp.int32(-1),
     )
 
 
@@ -176,15 +176,11 @@ def step(loop, clock, state, now):
     command, controller = loop.controller.step(state.controller, tick, estimate)
     metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
     u, actuator = loop.actuator.step(state.actuator, command, metric, clock.dt)
-    d = (0.0,) * loop.plant.tanks if now.d is None else now.d
-    x, spilled = _advance(loop.plant, clock, t, state.x, u, d)
+    x, spilled = _advance(loop.plant, clock, t, state.x, u, now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(t=t, x=state.x, y=y, x_hat=estimate.x, r=now.r, e=e, command=command, u=u, spilled=spilled)
-    bad_step, bad_tank = state.bad_step, state.bad_tank
-    for i, h in enumerate(state.x):
-        first = (bad_step < 0) & ~jnp.isfinite(h)
-        bad_step, bad_tank = jnp.where(first, state.k, bad_step), jnp.where(first, i, bad_tank)
-    return State(state.k + 1, x, observer, controller, actuator, bad_step, bad_tank), sample
+    bad = jnp.where((state.bad_step < 0) & ~jnp.isfinite(sum(state.x)), state.k, state.bad_step)
+    return State(state.k + 1, x, observer, controller, actuator, bad), sample
 
 
 def _advance(plant, clock, t, x, u, d):
@@ -207,7 +203,8 @@ def _integrate(plant, integrator, t, x, u, d, h):
         return along(k2, h)
     k3 = plant.derivative(t + 0.5 * h, along(k2, 0.5 * h), u, d)
     k4 = plant.derivative(t + h, along(k3, h), u, d)
-    return tuple(a + (h / 6.0) * (p + 2.0 * (q + r) + s) for a, p, q, r, s in zip(x, k1, k2, k3, k4))
+    # k4 is ready last, so it is added last
+    return tuple((a + (h / 6.0) * (p + 2.0 * (q + r))) + (h / 6.0) * s for a, p, q, r, s in zip(x, k1, k2, k3, k4))
 
 
 def _run(loop, clock):
@@ -251,13 +248,12 @@ def _evaluate(loop, clock, names, key, checkpoint):
         return (state, ms.update(run, acc, sample, now.window)), None
 
     carry = (initial(loop, clock), ms.start(run, names))
-    scan = _checkpointed_scan if checkpoint else _scan
-    state, acc = scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    return ms.read(run, acc, names), (state.bad_step, state.bad_tank)
+    state, acc = (_checkpointed_scan if checkpoint else _plain_scan)(body, carry, inputs(loop, clock, names, key), clock.samples)
+    return ms.read(run, acc, names), state.bad_step
 
 
-def _scan(body, carry, xs, length):
-    return jax.lax.scan(body, carry, xs, length=length)[0]
+def _plain_scan(body, carry, xs, length):
+    return scan(body, carry, xs, length=length)[0]
 
 
 def _checkpointed_scan(body, carry, xs, length):
@@ -266,9 +262,9 @@ def _checkpointed_scan(body, carry, xs, length):
     outer = length // inner
     head = jax.tree.map(lambda a: a[: outer * inner].reshape(outer, inner), xs)
     tail = jax.tree.map(lambda a: a[outer * inner :], xs)
-    piece = jax.checkpoint(lambda c, now: (jax.lax.scan(body, c, now, length=inner)[0], None))
-    carry = jax.lax.scan(piece, carry, head, length=outer)[0]
-    return jax.lax.scan(body, carry, tail, length=length - outer * inner)[0]
+    piece = jax.checkpoint(lambda c, now: (scan(body, c, now, length=inner)[0], None))
+    carry = scan(piece, carry, head, length=outer)[0]
+    return scan(body, carry, tail, length=length - outer * inner)[0]
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "save_every"))
@@ -288,15 +284,15 @@ def _simulate(loop, clock, key, save_every):
         carry, sample = one(carry, jax.tree.map(lambda a: a[0], now))
         if save_every > 1:
             rest = jax.tree.map(lambda a: a[1:], now)
-            carry = jax.lax.scan(lambda c, n: (one(c, n)[0], None), carry, rest, length=save_every - 1)[0]
+            carry = scan(lambda c, n: (one(c, n)[0], None), carry, rest, length=save_every - 1)[0]
         return carry, sample._replace(spilled=spilled)
 
     zero = _zero(loop)
-    (state, _), saved = jax.lax.scan(row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows)
+    (state, _), saved = scan(row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows)
     columns = {name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value for name, value in saved._asdict().items()}
     # the state may go bad in the steps after the last row, which are not part of the run
     in_run = state.bad_step < clock.samples
-    return Trajectory(**columns), (jnp.where(in_run, state.bad_step, -1), state.bad_tank)
+    return Trajectory(**columns), jnp.where(in_run, state.bad_step, -1)
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "names"))
@@ -353,7 +349,7 @@ def _sensitivities(loop, clock, names, values, key):
         return (floats, dfloats, rest, gauss_newton), None
 
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    (floats, dfloats, rest, gauss_newton), _ = jax.lax.scan(body, carry, (xs, dxs), length=clock.samples)
+    (floats, dfloats, rest, gauss_newton), _ = scan(body, carry, (xs, dxs), length=clock.samples)
 
     def finish(floats, theta):
         _, acc = join(floats, rest)
@@ -363,16 +359,16 @@ def _sensitivities(loop, clock, names, values, key):
     return results, slopes, gauss_newton * (2.0 / clock.samples), join(floats, rest)[0].bad_step
 
 
-def _report_bad(bad, loop, clock):
-    """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set."""
-    bad_step, bad_tank = bad
-    if isinstance(bad_step, jax.core.Tracer) or np.ndim(bad_step):
+def _report_bad(bad_step, loop, clock, key):
+    """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
+    if isinstance(bad_step, jax.core.Tracer) or np.ndim(bad_step) or int(bad_step) < 0:
         return
-    if int(bad_step) < 0:
-        return
+    until = dataclasses.replace(clock, duration=int(bad_step) * clock.dt)
+    last = np.asarray(_simulate(loop, until, key, 1)[0].x[-1])
+    tanks = " and ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(last))) or "?"
     shown = {n: v for n, v in parameters(loop).items() if n.startswith("controller.") and not n.startswith("controller.model.")}
     text = ", ".join(f"{n} = {np.asarray(v)}" for n, v in shown.items())
-    raise NonFiniteError(f"the level of tank {int(bad_tank) + 1} stopped being finite at t = {int(bad_step) * clock.dt:g} s with {text}")
+    raise NonFiniteError(f"the level of tank {tanks} stopped being finite at t = {int(bad_step) * clock.dt:g} s with {text}")
 
 
 __all__ = ["Clock", "ClosedLoop", "check", "evaluate", "evaluate_for_reverse", "sensitivities", "simulate"]

@@ -5,6 +5,7 @@ samples are inputs of the loop: interpolating inside it would cost more than the
 """
 
 import abc
+import math
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,7 +57,8 @@ class Ramps(Signal):
         r(t) = initial + sum_j (target_j - value before) S((t - t_j) / D)
 
     S(x) is x (shape "linear"; rate Delta/D on [t_j, t_j + D), second derivative 0, the impulses at the corners left out) or
-    10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held at 0 before and 1 after. D = 0 gives steps.
+    10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held at 0 before and 1 after. D = 0 gives steps. A change that
+    begins before the last one of its channel has ended starts from where that one has got to.
     """
 
     initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
@@ -70,17 +72,16 @@ class Ramps(Signal):
         return np.shape(self.initial)[0]
 
     def sample(self, clock):
-        t = sample_times(clock)
-        last = [self.initial[i] for i in range(self.channels)]
-        value = [level + jnp.zeros_like(t) for level in last]
-        rate = [jnp.zeros_like(t) for _ in last]
-        second = [jnp.zeros_like(t) for _ in last]
+        pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]  # of each channel: (first sample, function of time)
         for j, (start, i) in enumerate(self.changes):
-            delta = self.targets[j] - last[i]
-            s, ds, dds = _course((t - start) + 1e-7 * clock.dt, self.ramp, self.shape)
-            value[i], rate[i], second[i] = value[i] + delta * s, rate[i] + delta * ds, second[i] + delta * dds
-            last[i] = self.targets[j]
-        return tuple(value), tuple(rate), tuple(second)
+            level = pieces[i][-1][1](start)[0]  # the last target, or how far a change that is not over has come
+            if pieces[i][-1][0] > _index(start, clock):
+                pieces[i].pop()
+                level = pieces[i][-1][1](start)[0]
+            pieces[i].append((_index(start, clock), _course(level, self.targets[j] - level, start, self.ramp, self.shape)))
+            pieces[i].append((_index(start + self.ramp, clock), _flat(self.targets[j])))
+        value, rate, second = zip(*(_join(channel, clock) for channel in pieces))
+        return value, rate, second
 
     def windows(self, clock):
         """Per channel (target, step, time since the change ended), each (samples,): what overshoot and settling refer to.
@@ -133,15 +134,32 @@ def ramps(initial, changes, ramp=60.0, shape="linear"):
     )
 
 
-def _course(since, duration, shape):
-    """S(x), S', S'' of a change that began `since` seconds ago (negative: not yet)."""
-    if duration == 0.0:
-        return jnp.where(since >= 0, 1.0, 0.0), jnp.zeros_like(since), jnp.zeros_like(since)
-    inside = (since >= 0) & (since < duration)
-    x = jnp.where(inside, since / duration, jnp.where(since < 0, 0.0, 1.0))
+def _index(time, clock):
+    """First sample at or after `time`; half a part in a million of a sample is forgiven, so that 20 s is sample 2000 at 0.01 s."""
+    return max(0, math.ceil(time / clock.dt - 5e-7))
+
+
+def _flat(level):
+    return lambda t: (level + jnp.zeros_like(t), jnp.zeros_like(t), jnp.zeros_like(t))
+
+
+def _course(level, delta, start, duration, shape):
+    """Value, rate and second derivative of a change of `delta` from `level`, as a function of time inside the change."""
     if shape == "linear":
-        return x, jnp.where(inside, 1.0 / duration, 0.0), jnp.zeros_like(x)
-    s = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-    ds = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration
-    dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / duration**2
-    return s, ds, dds
+        return lambda t: (level + delta * ((t - start) / duration), delta / duration + jnp.zeros_like(t), jnp.zeros_like(t))
+
+    def quintic(t):
+        x = (t - start) / duration
+        s = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+        ds = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration
+        dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / duration**2
+        return level + delta * s, delta * ds, delta * dds
+
+    return quintic
+
+
+def _join(pieces, clock):
+    """The pieces of one channel, each evaluated on its own samples only, end to end."""
+    starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
+    parts = [f((a + jnp.arange(b - a)) * clock.dt) for (_, f), a, b in zip(pieces, starts, starts[1:]) if b > a]
+    return tuple(jnp.concatenate(column) for column in zip(*parts))

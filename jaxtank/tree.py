@@ -20,13 +20,14 @@ from jaxtank.errors import InputError, unknown
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)$")
 
 
-def leaf(unit="-", doc="", *, low=None, high=None, strict=False, default=dataclasses.MISSING):
+def leaf(unit="-", doc="", *, low=None, high=None, strict=False, like=None):
     """A differentiable field: its unit, what it is, and the range in which it means something.
 
-    low, high: allowed range, or None; strict: the value `low` itself is excluded.
+    low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a sibling field: such a leaf may be
+    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set.
     """
-    meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict}
-    return dataclasses.field(metadata=meta, default=default)
+    meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "like": like}
+    return dataclasses.field(metadata=meta, default=dataclasses.MISSING if like is None else None)
 
 
 def static(unit="-", doc="", *, low=None, high=None, strict=False, choices=None, default=dataclasses.MISSING):
@@ -64,8 +65,8 @@ def walk(tree, prefix="", kind="leaf"):
 
 
 def parameters(tree):
-    """{dotted name: value} of every leaf of a component (a loop, a plant, a law)."""
-    return {name: value for name, value, _ in walk(tree)}
+    """{dotted name: value} of every leaf of a component (a loop, a plant, a law). Absent optional leaves are left out."""
+    return {name: value for name, value, _ in walk(tree) if value is not None}
 
 
 def describe(tree, name):
@@ -119,7 +120,7 @@ def check_leaves(tree, names=None):
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
-        if isinstance(value, jax.core.Tracer):
+        if value is None or isinstance(value, jax.core.Tracer):
             continue
         check_value(name, value, meta)
 
@@ -164,6 +165,9 @@ def _replace(tree, path, index, value, name):
         return dataclasses.replace(tree, **{head: _replace(child, rest, index, value, name)})
     if is_component(child) or fields[head].metadata.get("kind") == "static":
         raise LookupError(name)
+    like = fields[head].metadata.get("like")
+    if child is None and like is not None:
+        child = np.zeros(np.shape(getattr(tree, like)))
     return dataclasses.replace(tree, **{head: _fitted(child, index, value, name)})
 
 

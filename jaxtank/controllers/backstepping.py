@@ -34,10 +34,11 @@ class Backstepping(Controller):
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
         q1, q2 = jnp.sqrt(r1), jnp.sqrt(r2)
         gain = self.k + self.k1
-        w1 = c.c2 * s3 + c.c3 * s4 - c.c1 * q1 + self.k1 * (h1 - r1)  # residual of the first step [cm/s]
-        w2 = c.c5 * s3 + c.c6 * s4 - c.c4 * q2 + self.k1 * (h2 - r2)
+        # residual of the first step [cm/s]; the roots come last, they are the last to be ready
+        w1 = (self.k1 * (h1 - r1) - c.c1 * q1) + c.c2 * s3 + c.c3 * s4
+        w2 = (self.k1 * (h2 - r2) - c.c4 * q2) + c.c5 * s3 + c.c6 * s4
         if not self.reference_rates:
-            return decouple(c, s3, s4, -gain * w1, -gain * w2), state
+            return decouple(c, s3, s4, w1, w2, scale=-gain), state
         v1 = tick.ddr[0] + 0.5 * c.c1 * tick.dr[0] / q1 - gain * (w1 - tick.dr[0])
         v2 = tick.ddr[1] + 0.5 * c.c4 * tick.dr[1] / q2 - gain * (w2 - tick.dr[1])
         return decouple(c, s3, s4, v1, v2), state

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.numerics import at_least
+from jaxtank.numerics import floored_root
 from jaxtank.plants.network import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
 from jaxtank.signals import Constant, Ramps
 
@@ -54,20 +54,20 @@ def floored_roots(levels, floor):
     """sqrt(max(h, floor)) of each level. The floor keeps roots and their inverses finite where a tank is dry or noise makes a
     level negative. The law multiplies by the roots of the upper levels, so with a dry tank its command is zero and stays so: a
     floor of about 1 cm lets it restart (spec 9)."""
-    return tuple(jnp.sqrt(at_least(h, floor)) for h in levels)
+    return tuple(floored_root(h, floor) for h in levels)
 
 
-def decouple(c, s3, s4, v1, v2):
-    """Voltages (u1, u2) that give the outputs the accelerations v (gouta2015 eqs. 28, 48): b^-1 (v - g), division-free.
+def decouple(c, s3, s4, v1, v2, scale=1.0):
+    """Voltages (u1, u2) that give the outputs the accelerations scale * v (gouta2015 eqs. 28, 48): b^-1 (v - g), division-free.
 
         u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8,   u2 likewise
 
-    c: Coefficients; s3, s4: roots of the upper levels [cm^0.5]; v1, v2 [cm/s^2] without the terms of the lower outlets.
-    Never forms b, whose entries grow as 1/sqrt(h) while its inverse stays finite.
+    c: Coefficients; s3, s4: roots of the upper levels [cm^0.5]; scale * v1, scale * v2 [cm/s^2] without the terms of the lower
+    outlets. Never forms b, whose entries grow as 1/sqrt(h) while its inverse stays finite.
     """
-    a = c.alpha
-    u1 = s3 * ((c.c6 * v1 - c.c3 * v2) / a + c.c7) / c.c8
-    u2 = s4 * ((c.c2 * v2 - c.c5 * v1) / a + c.c9) / c.c10
+    a8, a10 = c.alpha * c.c8, c.alpha * c.c10
+    u1 = s3 * ((c.c7 / c.c8 + (scale * c.c6 / a8) * v1) - (scale * c.c3 / a8) * v2)
+    u2 = s4 * ((c.c9 / c.c10 - (scale * c.c5 / a10) * v1) + (scale * c.c2 / a10) * v2)
     return u1, u2
 
 

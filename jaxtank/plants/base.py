@@ -18,7 +18,7 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def derivative(self, t, x, u, d):
-        """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and disturbing inflows d (n) [cm^3/s]; returns (n) [cm/s]."""
+        """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or None; returns (n) [cm/s]."""
 
     @abc.abstractmethod
     def spill(self, x):

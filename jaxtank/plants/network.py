@@ -1,9 +1,10 @@
 """Tanks, orifices, pumps: one network serves every rig."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.numerics import clip
+from jaxtank.numerics import clip, root
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import GRAVITY, disc, efflux
 from jaxtank.tree import component, leaf, number, static
@@ -13,7 +14,7 @@ from jaxtank.tree import component, leaf, number, static
 class TankNetwork(Plant):
     """n tanks joined by orifices that pour from one tank into another or into the basin, filled by m pumps.
 
-        A_i h_i' = sum_j s_ji v_j - (s_i + sum_j s_ij) v_i + pumped_i + d_i,      v = sqrt(2 g h)
+        A_i h_i' = sum_j s_ji v_j - (s_i + sum_j s_ij) v_i + pumped_i + d_i,      v = sqrt(2 g h)   (Torricelli; gouta2015 eqs. 1-8)
 
     Pump j delivers pump_gain_j u_j: the share split_j to its first tank and the rest to its second. An orifice discharges
     freely, so its flow depends on the level above it alone. Levels may fall to zero and stay there; with `overflow` they stop at
@@ -41,32 +42,34 @@ class TankNetwork(Plant):
     def pumps(self):
         return np.shape(self.pump_gain)[-1]
 
-    def pumped(self, u):
-        """Flow into each tank from the pumps, (n) [cm^3/s], for voltages u (m) [V]; None where no pump reaches."""
-        flow = [None] * self.tanks
+    def _shares(self):
+        """[(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
+        shares = []
         for j, (first, second) in enumerate(self.feeds):
-            q = self.pump_gain[j] * u[j]
-            shares = [(first, q if second is None else self.split[j] * q)]
-            if second is not None:
-                shares.append((second, (1.0 - self.split[j]) * q))
-            for tank, share in shares:
-                flow[tank] = share if flow[tank] is None else flow[tank] + share
-        return flow
+            if second is None:
+                shares.append((j, first, self.pump_gain[j]))
+            else:
+                shares += [(j, first, self.pump_gain[j] * self.split[j]), (j, second, self.pump_gain[j] * (1.0 - self.split[j]))]
+        return shares
 
     def derivative(self, t, x, u, d):
-        n = self.tanks
-        speed = [efflux(x[i], self.gravity, self.knee) for i in range(n)]
+        # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed once by the loop. What u and d bring
+        # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
+        n, w = self.tanks, jnp.sqrt(2.0 * self.gravity)
         out = [self.drain[i] for i in range(n)]
-        flow = self.pumped(u)
-        flow = [d[i] if flow[i] is None else flow[i] + d[i] for i in range(n)]
-        for k, (source, sink) in enumerate(self.links):
+        for k, (source, _) in enumerate(self.links):
             out[source] = out[source] + self.orifice[k]
-            flow[sink] = flow[sink] + self.orifice[k] * speed[source]
-        return tuple((flow[i] - out[i] * speed[i]) / self.area[i] for i in range(n))
+        rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
+        for j, tank, gain in self._shares():
+            rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
+        q = [root(h, self.knee) for h in x]
+        for k, (source, sink) in enumerate(self.links):
+            rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
+        return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
 
     def net_inflow(self, x, u, d):
         """Pumped and disturbing inflow less what leaves for the basin [cm^3/s]: the rate of change of the stored volume."""
-        inflow = sum(q for q in self.pumped(u) if q is not None) + sum(d)
+        inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
         return inflow - sum(self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks))
 
     def spill(self, x):

@@ -95,10 +95,8 @@ def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
         actuator=PumpBank(
             low=number([0.0, 0.0]),
             high=number([12.0, 12.0]),
-            dead_zone=number([0.0, 0.0]),
             stop=number([1.5, 1.5]),
             pulse=number([3.3, 3.3]),
-            lag=number([0.0, 0.0]),
             initial=u0,
             saturation=saturation,
         ),
