@@ -127,18 +127,22 @@ def check_leaves(tree, names=None):
 
 def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
-    array = np.asarray(value)
+    array, low, high = np.asarray(value), meta["low"], meta["high"]
+    good = np.isfinite(array)
+    if low is not None:
+        good = good & ((array > low) if meta["strict"] else (array >= low))
+    if high is not None:
+        good = good & (array <= high)
+    if np.all(good):
+        return
     unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-    for index in np.ndindex(array.shape):
-        entry = array[index]
-        label = name + (f"[{','.join(map(str, index))}]" if index else "")
-        if not np.isfinite(entry):
-            raise InputError(f"{label} = {entry}{unit}: must be a finite number")
-        low, high = meta["low"], meta["high"]
-        if low is not None and (entry < low or (meta["strict"] and entry == low)):
-            raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
-        if high is not None and entry > high:
-            raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
+    index = tuple(int(i) for i in np.argwhere(~good)[0])
+    entry, label = array[index], name + (f"[{','.join(map(str, index))}]" if index else "")
+    if not np.isfinite(entry):
+        raise InputError(f"{label} = {entry}{unit}: must be a finite number")
+    if high is not None and entry > high:
+        raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
+    raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
 
 
 def _all_names(tree):

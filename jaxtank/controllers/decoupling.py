@@ -81,9 +81,8 @@ def check_state_coupled(model, reference):
     """Raise InputError unless `model` is a state-coupled four-tank and the reference stays above zero (the laws take sqrt(r))."""
     if model.links != STATE_COUPLED_LINKS or model.feeds != STATE_COUPLED_FEEDS or model.outputs != (0, 1):
         raise InputError("controller.model must be a state-coupled four-tank (plants.state_coupled_four_tank): this law inverts it")
-    c = coefficients(model)
-    determinant, scale = 2.0 * float(c.alpha), float(abs(c.c2 * c.c6) + abs(c.c3 * c.c5))
-    if not abs(determinant) > 1e-9 * scale:
+    s31, s32, s41, s42 = (float(s) for s in model.orifice)
+    if not abs(s31 * s42 - s41 * s32) > 1e-9 * (s31 * s42 + s41 * s32):  # alpha without the areas
         raise InputError(
             f"controller.model.orifice = {np.asarray(model.orifice)} cm^2: the upper tanks pour into the lower ones in the same "
             "proportion, so the outputs cannot be moved apart"

@@ -1,0 +1,163 @@
+"""Pictures: one function each, drawn on given matplotlib axes and returning them. The only room here that imports matplotlib."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = "#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73"  # Okabe and Ito, colour-blind safe
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.dpi": 110,
+    "savefig.dpi": 130,
+    "svg.fonttype": "none",
+}
+
+
+def level(ax, trajectories, tank, output=None, rim=None, limit=None):
+    """Levels of one tank [cm] over time [s], one line per {name: (Trajectory, colour, style)}; its setpoint, rim and limit."""
+    for name, (run, colour, style) in trajectories.items():
+        ax.plot(run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=name)
+    last = next(iter(trajectories.values()))[0]
+    if output is not None:
+        ax.plot(last.t, last.r[:, output], color=REFERENCE, linestyle=":", linewidth=1.2, label="setpoint")
+    highest = max(float(np.max(run.x[:, tank])) for run, _, _ in trajectories.values())
+    # a rim far above all levels would only flatten the picture
+    for bound, words in ((rim, "rim"), (limit if limit != rim else None, "limit")):
+        if bound is not None and (highest > 0.6 * bound):
+            top = max(highest * 1.03, bound * 1.05)
+            ax.axhspan(bound, top, color=FORBIDDEN, alpha=0.18, linewidth=0)
+            ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{words} {bound:g} cm")
+            ax.set_ylim(top=top)
+    ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
+    ax.set(title=f"tank {tank + 1}", ylabel="level [cm]")
+    return ax
+
+
+def voltage(ax, trajectories, pump, low, high):
+    """Voltage of one pump [V] over time [s], what lies outside its limits shaded."""
+    for name, (run, colour, style) in trajectories.items():
+        ax.plot(run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
+    margin = 0.06 * (high - low)
+    ax.axhspan(low - margin, low, color=FORBIDDEN, alpha=0.18, linewidth=0)
+    ax.axhspan(high, high + margin, color=FORBIDDEN, alpha=0.18, linewidth=0)
+    ax.set(title=f"pump {pump + 1}", ylabel="voltage [V]", ylim=(low - margin, high + margin))
+    return ax
+
+
+def error(ax, trajectories, output, tank):
+    """Tracking error of one output [cm] over time [s]."""
+    for name, (run, colour, style) in trajectories.items():
+        ax.plot(run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=name)
+    ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
+    ax.set(title=f"tracking error of tank {tank + 1}", ylabel="h - r [cm]")
+    return ax
+
+
+def responses(loop, trajectories, title="", limits=None):
+    """Figure of a run, or of several over each other: outputs with setpoints, errors, other tanks with rims, voltages with limits.
+
+    trajectories: {name: Trajectory}, the first drawn dashed where there are several; limits: (tanks,) level limits [cm] or None.
+    """
+    names = list(trajectories)
+    styles = [(AFTER, "-")] if len(names) == 1 else [(BEFORE, "--"), (AFTER, "-"), (OTHER, "-.")]
+    drawn = {name: (run, *style) for (name, run), style in zip(trajectories.items(), styles)}
+    outputs = list(loop.plant.outputs)
+    others = [i for i in range(loop.plant.tanks) if i not in outputs]
+    rows = [
+        [lambda ax, i=i, k=k: level(ax, drawn, i, k, _at(loop.plant.rim, i), _at(limits, i)) for k, i in enumerate(outputs)],
+        [lambda ax, i=i, k=k: error(ax, drawn, k, i) for k, i in enumerate(outputs)],
+        [lambda ax, i=i: level(ax, drawn, i, None, _at(loop.plant.rim, i), _at(limits, i)) for i in others],
+        [
+            lambda ax, j=j: voltage(ax, drawn, j, float(loop.actuator.low[j]), float(loop.actuator.high[j]))
+            for j in range(loop.plant.pumps)
+        ],
+    ]
+    rows = [row for row in rows if row]
+    columns = max(len(row) for row in rows)
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(rows), columns, figsize=(4.6 * columns, 2.05 * len(rows) + 0.5), sharex=True, squeeze=False, layout="constrained"
+        )
+        for row, line in zip(rows, axes):
+            for draw, ax in zip(row, line):
+                draw(ax)
+            for ax in line[len(row) :]:
+                ax.set_visible(False)
+        for ax in axes[-1]:
+            ax.set_xlabel("time [s]")
+        handles = {}
+        for ax in axes.flat:
+            for handle, label in zip(*ax.get_legend_handles_labels()):
+                handles.setdefault(label, handle)
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+        figure.suptitle(title, fontsize=10)
+    return figure
+
+
+def convergence(ax, history, unit, limited):
+    """Cost of every evaluation in the order of the search, one colour per start; crosses break a limit, the line is the best so far."""
+    cost = np.array([h[1] for h in history])
+    broken = np.array([h[2] > 0 for h in history])
+    start = np.array([h[0] for h in history])
+    index = np.arange(1, len(history) + 1)
+    for s in np.unique(start):
+        here, colour = start == s, plt.get_cmap("cividis")(0.1 + 0.8 * s / max(1, start.max()))
+        ax.plot(index[here & ~broken], cost[here & ~broken], "o", color=colour, markersize=3.5)
+        ax.plot(index[here & broken], cost[here & broken], "x", color=colour, markersize=4)
+    best = np.minimum.accumulate(np.where(broken, np.inf, cost))
+    shown = np.isfinite(best)
+    ax.plot(index[shown], best[shown], color=AFTER, linewidth=1.4, drawstyle="steps-post", label="best that holds every limit" if limited else "best")
+    ax.plot([], [], "x", color="0.4", label="breaks a limit") if broken.any() else None
+    for s in np.unique(start)[1:]:
+        ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
+    ax.set(xlabel="evaluation (grey lines: next start)", ylabel=f"objective [{unit}]", title="convergence")
+    if cost.max() > 5 * cost.min() > 0:
+        ax.set_yscale("log")
+    ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
+    return ax
+
+
+def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, logarithmic):
+    """Objective along one parameter; the part that breaks a limit is shaded."""
+    ax.plot(values, cost, color="0.3", linewidth=1.3)
+    broken = np.asarray(violation) > 0
+    if broken.any():
+        low, high = ax.get_ylim()
+        ax.fill_between(values, low, high, where=broken, color=FORBIDDEN, alpha=0.18, linewidth=0, label="a limit is broken")
+        ax.set_ylim(low, high)
+    ax.plot(*before, "s", color=BEFORE, label="before")
+    ax.plot(*after, "o", color=AFTER, label="after")
+    ax.set(xlabel=f"{name} [{unit}]", ylabel=f"objective [{cost_unit}]", title="landscape", xscale="log" if logarithmic else "linear")
+    ax.legend()
+    return ax
+
+
+def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, logarithmic):
+    """Objective over two parameters as filled contours; beyond the pink line a limit is broken."""
+    finite = np.where(np.isfinite(cost), cost, np.nan)
+    low, high = np.nanmin(finite), np.nanquantile(finite, 0.98)
+    levels = np.geomspace(max(low, 1e-12), high, 18) if high > 4 * low > 0 else np.linspace(low, high, 18)
+    filled = ax.contourf(x, y, finite, levels=levels, cmap="cividis_r", extend="both")
+    ax.figure.colorbar(filled, ax=ax, label=f"objective [{cost_unit}]", format="%.3g")
+    if np.nanmax(violation) > 0 and np.nanmin(violation) <= 0:
+        ax.contour(x, y, violation, levels=[0.0], colors=[FORBIDDEN], linewidths=2.0)
+        ax.contourf(x, y, violation, levels=[0.0, np.inf], colors="none", hatches=["///"])
+        ax.plot([], [], color=FORBIDDEN, linewidth=2.0, label="a limit is reached; broken where hatched")
+    ax.plot(*before, "s", color=BEFORE, markeredgecolor="white", markersize=8, label="before", clip_on=False, zorder=5)
+    ax.plot(*after, "o", color=AFTER, markeredgecolor="white", markersize=9, label="after", clip_on=False, zorder=5)
+    ax.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]", title="landscape")
+    ax.set_xscale("log" if logarithmic[0] else "linear")
+    ax.set_yscale("log" if logarithmic[1] else "linear")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    return ax
+
+
+def _at(array, i):
+    return None if array is None else float(np.asarray(array)[i])

@@ -1,0 +1,287 @@
+"""A rig as a TOML file: a case of a paper and what is different about yours.
+
+    case = "gouta2015/backstepping"
+
+    [values]                     # any parameter by its dotted name
+    "controller.k1" = 0.01
+    "plant.area" = [21.2, 21.2, 21.2, 21.2]
+    "clock.dt" = 0.01
+
+    [reference]                  # ramps between plateaus
+    initial = [3.0, 3.0]
+    changes = [[20.0, 1, 8.0]]   # time [s], output (from 1), level
+    ramp = 60.0
+
+    [limits]                     # hard limits of `tune`
+    max_level = "rim"
+
+    [free]                       # what `tune` may change: [low, high] or [low, high, "log" or "linear"]
+    "controller.k1" = [0.001, 5.0]
+
+    [objective]                  # what it makes small: measure = weight
+    rms_error_total = 1.0
+"""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import presets
+from jaxtank.analysis import equilibrium
+from jaxtank.errors import EquilibriumError, InputError, unknown
+from jaxtank.files import read_text, write_atomic
+from jaxtank.measures import check_names
+from jaxtank.presets.base import Case, Free
+from jaxtank.records import CLOCK_UNITS, check_clock
+from jaxtank.signals import Ramps, ramps
+from jaxtank.tree import check_value, describe, get_value, is_component, split_index, walk, with_values
+
+TABLES = ("case", "name", "values", "reference", "limits", "free", "objective")
+REFERENCE_KEYS = ("initial", "changes", "ramp", "shape")
+
+
+def open_case(name):
+    """The Case of "paper/case", or of a rig file where `name` ends in .toml, checked."""
+    return load(name) if name.endswith(".toml") else presets.find(name)
+
+
+def load(path):
+    """The Case of a rig file. Raises InputError, naming the file, for anything in it that is unknown, misshapen or out of range."""
+    text = read_text(path, "rig file")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"rig file {str(path)!r} is not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(f"rig file {str(path)!r} is not TOML that can be read: it is nested too deeply") from None
+    try:
+        return from_table(table)
+    except InputError as error:
+        raise type(error)(f"rig file {str(path)!r}: {error}") from None
+
+
+def from_table(table):
+    """The Case described by a table of the form of a rig file."""
+    for key, value in table.items():
+        if key not in TABLES:
+            raise unknown("key", key, TABLES)
+        wanted = str if key in ("case", "name") else dict
+        if not isinstance(value, wanted):
+            raise InputError(f"{key} = {value!r}: must be {'a text' if wanted is str else 'a table'}")
+    if "case" not in table:
+        raise InputError('a rig file needs case = "paper/case" to start from; `jaxtank list` prints them')
+    case = presets.find(table["case"])
+    case = case.replace(name=table.get("name", case.name))
+    if "reference" in table:
+        case = case.replace(loop=dataclasses.replace(case.loop, reference=_reference(table["reference"], case.loop.reference)))
+    case = set_values(case, table.get("values", {}))
+    if "limits" in table:
+        check_names(table["limits"])
+        case = case.replace(limits=dict(table["limits"]))
+    if "objective" in table:
+        check_names(table["objective"])
+        for measure, weight in table["objective"].items():
+            _number(f"objective.{measure}", weight)
+        case = case.replace(objective=dict(table["objective"]))
+    if "free" in table:
+        case = case.replace(free={name: _free(case, name, spec) for name, spec in table["free"].items()})
+    return check(case)
+
+
+def check(case):
+    """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
+    lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
+    if isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
+        for values in case.loop.reference.plateaus():
+            try:
+                equilibrium(case.loop.plant, values)
+            except EquilibriumError as error:
+                raise EquilibriumError(f"reference: {error}") from None
+    return case
+
+
+def set_values(case, values):
+    """A copy of `case` with leaves, static fields and clock fields set by dotted name.
+
+    values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with the nearest), a value of the wrong
+    kind or shape, and a value out of range.
+    """
+    for name, value in values.items():
+        if name.startswith("clock."):
+            case = case.replace(clock=_set_clock(case.clock, name, value))
+            continue
+        meta = describe(case.loop, name)
+        if meta["kind"] == "static":
+            case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
+            continue
+        if not _is_numeric(value):
+            raise InputError(f"{name} = {value!r}: must be a number or a list of numbers{_unit(meta)}")
+        loop = with_values(case.loop, {name: value})
+        check_value(name, get_value(loop, name), meta)
+        case = case.replace(loop=loop)
+    return case
+
+
+def dump(case):
+    """The complete rig file of `case` as text: every leaf, every static field that a file may set, reference, limits, free, objective."""
+    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", "", "[values]"]
+    for name, value, meta in walk(case.loop):
+        if value is not None and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps)):
+            lines.append(_line(name, np.asarray(value).tolist(), meta))
+    for name, value, meta in walk(case.loop, kind="static"):
+        if not isinstance(value, tuple) and not name.startswith("reference."):
+            lines.append(_line(name, value, meta))
+    for name, unit in CLOCK_UNITS.items():
+        lines.append(_line(f"clock.{name}", getattr(case.clock, name), {"unit": unit, "doc": ""}))
+    reference = case.loop.reference
+    if isinstance(reference, Ramps):
+        lines += ["", "[reference]", f"initial = {_toml(np.asarray(reference.initial).tolist())}  # [cm]"]
+        changes = [[t, i + 1, float(v)] for (t, i), v in zip(reference.changes, np.asarray(reference.targets))]
+        lines += [f"changes = {_toml(changes)}  # time [s], output (from 1), level [cm]"]
+        lines += [f"ramp = {_toml(reference.ramp)}  # [s]", f"shape = {_toml(reference.shape)}"]
+    lines += ["", "[limits]"] + [f"{m} = {_toml(np.asarray(v).tolist() if not isinstance(v, str) else v)}" for m, v in case.limits.items()]
+    lines += ["", "[free]"] + [f"{_toml(n)} = {_toml(list(Free(*spec)))}" for n, spec in case.free.items()]
+    lines += ["", "[objective]"] + [f"{m} = {_toml(float(w))}" for m, w in case.objective.items()]
+    return "\n".join(lines) + "\n"
+
+
+def save(case, path):
+    """Write `dump(case)` to a file, whole or not at all."""
+    write_atomic(Path(path), dump(case))
+
+
+def _origin(case):
+    """The preset that a case came from: one with the same components, so that values are all there is to set."""
+    structure = jax.tree.structure(_plain(case.loop))
+    for paper in presets.PAPERS:
+        cases = presets.load(paper).cases
+        if case.name in (f"{paper}/{c}" for c in cases):
+            return case.name
+        for other in cases.values():
+            if jax.tree.structure(_plain(other.loop)) == structure:
+                return other.name
+    raise InputError(f"{case.name}: no preset has these components, so the case cannot be written as a rig file")
+
+
+def _plain(loop):
+    """The loop with what a rig file can set made alike, so that structures compare by their components."""
+    def settle(tree):
+        changed = {}
+        for field in dataclasses.fields(tree):
+            value = getattr(tree, field.name)
+            if is_component(value):
+                changed[field.name] = settle(value)
+            elif field.metadata.get("kind") == "static" and not isinstance(value, tuple):
+                changed[field.name] = type(value)()
+            elif field.metadata.get("like"):
+                changed[field.name] = None
+        return dataclasses.replace(tree, **changed)
+
+    loop = settle(loop)
+    return dataclasses.replace(loop, reference=type(loop.reference).__name__ and None)
+
+
+def _reference(table, old):
+    for key in table:
+        if key not in REFERENCE_KEYS:
+            raise unknown("key of [reference]", key, REFERENCE_KEYS)
+    if not isinstance(old, Ramps):
+        raise InputError("[reference] is for cases whose reference is made of ramps")
+    initial = table.get("initial", np.asarray(old.initial).tolist())
+    if not (_is_numeric(initial) and np.shape(initial) == np.shape(old.initial)):
+        raise InputError(f"reference.initial = {initial!r}: must be a list of {np.size(old.initial)} levels [cm]")
+    changes = table.get("changes", [[t, i + 1, float(v)] for (t, i), v in zip(old.changes, np.asarray(old.targets))])
+    if not isinstance(changes, list):
+        raise InputError(f"reference.changes = {changes!r}: must be a list of [time [s], output (from 1), level [cm]]")
+    for change in changes:
+        good = isinstance(change, list) and len(change) == 3 and _is_numeric(change) and not isinstance(change[1], float)
+        if not (good and 1 <= change[1] <= np.size(old.initial)):
+            raise InputError(
+                f"reference.changes has {change!r}: must be [time [s], output from 1 to {np.size(old.initial)}, level [cm]]"
+            )
+    ramp = _number("reference.ramp", table.get("ramp", old.ramp))
+    check_value("reference.ramp", ramp, describe_field(Ramps, "ramp"))
+    return ramps(initial, [(float(t), i - 1, float(v)) for t, i, v in changes], ramp, table.get("shape", old.shape))
+
+
+def describe_field(cls, name):
+    """The metadata of a field of a component class."""
+    return next(f.metadata for f in dataclasses.fields(cls) if f.name == name)
+
+
+def _free(case, name, spec):
+    describe(case.loop, name)
+    good = isinstance(spec, list) and len(spec) in (2, 3) and _is_numeric(spec[:2])
+    if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
+        raise InputError(f'free.{name} = {spec!r}: must be [low, high] or [low, high, "log" or "linear"]')
+    return Free(*(float(v) for v in spec[:2]), *spec[2:])
+
+
+def _set_clock(clock, name, value):
+    field = name.removeprefix("clock.")
+    if field not in CLOCK_UNITS:
+        raise unknown("parameter", name, [f"clock.{f}" for f in CLOCK_UNITS])
+    if field in ("dt", "duration"):
+        value = _number(name, value)
+    elif field == "substeps" and isinstance(value, float) and value == int(value):
+        value = int(value)
+    clock = dataclasses.replace(clock, **{field: value})
+    check_clock(clock)
+    return clock
+
+
+def _set_static(tree, name, path, value, meta):
+    if len(path) > 1:
+        return dataclasses.replace(tree, **{path[0]: _set_static(getattr(tree, path[0]), name, path[1:], value, meta)})
+    split_index(name)
+    old = getattr(tree, path[0])
+    if isinstance(old, tuple):
+        raise InputError(f"{name} is the topology of the rig and cannot be set: choose another case")
+    if meta["choices"] is not None:
+        if value not in meta["choices"] or isinstance(value, bool) != isinstance(old, bool):
+            raise InputError(f"{name} = {value!r}: must be one of {', '.join(str(c).lower() if isinstance(c, bool) else c for c in meta['choices'])}")
+        return dataclasses.replace(tree, **{path[0]: value})
+    value = _number(name, value)
+    if isinstance(old, int) and value != int(value):
+        raise InputError(f"{name} = {value:g}: must be a whole number")
+    check_value(name, value, meta)
+    return dataclasses.replace(tree, **{path[0]: type(old)(value)})
+
+
+def _number(name, value):
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{name} = {value!r}: must be a number")
+    return float(value)
+
+
+def _is_numeric(value):
+    if isinstance(value, list):
+        return all(_is_numeric(v) for v in value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _unit(meta):
+    return "" if meta["unit"] == "-" else f" [{meta['unit']}]"
+
+
+def _line(name, value, meta):
+    note = " ".join(filter(None, ["" if meta["unit"] == "-" else f"[{meta['unit']}]", meta["doc"]]))
+    return f"{_toml(name)} = {_toml(value)}" + (f"  # {note}" if note else "")
+
+
+def _toml(value):
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    return repr(value)
+
+
+__all__ = ["Case", "check", "dump", "from_table", "load", "open_case", "save", "set_values"]

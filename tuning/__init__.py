@@ -1,0 +1,30 @@
+"""What one does with a loop: tune its gains through the simulation, under limits.
+
+    import tuning
+    from jaxtank import presets
+
+    result = tuning.tune(presets.load("gouta2015").cases["backstepping"])
+    print(result)
+    result.save("tuned")
+"""
+
+import importlib
+
+_HOMES = {
+    "Bound": "tuning.bounds",
+    "Problem": "tuning.objective",
+    "TuningResult": "tuning.search",
+    "tune": "tuning.search",
+}
+
+__all__ = list(_HOMES)
+
+
+def __getattr__(name):
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'tuning' has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted([*globals(), *__all__])

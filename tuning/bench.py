@@ -1,0 +1,136 @@
+"""`jaxtank bench`: what a closed-loop step costs here, beside a C loop of the same arithmetic."""
+
+import ctypes
+import shutil
+import statistics
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import presets
+from jaxtank.tree import with_values
+from tuning import report
+from tuning.search import provenance
+
+MEASURES = ("rms_error_total", "max_level")
+CASES = ("gouta2015/backstepping", "gouta2015/ngpc", "gouta2015/backstepping-ff", "gouta2015/ngpc-boxqp")
+SOURCE = Path(__file__).with_name("floor.c")
+
+
+def c_loop(folder):
+    """The C loop of floor.c, built with gcc -O3 -march=native in `folder`; None where there is no gcc."""
+    if shutil.which("gcc") is None:
+        return None
+    library = Path(folder) / "floor.so"
+    subprocess.run(["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True)
+    function = ctypes.CDLL(str(library)).four_tank
+    function.restype = ctypes.c_double
+    return function
+
+
+def c_runner(function, case, rk4=True):
+    """A call of the C loop with the numbers of `case` (backstepping as printed): () -> (rms error [cm], highest levels [cm])."""
+    plant, law, clock = case.loop.plant, case.loop.controller, case.clock
+    numbers = np.concatenate([plant.area, plant.drain[:2], plant.orifice, plant.pump_gain, [float(plant.gravity), plant.knee]])
+    r = np.ascontiguousarray(np.array(case.loop.reference.sample(clock)[0]))
+    x0, result = np.array(case.loop.x0, dtype=float), np.zeros(5)
+
+    def pointer(array):
+        return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+    real = [float(clock.dt), float(law.k), float(law.k1), float(law.level_floor), float(case.loop.actuator.high[0])]
+    dt, *rest = (ctypes.c_double(v) for v in real)
+
+    def run():
+        rms = function(pointer(numbers), ctypes.c_long(clock.samples), dt, int(rk4), *rest, pointer(x0), pointer(r), pointer(result))
+        return rms, result[1:].copy()
+
+    return run
+
+
+def timed(calls, rounds):
+    """{name: [seconds of each round]}: every call once a round, in turn, after a warm-up; {name: first result}."""
+    results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
+    seconds = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            began = time.perf_counter()
+            jax.block_until_ready(call())
+            seconds[name].append(time.perf_counter() - began)
+    return seconds, results
+
+
+def measure(rounds=7):
+    """The figures of `jaxtank bench`, as a table for JSON."""
+    cases = {name: presets.find(name) for name in CASES}
+    first = cases[CASES[0]]
+    gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
+    derivative = jax.jit(jax.jacfwd(lambda v: lp.evaluate(with_values(first.loop, v), first.clock, MEASURES)["rms_error_total"]))
+    compile_s = {}
+    calls = {}
+    for name, case in cases.items():
+        calls[name] = lambda case=case: lp.evaluate(case.loop, case.clock, MEASURES)
+    calls["jacfwd for 2 gains"] = lambda: derivative(gains)
+    calls["gradient, Gauss-Newton and maxima for 2 gains"] = lambda: lp.sensitivities(first.loop, first.clock, MEASURES, gains)
+    for name, call in calls.items():
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        compile_s[name] = time.perf_counter() - began
+    with tempfile.TemporaryDirectory() as folder:
+        function = c_loop(folder)
+        if function is not None:
+            calls["C loop, backstepping"] = c_runner(function, first)
+        seconds, results = timed(calls, rounds)
+    medians = {name: statistics.median(s) for name, s in seconds.items()}
+    base = medians[CASES[0]]
+    rows = {
+        name: {
+            "ns_per_step": 1e9 * medians[name] / first.clock.samples,
+            "ms": 1e3 * medians[name],
+            "spread": (max(s) - min(s)) / medians[name],
+            "first_call_s": compile_s.get(name),
+            "times_the_run": medians[name] / base,
+        }
+        for name, s in seconds.items()
+    }
+    found = {"steps": first.clock.samples, "rounds": rounds, "rows": rows, "provenance": provenance(first, None)}
+    if "C loop, backstepping" in seconds:
+        rms, top = results["C loop, backstepping"]
+        ours = results[CASES[0]]
+        found["ratio_to_c"] = statistics.median(a / b for a, b in zip(seconds[CASES[0]], seconds["C loop, backstepping"]))
+        found["difference_to_c_cm"] = float(max(abs(rms - float(ours["rms_error_total"])), np.max(np.abs(top - np.asarray(ours["max_level"])))))
+    found["notes"] = _notes(found, function)
+    return found
+
+
+def _notes(found, function):
+    notes = []
+    if not found["provenance"]["xla_option"]:
+        notes.append("the XLA option for fast loops is off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): runs are about 16 times slower")
+    if function is None:
+        notes.append("no gcc here, so there is no C loop to compare with")
+    if found["provenance"]["backend"] != "cpu":
+        notes.append(f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small steps and belongs on a CPU")
+    return notes
+
+
+def text(found):
+    """The page of `jaxtank bench`."""
+    rows = [
+        [n, f"{r['ns_per_step']:.0f}", f"{r['ms']:.2f}", f"{100 * r['spread']:.0f} %", "-" if r["first_call_s"] is None else f"{r['first_call_s']:.2f}", f"{r['times_the_run']:.2f}"]
+        for n, r in found["rows"].items()
+    ]
+    lines = [
+        f"one run of {found['steps']} steps, float64, {found['provenance']['integrator']}; medians of {found['rounds']} interleaved rounds",
+        "",
+        report.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
+    ]
+    if "ratio_to_c" in found:
+        lines += ["", f"backstepping over the C loop of the same arithmetic (gcc -O3 -march=native): {found['ratio_to_c']:.2f}; "
+                  f"the two agree to {found['difference_to_c_cm']:.1e} cm"]
+    return "\n".join([*lines, *found["notes"]])

@@ -1,0 +1,70 @@
+"""Where a value may lie, and the scale on which it is searched."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxtank.errors import InputError
+from jaxtank.presets.base import Free
+from jaxtank.tree import check_value, describe, get_value, split_index
+
+
+class Bound(NamedTuple):
+    """One scalar parameter: its dotted name, range and unit. The search sees z in [0, 1], logarithmic or linear in the value."""
+
+    name: str
+    low: float
+    high: float
+    scale: str  # "log" or "linear"
+    unit: str
+
+    def to_unit(self, value):
+        """z in [0, 1] of a value; values outside the range give z outside [0, 1]."""
+        if self.scale == "log":
+            return np.log(value / self.low) / math.log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
+
+    def from_unit(self, z):
+        """The value at z; the ends are met exactly. Numbers or arrays."""
+        z = np.asarray(z, dtype=float)
+        if self.scale == "log":
+            value = self.low * np.exp(z * math.log(self.high / self.low))
+        else:
+            value = self.low + z * (self.high - self.low)
+        return np.where(z <= 0, self.low, np.where(z >= 1, self.high, value))
+
+    def slope(self, value):
+        """d value / d z."""
+        return value * math.log(self.high / self.low) if self.scale == "log" else np.full_like(value, self.high - self.low)
+
+
+def bounds(loop, free):
+    """The Bounds of {name: Free}; the name of an array stands for all its entries.
+
+    Raises InputError for an unknown name, a range that is empty, not finite or outside what the parameter allows.
+    """
+    if not free:
+        raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
+    found = []
+    for name, spec in free.items():
+        low, high, scale = Free(*spec)
+        meta = describe(loop, name)
+        if meta["kind"] == "static":
+            raise InputError(f"{name} cannot be tuned: it is part of the compiled program, not a number with a derivative")
+        unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise InputError(f"--free {name}={low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
+        for end in (low, high):
+            check_value(f"--free {name}", end, meta)
+        if scale == "log" and low <= 0:
+            scale = "linear"
+        base, index = split_index(name)
+        value = get_value(loop, name)
+        names = [name] if np.ndim(value) == 0 else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
+        found += [Bound(n, float(low), float(high), scale, meta["unit"]) for n in names]
+    names = [b.name for b in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"--free {name} is given twice")
+    return found

@@ -1,0 +1,330 @@
+"""The command `jaxtank`. Results on stdout, progress and errors on stderr.
+
+Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing written), 3 not converged, 4 limits cannot
+be met, 130 interrupted (the best point so far is written and said). Nothing heavy is imported before the arguments are read.
+"""
+
+import argparse
+import os
+import sys
+
+from jaxtank.errors import InputError, NonFiniteError, nearest
+
+EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
+
+
+class Parser(argparse.ArgumentParser):
+    """Errors in one line, with the nearest valid word."""
+
+    def error(self, message):
+        words = [w.strip("'") for w in message.split() if w.startswith("'")] if "invalid choice" in message else []
+        if words:
+            choices = [w.strip("(),'") for w in message.split("choose from")[-1].split()]
+            message = f"unknown {'command' if 'command' in message else 'choice'} {words[0].rstrip(',')!r}{nearest(words[0], choices)}"
+        elif "unrecognized arguments:" in message:
+            word = message.split(": ", 1)[1].split()[0]
+            known = [o for a in self._every_action() for o in a.option_strings]
+            message = f"unknown option {word!r}{nearest(word.split('=')[0], known)}"
+        raise InputError(message)
+
+    def _every_action(self):
+        for action in self._actions:
+            yield action
+            if isinstance(action, argparse._SubParsersAction):
+                for parser in action.choices.values():
+                    yield from parser._actions
+
+
+def parser():
+    """The argument parser of every command."""
+    top = Parser(prog="jaxtank", description="Differentiable liquid-tank rigs, the controllers of five papers, and a tuner that works "
+                 "through the simulation.", epilog="Start with: jaxtank list; jaxtank tune gouta2015/backstepping --out tuned")
+    top.add_argument("--version", action="store_true", help="print the version and exit")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND")
+
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--json", action="store_true", help="one JSON object on stdout instead of tables")
+    common.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+    case = argparse.ArgumentParser(add_help=False)
+    case.add_argument("case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml')
+    case.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="values", help="set a parameter by its dotted name; repeatable")
+    case.add_argument("--dt", type=str, metavar="S", help="sampling period [s], short for --set clock.dt=S")
+
+    run = argparse.ArgumentParser(add_help=False)
+    run.add_argument("--seed", default="0", metavar="N", help="seed of the sensor noise and of the search (default 0)")
+    run.add_argument("--out", metavar="DIR", help="folder for result.json, CSV, pictures and the rig")
+
+    commands.add_parser("list", parents=[common], help="print every case")
+    commands.add_parser("show", parents=[common, case], help="one case: rig, law, every parameter, published numbers, departures")
+    commands.add_parser("simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures")
+    tune = commands.add_parser("tune", parents=[common, case, run], help="tune the gains of a case under its limits")
+    tune.add_argument("--method", default="auto", metavar="NAME", help="auto (default), trf, slsqp, lbfgs or adam")
+    tune.add_argument("--free", action="append", default=[], metavar="NAME=LOW:HIGH", help="a parameter to tune; replaces the case's own; repeatable")
+    tune.add_argument("--limit", action="append", default=[], metavar="MEASURE=VALUE", help="a hard limit; MEASURE=none drops one, none drops all; repeatable")
+    tune.add_argument("--objective", action="append", default=[], metavar="MEASURE=WEIGHT", help="what is made small (default rms_error_total=1); repeatable")
+    tune.add_argument("--starts", default="8", metavar="N", help="local searches (default 8)")
+    tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
+    tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
+    commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
+    bench = commands.add_parser("bench", parents=[common], help="ns per closed-loop step here, beside a C loop")
+    bench.add_argument("--rounds", default="7", metavar="N", help="interleaved rounds to take the median of (default 7)")
+    return top
+
+
+def main(argv=None):
+    """Run the command; returns the exit code."""
+    try:
+        args = parser().parse_args(argv)
+        if args.version:
+            import jaxtank
+
+            print(jaxtank.__version__)
+            return 0
+        if args.command is None:
+            raise InputError("no command: try jaxtank --help")
+        return COMMANDS[args.command](args)
+    except (InputError, NonFiniteError) as error:
+        print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("jaxtank: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone; nothing more to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except Exception as error:
+        if os.environ.get("JAXTANK_TRACEBACK"):
+            raise
+        print(f"jaxtank: internal error: {type(error).__name__}: {_one_line(error)} (JAXTANK_TRACEBACK=1 shows where)", file=sys.stderr)
+        return 1
+
+
+def _one_line(error):
+    return " ".join(str(error).split())
+
+
+def _open(args):
+    """The checked case of the command line, in float64."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxtank import rig
+
+    case = rig.open_case(args.case)
+    values = dict(_pair("--set", text, parse_value) for text in args.values)
+    if args.dt is not None:
+        values["clock.dt"] = _number("--dt", args.dt)
+    return rig.check(rig.set_values(case, values)) if values else rig.check(case)
+
+
+def _pair(option, text, read):
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise InputError(f"{option} {text!r}: must be NAME=VALUE")
+    return name.strip(), read(value.strip())
+
+
+def parse_value(text):
+    """A number, a truth value, a list of numbers ("1,2" or "[1,2]"), or the text itself."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    parts = [p for p in inner.split(",") if p.strip()]
+    try:
+        found = [_plain_number(p) for p in parts]
+    except ValueError:
+        return text
+    return found if len(found) != 1 or inner is not text else found[0]
+
+
+def _plain_number(text):
+    """An int where it is written as one, else a float; underscores are not numbers."""
+    if "_" in text:
+        raise ValueError(text)
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
+
+
+def _number(option, text):
+    try:
+        return float(_plain_number(text))
+    except ValueError:
+        raise InputError(f"{option} {text!r}: must be a number") from None
+
+
+def _whole(option, text, low, high):
+    try:
+        value = int(text)
+    except ValueError:
+        value = None
+    if value is None or not low <= value <= high:
+        raise InputError(f"{option} {text!r}: must be a whole number from {low} to {high}")
+    return value
+
+
+def _seed(args):
+    return _whole("--seed", args.seed, 0, 2**31 - 1)
+
+
+def _out(args):
+    if args.out is not None:
+        from jaxtank.files import check_folder
+
+        check_folder(args.out)
+
+
+def _range(text):
+    parts = text.split(":")
+    try:
+        low, high = (float(_plain_number(p)) for p in parts[:2])
+    except ValueError:
+        raise InputError(f"--free range {text!r}: must be LOW:HIGH") from None
+    if len(parts) > 3 or (len(parts) == 3 and parts[2] not in ("log", "linear")):
+        raise InputError(f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
+    return (low, high, parts[2] if len(parts) == 3 else "log" if low > 0 else "linear")
+
+
+def _limits(args, case):
+    limits = dict(case.limits)
+    for text in args.limit:
+        if text == "none":
+            limits = {}
+            continue
+        measure, value = _pair("--limit", text, parse_value)
+        from jaxtank.measures import check_names
+
+        check_names([measure])
+        if value == "none":
+            limits.pop(measure, None)
+        else:
+            limits[measure] = value
+    return limits
+
+
+def _list(args):
+    from jaxtank import presets
+    from tuning import report
+
+    cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
+    print(report.dumps(cases) if args.json else report.table([[n, t] for n, t in cases.items()], ["case", ""]))
+    return 0
+
+
+def _show(args):
+    case = _open(args)
+    from tuning import manual, report
+
+    print(report.dumps(manual.json_of(case)) if args.json else manual.text(case))
+    return 0
+
+
+def _init(args):
+    case = _open(args)
+    from jaxtank import rig
+
+    print(rig.dump(case), end="")
+    return 0
+
+
+def _simulate(args):
+    _out(args)
+    seed, case = _seed(args), _open(args)
+    import jax
+
+    from jaxtank import loop
+    from jaxtank import measures as ms
+    from tuning import manual, report, search
+
+    key = jax.random.key(seed) if manual.noisy(case) else None
+    values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
+    payload = {
+        "case": case.name,
+        "measures": report.measures_json(values),
+        "units": report.units(),
+        "reasons": report.reasons(values),
+        "clock": manual.clock(case.clock),
+        "parameters": report.clean(loop.parameters(case.loop)),
+        "provenance": search.provenance(case, seed),
+    }
+    written = report.save_run(case, report.run_for_people(case, key), payload, args.out) if args.out else []
+    if args.json:
+        print(report.dumps(payload))
+    else:
+        print(f"{case.name}: {case.title}\n")
+        rows = [[m, s.unit, report.numbers(values[m]), s.doc] for m, s in ms.MEASURES.items() if m in values and m != "time_of_max_level"]
+        print(report.table(rows, ["measure", "unit", "value", ""]))
+    _written(written, args)
+    return 0
+
+
+def _tune(args):
+    _out(args)
+    seed, case = _seed(args), _open(args)
+    from tuning import report, search
+
+    free = dict(_pair("--free", text, _range) for text in args.free) or None
+    objective = dict(_pair("--objective", text, lambda v: _number("--objective", v)) for text in args.objective) or None
+    result = search.tune(
+        case,
+        args.method,
+        free=free,
+        objective=objective,
+        limits=_limits(args, case),
+        starts=_whole("--starts", args.starts, 1, 1000),
+        seed=seed,
+        screening=_whole("--screening", args.screening, 1, 65536),
+        iterations=_whole("--iterations", args.iterations, 1, 100_000),
+        progress=None if args.quiet else Progress(report.objective_unit(objective or case.objective)),
+    )
+    if not args.quiet and sys.stderr.isatty():
+        print(file=sys.stderr)
+    written = result.save(args.out) if args.out else []
+    print(report.dumps(report.json_of(result)) if args.json else report.text(result))
+    _written(written, args)
+    if not args.out and not args.json and not args.quiet:
+        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
+    return EXIT[result.status]
+
+
+class Progress:
+    """A line per evaluation on a terminal, a line per local search elsewhere."""
+
+    def __init__(self, unit):
+        self.unit, self.last, self.terminal = unit, None, sys.stderr.isatty()
+
+    def __call__(self, event):
+        if not self.terminal and event["start"] == self.last:
+            return
+        self.last = event["start"]
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}"
+        line = f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation {event['evaluations']}  best {best}"
+        print(f"\r{line:<70}" if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
+
+
+def _written(paths, args):
+    if paths and not args.quiet:
+        print(f"written to {args.out}: " + ", ".join(p.name for p in paths), file=sys.stderr)
+
+
+def _bench(args):
+    rounds = _whole("--rounds", args.rounds, 1, 1000)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from tuning import bench, report
+
+    result = bench.measure(rounds)
+    print(report.dumps(result) if args.json else bench.text(result))
+    return 0
+
+
+COMMANDS = {"list": _list, "show": _show, "simulate": _simulate, "tune": _tune, "init": _init, "bench": _bench}
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Tables, JSON and pictures of a result."""
+
+import io
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import measures as ms
+from jaxtank import rig
+from jaxtank.files import check_folder, write_atomic
+
+SHOWN = ("rms_error", "rms_error_total", "max_error", "max_level", "min_level", "overshoot_percent", "settling_time", "rms_input",
+         "input_travel", "saturated_fraction")
+REASONS = {
+    "overshoot_percent": "the reference does not change",
+    "rise_time": "no change of the setpoint was followed to 90 % of its height",
+    "settling_time": "the reference does not change, or an output never left the band",
+    "recovery_time": "this case has no disturbance to recover from",
+}
+ABSENT = "the value is not a finite number"
+
+
+def number(value, digits=5):
+    """A number for people: at most `digits` significant digits, a dash where there is none."""
+    value = float(value)
+    if not math.isfinite(value):
+        return "-"
+    if value == 0:
+        return "0"
+    text = f"{value:.{digits}g}"
+    return text if "e" not in text else f"{value:.{digits - 1}e}"
+
+
+def numbers(value, digits=5):
+    """The entries of a measure, side by side."""
+    return "  ".join(number(v, digits) for v in np.ravel(value))
+
+
+def clean(value):
+    """`value` for JSON: arrays as lists, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {k: clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [clean(v) for v in value]
+    if isinstance(value, (np.ndarray, np.generic)) or hasattr(value, "__jax_array__") or type(value).__module__.startswith("jax"):
+        return clean(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def reasons(measures):
+    """{measure: why} for every measure with an entry that is not a number."""
+    found = {m: REASONS.get(m, ABSENT) for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float)))}
+    return {**found, "recovery_time": REASONS["recovery_time"]}
+
+
+def measures_json(measures):
+    """Measures as JSON, `recovery_time` among them (null until a case has disturbances)."""
+    return {**clean({m: v for m, v in measures.items() if m != "time_of_max_level"}), "recovery_time": None}
+
+
+def dumps(table):
+    """One JSON object as text; refuses NaN."""
+    return json.dumps(table, indent=2, allow_nan=False)
+
+
+def units():
+    """{measure: unit} of everything that is reported."""
+    return {**{m: spec.unit for m, spec in ms.MEASURES.items()}, "recovery_time": "s"}
+
+
+def table(rows, head=None):
+    """Rows of text as aligned columns, the first to the left."""
+    rows = ([head] if head else []) + [[str(c) for c in row] for row in rows]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
+    return "\n".join(lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines)
+
+
+def json_of(result):
+    """The JSON object of `jaxtank tune --json`."""
+    return {
+        "case": result.tuned.name,
+        "method": result.method,
+        "success": result.success,
+        "status": result.status,
+        "message": result.message,
+        "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
+        "interval_reason": "no measurements were fitted, so there is no confidence interval",
+        "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
+        "measures": {"before": measures_json(result.measures["before"]), "after": measures_json(result.measures["after"])},
+        "reasons": reasons({**result.measures["before"], **result.measures["after"]}),
+        "units": units(),
+        "constraints": clean(result.constraints),
+        "evaluations": result.evaluations,
+        "starts": clean(result.starts),
+        "optimality": clean(result.optimality),
+        "wall_s": result.wall_s,
+        "bound": None,
+        "validation": None,
+        "provenance": result.provenance,
+    }
+
+
+def text(result):
+    """The result as a page of text."""
+    unit = objective_unit(result.objective["terms"])
+    head = [f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
+            f"{result.evaluations['gradients']} of them with gradients, {result.wall_s:.1f} s)", ""]
+    rows = [
+        [n, p["unit"], number(p["before"]), number(p["after"]), f"{number(p['lower'])} : {number(p['upper'])}", f"at {p['at_bound']} bound" if p["at_bound"] else ""]
+        for n, p in result.parameters.items()
+    ]
+    parts = [table(rows, ["parameter", "unit", "before", "after", "range", ""]), ""]
+    rows = [["objective", unit, number(result.objective["before"]), number(result.objective["after"])]]
+    for m in SHOWN:
+        if m in result.measures["after"] and not (m == "rms_error_total" and set(result.objective["terms"]) == {m}):
+            rows.append([m, ms.MEASURES[m].unit, numbers(result.measures["before"][m], 4), numbers(result.measures["after"][m], 5 if "level" in m else 4)])
+    parts += [table(rows, ["measure", "unit", "before", "after"]), ""]
+    if result.constraints:
+        rows = [
+            [c["name"], c["unit"], number(c["limit"], 7), number(c["value"], 7), number(c["margin"], 3), f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-"]
+            for c in result.constraints
+        ]
+        parts += [table(rows, ["limit", "unit", "at most" if not any("min_level" in c["measure"] for c in result.constraints) else "limit", "value", "margin", "reached at"]), ""]
+    rims = "rims are physics: liquid past them is lost" if result.tuned.loop.plant.overflow else "rims are limits: a level may rise past one"
+    return "\n".join([*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s", _wrap(result.message)])
+
+
+def _wrap(message):
+    return "\n".join(f"- {part}" for part in message.split("; "))
+
+
+def objective_unit(terms):
+    """Unit of a weighted sum: that of its only measure, or a plain number."""
+    found = {ms.MEASURES[m].unit for m in terms}
+    return found.pop() if len(found) == 1 else "-"
+
+
+def trajectory_csv(run):
+    """A trajectory as CSV with units in the header."""
+    columns = [("t [s]", np.asarray(run.t))]
+    for name, field, unit in (("h", "x", "cm"), ("y", "y", "cm"), ("r", "r", "cm"), ("u", "u", "V"), ("command", "command", "V"), ("spilled", "spilled", "cm^3")):
+        values = np.asarray(getattr(run, field))
+        columns += [(f"{name}{i + 1} [{unit}]", values[:, i]) for i in range(values.shape[1])]
+    out = io.StringIO()
+    out.write(",".join(head for head, _ in columns) + "\n")
+    np.savetxt(out, np.column_stack([values for _, values in columns]), delimiter=",", fmt="%.10g")
+    return out.getvalue()
+
+
+def run_for_people(case, key=None, rows=3000):
+    """A Trajectory of about `rows` rows, as host arrays."""
+    run = lp.simulate(case.loop, case.clock, key, save_every=max(1, (case.clock.samples - 1) // rows))
+    return type(run)(*(np.asarray(v) for v in run))
+
+
+def _png(figure):
+    import matplotlib.pyplot as plt
+
+    out = io.BytesIO()
+    figure.savefig(out, format="png", metadata={"Software": None})
+    plt.close(figure)
+    return out.getvalue()
+
+
+def figures(result, runs=None):
+    """Matplotlib figures of a tuning result: "responses" (before against after), "convergence", "landscape"."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting
+
+    key = result.problem.key
+    runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    unit = objective_unit(result.objective["terms"])
+    tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level"}
+    limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
+    title = f"{result.tuned.name}: objective {number(result.objective['before'], 4)} -> {number(result.objective['after'], 4)} {unit}   (" + ", ".join(
+        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}" for n, p in list(result.parameters.items())[:4]
+    ) + ")"
+    drawn = {"responses": plotting.responses(result.tuned.loop, runs, title, limits)}
+    with plt.rc_context(plotting.STYLE):
+        if result.history:
+            figure, ax = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+            plotting.convergence(ax, result.history, unit, bool(result.problem.limits))
+            drawn["convergence"] = figure
+        figure, ax = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
+        _landscape(ax, result, unit)
+        drawn["landscape"] = figure
+    return drawn
+
+
+def _landscape(ax, result, unit):
+    """The objective around the answer at the case's own step: along one parameter, or over the two that it feels most."""
+    from jaxtank import plotting
+
+    problem = result.problem
+    z = np.array([float(b.to_unit(p["after"])) for b, p in zip(problem.bounds, result.parameters.values())])
+    z0 = problem.start()
+    if len(z) == 1:
+        grid = np.linspace(0.0, 1.0, 128)
+        costs, margins = problem.screen(grid[:, None], problem.clock)
+        violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
+        b = problem.bounds[0]
+        return plotting.curve(
+            ax, b.from_unit(grid), costs, violation, b.name, b.unit, unit,
+            (result.parameters[b.name]["before"], result.objective["before"]), (result.parameters[b.name]["after"], result.objective["after"]), b.scale == "log",
+        )
+    first, second = sorted(np.argsort(-_felt(problem, z))[:2])
+    side = np.linspace(0.0, 1.0, 24)
+    a, c = np.meshgrid(side, side)
+    points = np.tile(z, (a.size, 1))
+    points[:, first], points[:, second] = a.ravel(), c.ravel()
+    costs, margins = problem.screen(points, problem.clock)
+    worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
+    x, y = problem.bounds[first], problem.bounds[second]
+    plotting.contours(
+        ax, x.from_unit(a), y.from_unit(c), costs.reshape(a.shape), worst.reshape(a.shape), (x.name, y.name), (x.unit, y.unit), unit,
+        (x.from_unit(z0[first]), y.from_unit(z0[second])), (x.from_unit(z[first]), y.from_unit(z[second])), (x.scale == "log", y.scale == "log"),
+    )
+    if len(z) > 2:
+        ax.set_title("landscape (slice through the answer)")
+    return ax
+
+
+def _felt(problem, z):
+    """(P,) how strongly the cost curves along each parameter."""
+    if len(z) == 2:
+        return np.ones(2)
+    diagonal = np.diag(problem.point(z).gauss_newton)
+    return np.where(np.isfinite(diagonal), diagonal, 0.0)
+
+
+def save(result, folder):
+    """Write result.json, rig.toml, trajectory.csv and PNG pictures to `folder`, each whole or not at all; returns their paths."""
+    check_folder(folder)
+    folder = Path(folder)
+    key = result.problem.key
+    runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    files = {
+        "result.json": dumps(json_of(result)) + "\n",
+        "rig.toml": rig.dump(result.tuned),
+        "trajectory.csv": trajectory_csv(runs["after"]),
+        "before.csv": trajectory_csv(runs["before"]),
+        **{f"{name}.png": _png(figure) for name, figure in figures(result, runs).items()},
+    }
+    return write_files(folder, files)
+
+
+def save_run(case, run, payload, folder):
+    """Write result.json, trajectory.csv and responses.png of one simulation to `folder`."""
+    from jaxtank import plotting
+
+    check_folder(folder)
+    picture = plotting.responses(case.loop, {case.name: run}, case.title)
+    return write_files(Path(folder), {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run), "responses.png": _png(picture)})
+
+
+def write_files(folder, files):
+    """Write {name: text or bytes} to `folder`, made if need be; returns the paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        write_atomic(folder / name, data)
+    return [folder / name for name in files]

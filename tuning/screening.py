@@ -1,0 +1,108 @@
+"""Where to start: Sobol points at a coarse step, and which of them only the coarse step makes unstable."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+from jaxtank import loop as lp
+from jaxtank.analysis import equilibrium
+from jaxtank.errors import InputError
+from jaxtank.loop import Inputs
+from jaxtank.tree import with_values
+
+COARSE = 10
+"""How many samples of the case make one of the coarse stage."""
+
+
+def coarse_clock(clock):
+    """The clock of the coarse stage: ten times the step, where that leaves at least a thousand samples; else the clock itself."""
+    if clock.samples < 1000 * COARSE:
+        return clock
+    return dataclasses.replace(clock, dt=clock.dt * COARSE)
+
+
+def sobol(count, dimensions, seed):
+    """(count, dimensions) scrambled Sobol points in the unit cube; count should be a power of 2."""
+    return qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(count)
+
+
+def spectral_radius(problem, zs, clock):
+    """(points,) largest modulus of the eigenvalues of one sample of the loop, linearised at the reference's plateaus.
+
+    Above 1, the sampled loop is unstable there: it chatters between the limits of the pumps however good its gains would be at a
+    smaller step. Points (points, P); NaN where no plateau has a steady state.
+    """
+    steady = []
+    plateaus = problem.loop.reference.plateaus() if hasattr(problem.loop.reference, "plateaus") else []
+    for r in plateaus:
+        try:
+            steady.append((r, *equilibrium(problem.loop.plant, r)))
+        except InputError:
+            continue
+    if not steady:
+        return np.full(len(zs), np.nan)
+    r, x, u = (jnp.asarray(np.array(column)) for column in zip(*steady))
+    values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(problem.bounds)}
+    steps = np.asarray(_one_step_jacobians(problem.loop, clock, values, r, x, u))
+    return np.abs(np.linalg.eigvals(steps)).max(axis=(1, 2))
+
+
+@functools.partial(jax.jit, static_argnames=("clock",))
+def _one_step_jacobians(loop, clock, values, r, x, u):
+    """(points, plateaus, n, n) derivative of the loop's state after a sample by the state before it."""
+
+    def jacobian(values, r, x, u):
+        here = with_values(loop, {**values, "x0": x, "actuator.initial": u})
+        state = lp.initial(here, clock)
+        leaves, structure = jax.tree.flatten(state)
+        moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
+        zero = jnp.zeros_like(r)
+        d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
+        now = Inputs(r=tuple(r), dr=tuple(zero), ddr=tuple(zero), d=d, xi=None, window=None)
+
+        def after(flat):
+            floats, rest = iter(unravel(flat)), iter([v for v, m in zip(leaves, moves) if not m])
+            state = jax.tree.unflatten(structure, [next(floats) if m else next(rest) for m in moves])
+            out = jax.tree.leaves(lp.step(here, clock, state, now)[0])
+            return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
+
+        flat, unravel = jax.flatten_util.ravel_pytree([v for v, m in zip(leaves, moves) if m])
+        return jax.jacfwd(after)(flat)
+
+    return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)
+
+
+def screen(problem, count, seed):
+    """(zs, costs, margins, redone): `count` Sobol points, costs in the order of zs.
+
+    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run again at the true step (`redone` of them).
+    """
+    zs = sobol(count, len(problem.bounds), seed)
+    clock = coarse_clock(problem.clock)
+    costs, margins = problem.screen(zs, clock)
+    suspect = ~np.isfinite(costs)
+    if clock != problem.clock:
+        suspect |= (spectral_radius(problem, zs, clock) > 1.0) & ~(spectral_radius(problem, zs, problem.clock) > 1.0)
+        if suspect.any():
+            # always the same number of lanes, so that one compiled program serves every search
+            again = np.concatenate([zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)])
+            true_costs, true_margins = problem.screen(again, problem.clock)
+            costs[suspect], margins[suspect] = true_costs[: suspect.sum()], true_margins[: suspect.sum()]
+    return zs, costs, margins, int(suspect.sum())
+
+
+def distinct_starts(zs, merits, count, first):
+    """Up to `count` points: `first`, then those of lowest merit that keep their distance from all taken so far."""
+    taken = [np.asarray(first, dtype=float)]
+    apart = 0.5 / max(2, count) * np.sqrt(len(first))
+    order = [i for i in np.argsort(merits, kind="stable") if np.isfinite(merits[i])]
+    while len(taken) < count and order and apart > 1e-4:
+        for i in order:
+            if len(taken) < count and min(np.linalg.norm(zs[i] - t) for t in taken) > apart:
+                taken.append(zs[i])
+        apart /= 2
+    return taken

@@ -1,0 +1,161 @@
+"""Local searches from one start. Each takes a Search, which counts, remembers and shields; each may stop early, none may fail."""
+
+import numpy as np
+import optax
+from scipy.optimize import least_squares, minimize, nnls
+
+BACKOFF = 1e-6
+"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
+
+
+class Search:
+    """A problem as a solver sees it: scaled cost, margins, memory of the last points, the best one so far."""
+
+    def __init__(self, problem, reference, report):
+        self.problem, self.report = problem, report
+        self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
+        self.room = np.array([max(abs(limit.value), 1.0) for limit in problem.limits])
+        self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
+
+    def point(self, z):
+        """The Point at z, clipped into the box; remembered."""
+        z = np.clip(z, 0.0, 1.0)
+        key = z.tobytes()
+        if key not in self.memory:
+            point = self.problem.point(z)
+            self.memory[key] = point
+            self.history.append((self.start, point.cost, self.violation(point), tuple(z)))
+            if point.finite:
+                self.last_finite = point
+                if self.best is None or self.better(point, self.best):
+                    self.best = point
+            self.report(self)
+        return self.memory[key]
+
+    def violation(self, point):
+        """Largest amount by which a limit is broken, in the measure's unit; 0 where all hold."""
+        return float(max(0.0, *(-point.margins))) if len(point.margins) else 0.0
+
+    def better(self, a, b):
+        """True if a is to be preferred: fewer violations first, then lower cost."""
+        va, vb = self.violation(a), self.violation(b)
+        return va < vb if max(va, vb) > 0 and va != vb else a.cost < b.cost
+
+    def cost(self, z):
+        """(scaled cost, gradient). A point that is not finite costs ten times the start and points back to the last good one."""
+        point = self.point(z)
+        if point.finite:
+            return point.cost / self.scale, point.gradient / self.scale
+        return 10.0, (point.z - self.last_finite.z) * 10.0
+
+    def margins(self, z):
+        """((limits,) margins as shares of their limits, less the back-off, (limits, P) slopes)."""
+        point = self.point(z)
+        good = point if point.finite else self.last_finite
+        return good.margins / self.room - BACKOFF, good.margin_slopes / self.room[:, None]
+
+
+def slsqp(search, z, iterations, tolerance=1e-8):
+    """Sequential quadratic programming on the exact maxima. Returns True if it converged."""
+    constraints = []
+    if search.problem.limits:
+        constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
+    done = minimize(
+        search.cost, z, jac=True, method="SLSQP", bounds=[(0.0, 1.0)] * len(z), constraints=constraints,
+        options={"maxiter": iterations, "ftol": tolerance},
+    )
+    # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
+    return bool(done.success) or done.status == 8
+
+
+def trf(search, z, iterations, tolerance=1e-10):
+    """Bounded Gauss-Newton trust region on the mean squared tracking error, P + 1 residuals that give the same model as all samples."""
+
+    def model(z):
+        point = search.point(z)
+        if not point.finite:
+            return np.full(len(z) + 1, 1e3), np.eye(len(z) + 1, len(z))
+        normal = 0.5 * point.gauss_newton / search.scale**2
+        slope = point.cost * point.gradient / search.scale**2
+        root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
+        head = np.linalg.solve(root, slope)
+        rest = np.sqrt(max((point.cost / search.scale) ** 2 - head @ head, 0.0))
+        return np.append(head, rest), np.vstack([root.T, np.zeros(len(z))])
+
+    done = least_squares(
+        lambda z: model(z)[0], np.clip(z, 1e-9, 1 - 1e-9), jac=lambda z: model(z)[1], bounds=(0.0, 1.0), method="trf",
+        ftol=tolerance, xtol=tolerance, gtol=tolerance, max_nfev=iterations,
+    )
+    return bool(done.success)
+
+
+def lbfgs(search, z, iterations):
+    """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
+    return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
+
+
+def adam(search, z, iterations):
+    """optax's Adam, limits by augmented Lagrangian, projected into the box."""
+    return _augmented(search, z, iterations, optax.adam(optax.cosine_decay_schedule(0.05, max(iterations, 1), 0.02)), descend=False)
+
+
+def _augmented(search, z, iterations, optimiser, descend):
+    weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, 4 if search.problem.limits else 1
+    moved = np.inf
+
+    def value(z):
+        f, g = search.cost(z)
+        if not len(weights):
+            return f, g
+        m, slopes = search.margins(z)
+        push = np.maximum(0.0, weights - stiffness * m)
+        return f + float(push @ push) / (2 * stiffness), g - push @ slopes
+
+    for _ in range(rounds):
+        state = optimiser.init(z)
+        for _ in range(max(1, iterations // rounds)):
+            f, g = value(z)
+            update, state = optimiser.update(g, state, z)
+            step = np.asarray(update) if not descend else -np.asarray(update)
+            new = np.clip(z + step, 0.0, 1.0)
+            halvings = 0
+            while descend and value(new)[0] > f - 1e-4 * abs(g @ (new - z)) and halvings < 12:
+                step, halvings = 0.5 * step, halvings + 1
+                new = np.clip(z + step, 0.0, 1.0)
+            moved, z = float(np.linalg.norm(new - z)), new
+            if moved < 1e-7:
+                break
+        if len(weights):
+            weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
+            stiffness *= 4
+    return moved < 1e-3
+
+
+def optimality(search, point):
+    """(gradient norm, KKT residual, multipliers of the limits) at a point, all of the scaled cost per unit of z.
+
+    The residual is what is left of the gradient after the best non-negative combination of the slopes of active limits and bounds.
+    """
+    g = point.gradient / search.scale
+    columns, owners = [], []
+    for i, (m, slope) in enumerate(zip(point.margins / search.room, point.margin_slopes / search.room[:, None])):
+        if m < 1e-4:
+            columns.append(slope)
+            owners.append(i)
+    for p, z in enumerate(point.z):
+        if z < 1e-6 or z > 1 - 1e-6:
+            columns.append(np.eye(len(g))[p] * (1.0 if z < 0.5 else -1.0))
+            owners.append(None)
+    multipliers = np.zeros(len(point.margins))
+    residual = g
+    if columns:
+        matrix = np.array(columns).T
+        found, _ = nnls(matrix, g)
+        residual = g - matrix @ found
+        for owner, value in zip(owners, found):
+            if owner is not None:
+                multipliers[owner] = value
+    return float(np.linalg.norm(g)), float(np.linalg.norm(residual)), multipliers
+
+
+METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam}
