@@ -7,7 +7,6 @@ alone is computed once; equal coefficients (each Runge-Kutta stage makes its own
 
 import jax
 import jax.numpy as jnp
-from jax.core import eval_jaxpr
 from jax.extend.core import Literal
 
 
@@ -15,43 +14,58 @@ def scan(body, carry, xs, length):
     """jax.lax.scan(body, carry, xs, length), less what need not be in the loop. Values and derivatives are the same."""
     closed, shape = jax.make_jaxpr(body, return_shape=True)(_like(carry), jax.tree.map(lambda a: _like(a[0]), xs))
     jaxpr, structure = closed.jaxpr, jax.tree.structure(shape)
+    once, inside, same = _split(jaxpr)
+    constants = dict(zip(jaxpr.constvars, closed.consts))
+    _run(once, constants, same)
 
-    same, seen, fixed, once, inside = {}, {}, set(jaxpr.constvars), [], []
+    def lean(state, x):
+        values = {**constants, **dict(zip(jaxpr.invars, jax.tree.leaves((state, x))))}
+        _run(inside, values, same)
+        return jax.tree.unflatten(structure, [_read(v, values, same) for v in jaxpr.outvars])
+
+    return jax.lax.scan(lean, carry, xs, length=length)
+
+
+def _split(jaxpr):
+    """(operations to do once, operations of the loop, {variable: the one it equals})."""
+    once, inside, same, seen, fixed = [], [], {}, {}, set(jaxpr.constvars)
     for eqn in jaxpr.eqns:
-        eqn = eqn.replace(invars=[v if isinstance(v, Literal) else same.get(v, v) for v in eqn.invars])
-        if eqn.effects or not all(isinstance(v, Literal) or v in fixed for v in eqn.invars):
+        operands = [v if isinstance(v, Literal) else same.get(v, v) for v in eqn.invars]
+        if eqn.effects or not all(isinstance(v, Literal) or v in fixed for v in operands):
             inside.append(eqn)
             continue
-        twin = seen.setdefault(_key(eqn), eqn)
+        twin = seen.setdefault(_key(eqn, operands), eqn)
         if twin is eqn:
             once.append(eqn)
             fixed.update(eqn.outvars)
         else:
             same.update(zip(eqn.outvars, twin.outvars))
-    out = [v if isinstance(v, Literal) else same.get(v, v) for v in jaxpr.outvars]
-
     # a number spread over lanes is cheaper to spread again than to fetch
-    wanted = {v for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
-    inside = [eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in wanted] + inside
-    made = {v for eqn in inside for v in eqn.outvars}
-    used = {v for v in [*out, *(v for eqn in inside for v in eqn.invars)] if not isinstance(v, Literal)}
-    kept = [v for v in [*jaxpr.constvars, *(v for eqn in once for v in eqn.outvars)] if v in used and v not in made]
-    before = jaxpr.replace(invars=[], outvars=kept, eqns=once, debug_info=None)
-    loop = jaxpr.replace(constvars=kept, outvars=out, eqns=inside, debug_info=None)
-    constants = eval_jaxpr(before, closed.consts)
+    wanted = {same.get(v, v) for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
+    spread = [eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in wanted]
+    return once, spread + inside, same
 
-    def lean(state, x):
-        return jax.tree.unflatten(structure, eval_jaxpr(loop, constants, *jax.tree.leaves((state, x))))
 
-    return jax.lax.scan(lean, carry, xs, length=length)
+def _key(eqn, operands):
+    """Equal for two operations that give the same result. Operations that carry a program are told apart by identity."""
+    if any(hasattr(p, "eqns") or hasattr(p, "jaxpr") or callable(p) for p in eqn.params.values()):
+        return id(eqn)
+    told = tuple((str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(v) for v in operands)
+    return eqn.primitive, told, tuple(sorted((name, str(p)) for name, p in eqn.params.items()))
+
+
+def _run(eqns, values, same):
+    """Do the operations in order, reading and writing {variable: value}."""
+    for eqn in eqns:
+        bound = eqn.primitive.get_bind_params(eqn.params)
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)  # a pair in older releases of jax
+        out = eqn.primitive.bind(*functions, *(_read(v, values, same) for v in eqn.invars), **params)
+        values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out]))
+
+
+def _read(v, values, same):
+    return v.val if isinstance(v, Literal) else values[same.get(v, v)]
 
 
 def _like(tree):
     return jax.tree.map(lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), tree)
-
-
-def _key(eqn):
-    """Equal for two operations that give the same result. Operations that carry a program are told apart by identity."""
-    operands = tuple(("literal", str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(v) for v in eqn.invars)
-    plain = all(not hasattr(p, "eqns") and not hasattr(p, "jaxpr") and not callable(p) for p in eqn.params.values())
-    return (eqn.primitive, operands, tuple(sorted((k, str(v)) for k, v in eqn.params.items()))) if plain else id(eqn)

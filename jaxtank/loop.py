@@ -51,7 +51,6 @@ class State(NamedTuple):
     observer: Any
     controller: Any
     actuator: Any
-    bad_step: Any  # first sample with a level that is not finite, or -1
 
 
 class Inputs(NamedTuple):
@@ -98,8 +97,8 @@ def simulate(loop, clock, key=None, save_every=1):
     check(loop, clock, key)
     if not isinstance(save_every, int) or save_every < 1:
         raise InputError(f"save_every = {save_every!r}: must be a whole number of at least 1 sample")
-    trajectory, bad = _simulate(loop, clock, key, save_every)
-    _report_bad(bad, loop, clock, key)
+    trajectory, broken = _simulate(loop, clock, key, save_every)
+    _report_broken(broken, loop, clock, key)
     return trajectory
 
 
@@ -111,8 +110,8 @@ def evaluate(loop, clock, measures, key=None):
     """
     names = _names(measures)
     check(loop, clock, key)
-    values, bad = _evaluate(loop, clock, names, key, False)
-    _report_bad(bad, loop, clock, key)
+    values, broken = _evaluate(loop, clock, names, key, False)
+    _report_broken(broken, loop, clock, key)
     return values
 
 
@@ -131,9 +130,9 @@ def sensitivities(loop, clock, measures, values, key=None):
 
     values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth
     it to about ten). Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix
-    2/N sum_k sum_i grad(e_i) grad(e_i)' [cm^2 per unit^2], first bad sample or -1).
+    2/N sum_k sum_i grad(e_i) grad(e_i)' [cm^2 per unit^2], True if the run stopped being finite); P in the order of `values`.
     """
-    return _sensitivities(loop, clock, _names(measures), values, key)
+    return _sensitivities(loop, clock, _names(measures), tuple(values), tuple(values.values()), key)
 
 
 def _names(measures):
@@ -163,7 +162,6 @@ def initial(loop, clock):
         observer=loop.observer.init(),
         controller=loop.controller.init(),
         actuator=jax.tree.map(lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, loop.actuator.init(clock)),
-        bad_step=jnp.int32(-1),
     )
 
 
@@ -179,8 +177,7 @@ def step(loop, clock, state, now):
     x, spilled = _advance(loop.plant, clock, t, state.x, u, now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(t=t, x=state.x, y=y, x_hat=estimate.x, r=now.r, e=e, command=command, u=u, spilled=spilled)
-    bad = jnp.where((state.bad_step < 0) & ~jnp.isfinite(sum(state.x)), state.k, state.bad_step)
-    return State(state.k + 1, x, observer, controller, actuator, bad), sample
+    return State(state.k + 1, x, observer, controller, actuator), sample
 
 
 def _advance(plant, clock, t, x, u, d):
@@ -249,7 +246,7 @@ def _evaluate(loop, clock, names, key, checkpoint):
 
     carry = (initial(loop, clock), ms.start(run, names))
     state, acc = (_checkpointed_scan if checkpoint else _plain_scan)(body, carry, inputs(loop, clock, names, key), clock.samples)
-    return ms.read(run, acc, names), state.bad_step
+    return ms.read(run, acc, names), _broken(state)
 
 
 def _plain_scan(body, carry, xs, length):
@@ -290,15 +287,17 @@ def _simulate(loop, clock, key, save_every):
     zero = _zero(loop)
     (state, _), saved = scan(row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows)
     columns = {name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value for name, value in saved._asdict().items()}
-    # the state may go bad in the steps after the last row, which are not part of the run
-    in_run = state.bad_step < clock.samples
-    return Trajectory(**columns), jnp.where(in_run, state.bad_step, -1)
+    return Trajectory(**columns), _broken(state)
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names"))
-def _sensitivities(loop, clock, names, values, key):
-    order = tuple(values)
-    flat, unflatten = ravel_pytree([values[name] for name in order])
+def _broken(state):
+    """True if the run left the numbers: a level that is not finite stays so, so the last state tells and the loop need not look."""
+    return ~jnp.isfinite(sum(state.x))
+
+
+@functools.partial(jax.jit, static_argnames=("clock", "names", "order"))  # a dict would come back from jit with its keys sorted
+def _sensitivities(loop, clock, names, order, values, key):
+    flat, unflatten = ravel_pytree(values)
 
     def at(theta):
         return with_values(loop, dict(zip(order, unflatten(theta))))
@@ -356,19 +355,22 @@ def _sensitivities(loop, clock, names, values, key):
         return ms.read(_run(at(theta), clock), acc, names), None
 
     results, slopes, _ = pushed(finish, (floats, flat), dfloats, basis)
-    return results, slopes, gauss_newton * (2.0 / clock.samples), join(floats, rest)[0].bad_step
+    return results, slopes, gauss_newton * (2.0 / clock.samples), _broken(join(floats, rest)[0])
 
 
-def _report_bad(bad_step, loop, clock, key):
+def _report_broken(broken, loop, clock, key):
     """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
-    if isinstance(bad_step, jax.core.Tracer) or np.ndim(bad_step) or int(bad_step) < 0:
+    if isinstance(broken, jax.core.Tracer) or np.ndim(broken) or not broken:
         return
-    until = dataclasses.replace(clock, duration=int(bad_step) * clock.dt)
-    last = np.asarray(_simulate(loop, until, key, 1)[0].x[-1])
-    tanks = " and ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(last))) or "?"
+    run = _simulate(loop, clock, key, 1)[0]
+    bad = ~np.isfinite(np.asarray(run.x))
+    if not bad.any():  # only the step after the last sample
+        return
+    first = int(np.argmax(bad.any(axis=1)))
+    tanks = ", ".join(str(i + 1) for i in np.flatnonzero(bad[first]))
     shown = {n: v for n, v in parameters(loop).items() if n.startswith("controller.") and not n.startswith("controller.model.")}
     text = ", ".join(f"{n} = {np.asarray(v)}" for n, v in shown.items())
-    raise NonFiniteError(f"the level of tank {tanks} stopped being finite at t = {int(bad_step) * clock.dt:g} s with {text}")
+    raise NonFiniteError(f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}")
 
 
 __all__ = ["Clock", "ClosedLoop", "check", "evaluate", "evaluate_for_reverse", "sensitivities", "simulate"]

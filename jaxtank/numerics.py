@@ -23,7 +23,7 @@ def root(h, knee=ROOT_KNEE):
              = sqrt(h0) (1.5 x - 0.5 x^2)        0 <= h < h0,  x = h/h0
              = 1.5 sqrt(h0) x                    h < 0
 
-    Exact at and above the knee. Between, it is below the square root by at most 0.174 sqrt(h0) (at x = 0.12): a thin film
+    Exact at and above the knee. Between, it is below the square root by at most 0.175 sqrt(h0) (at x = 0.13): a thin film
     drains as laminar flow, slower than Torricelli. Value and slope are continuous; the slope at 0 is 1.5/sqrt(h0) = 15 cm^-0.5 for
     the default. Negative levels are drawn back to 0. On the four-tank benchmark of 1,200 s it moves no level by more than
     3e-4 cm unless a tank runs dry.

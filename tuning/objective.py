@@ -183,7 +183,7 @@ class Problem:
     def _run(self, values):
         if len(values) <= FORWARD_LIMIT:
             return lp.sensitivities(self.loop, self.clock, self.needed, values, self.key)[:3]
-        measures, slopes = _reverse(self.loop, self.clock, self.needed, values, self.key)
+        measures, slopes = _reverse(self.loop, self.clock, self.needed, tuple(values), np.array(list(values.values())), self.key)
         return measures, slopes, np.full((len(values),) * 2, np.nan)
 
 
@@ -192,11 +192,9 @@ def _batch(loop, clock, names, values, key):
     return jax.vmap(lambda v: lp.evaluate(with_values(loop, v), clock, names, key))(values)
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names"))
-def _reverse(loop, clock, names, values, key):
-    """(measures, {measure: (entries, P) slopes}) by reverse mode through checkpointed pieces."""
-    order = tuple(values)
-    theta = jnp.stack([jnp.asarray(values[n]) for n in order])
+@functools.partial(jax.jit, static_argnames=("clock", "names", "order"))
+def _reverse(loop, clock, names, order, theta, key):
+    """(measures, {measure: (entries, P) slopes}) by reverse mode through checkpointed pieces; theta: (P,) values of `order`."""
 
     def run(theta):
         measures = lp.evaluate_for_reverse(with_values(loop, dict(zip(order, theta))), clock, names, key)

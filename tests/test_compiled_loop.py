@@ -1,0 +1,206 @@
+"""The structural causes of speed, and that no transformation changes a result."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import _xla, invariants
+from jaxtank.loop import _evaluate, _sensitivities, evaluate_for_reverse
+from jaxtank.records import Clock
+
+MEASURES = ("rms_error_total", "max_level")
+ONE_FUNCTION = 'xla_cpu_small_call="true"'
+GAINS = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
+
+
+def loops_in(compiled):
+    """(while loops left to the runtime, calls compiled to one function) of a compiled program."""
+    text = compiled.as_text()
+    return text.count(ONE_FUNCTION)
+
+
+@pytest.mark.parametrize("name", ["ngpc", "backstepping", "backstepping-ff", "ngpc-boxqp"])
+def test_the_loop_compiles_to_one_function(gouta, name):
+    case = gouta(name)
+    assert loops_in(_evaluate.lower(case.loop, case.clock, MEASURES, None, False).compile()) >= 1
+
+
+def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
+    from jaxtank.measures import MEASURES as every
+
+    case = gouta("ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12})
+    assert loops_in(_evaluate.lower(case.loop, case.clock, tuple(every), jax.random.key(0), False).compile()) >= 1
+
+
+def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
+    case = gouta("backstepping")
+    assert loops_in(_sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile()) >= 1
+
+
+def test_other_gains_do_not_recompile(gouta):
+    case = gouta("backstepping", {"clock.duration": 20.0})
+    jaxtank.evaluate(case.loop, case.clock, MEASURES)
+    before = _evaluate._cache_size()
+    for k in (0.01, 0.2, 3):
+        jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17}), case.clock, MEASURES)
+    jaxtank.evaluate(gouta("backstepping-table1", {"clock.duration": 20.0}).loop, case.clock, MEASURES)
+    assert _evaluate._cache_size() == before
+
+
+def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
+    """The only arrays as long as the run are the samples of the reference."""
+    sizes = []
+    for duration in (100.0, 1200.0):
+        case = gouta("backstepping", {"clock.duration": duration})
+        stats = _evaluate.lower(case.loop, case.clock, MEASURES, None, False).compile().memory_analysis()
+        sizes.append(stats.temp_size_in_bytes / case.clock.samples)
+    assert max(sizes) < 8 * 8  # bytes per sample: at most eight float64 arrays of inputs
+
+
+def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
+    case = gouta("backstepping")
+    stats = _sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile().memory_analysis()
+    assert stats.temp_size_in_bytes < 10e6
+    reverse = jax.jit(jax.grad(lambda k1: evaluate_for_reverse(jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES)["rms_error_total"]))
+    assert reverse.lower(0.088).compile().memory_analysis().temp_size_in_bytes < 10e6
+
+
+def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
+    """Coefficients are computed before the loop, once each; results and derivatives are those of jax.lax.scan."""
+
+    def run(scan, a, b):
+        def body(carry, x):
+            c = jnp.sqrt(a / b)  # invariant
+            same = jnp.sqrt(a / b)  # and again
+            return carry * c + same * jnp.sin(x), carry
+
+        return scan(body, jnp.float64(1.0), jnp.arange(7.0), length=7)
+
+    def loop_of(scan):
+        jaxpr = jax.make_jaxpr(lambda a, b: run(scan, a, b))(2.0, 3.0)
+        return [e for e in jaxpr.eqns if e.primitive.name == "scan"][0].params["jaxpr"].jaxpr, jaxpr
+
+    inside, whole = loop_of(invariants.scan)
+    assert not {"sqrt", "div"} & {e.primitive.name for e in inside.eqns}
+    assert [e.primitive.name for e in whole.eqns].count("sqrt") == 1
+    assert {"sqrt", "div"} <= {e.primitive.name for e in loop_of(jax.lax.scan)[0].eqns}
+    plain, lean = (run(s, 2.0, 3.0) for s in (jax.lax.scan, invariants.scan))
+    np.testing.assert_allclose(lean[0], plain[0], rtol=1e-15)
+    np.testing.assert_allclose(lean[1], plain[1], rtol=1e-15)
+    for derivative in (jax.grad, jax.jacfwd):
+        a, b = (derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, invariants.scan))
+        np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def test_vmap_equals_a_python_loop(gouta):
+    case = gouta("ngpc", {"clock.dt": 0.1})
+    horizons = np.array([4.0, 11.0, 30.0])
+    run = lambda Tp: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, MEASURES)
+    batch = jax.vmap(run)(horizons)
+    for i, Tp in enumerate(horizons):
+        for name, value in run(Tp).items():
+            np.testing.assert_allclose(batch[name][i], value, rtol=1e-12)
+
+
+def test_jit_equals_no_jit(gouta):
+    case = gouta("backstepping", {"clock.dt": 0.1, "clock.duration": 30.0})
+    compiled = jaxtank.evaluate(case.loop, case.clock, MEASURES)
+    outer = jax.jit(lambda loop: jaxtank.evaluate(loop, case.clock, MEASURES))(case.loop)
+    with jax.disable_jit():
+        plain = jaxtank.evaluate(case.loop, Clock(dt=0.1, duration=30.0), MEASURES)
+    for name in MEASURES:
+        np.testing.assert_allclose(outer[name], compiled[name], rtol=1e-12)
+        np.testing.assert_allclose(plain[name], compiled[name], rtol=1e-12)
+
+
+def test_a_run_repeats_bit_for_bit(gouta):
+    case = gouta("ngpc", {"sensor.noise": 0.02, "clock.duration": 100.0})
+    one, two = (jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(5)) for _ in range(2))
+    other = jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(6))
+    assert all(np.array_equal(one[m], two[m]) for m in MEASURES)
+    assert one["rms_error_total"] != other["rms_error_total"]
+
+
+def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
+    case = gouta("backstepping", {"clock.duration": 400.0})
+    values = jaxtank.evaluate(case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"])
+    run = jaxtank.simulate(case.loop, case.clock)
+    e, u = np.asarray(run.e), np.asarray(run.u)
+    np.testing.assert_allclose(values["rms_error"], np.sqrt((e**2).mean(axis=0)), rtol=1e-10)
+    np.testing.assert_allclose(values["iae"], np.abs(e).sum(axis=0) * 0.01, rtol=1e-10)
+    np.testing.assert_allclose(values["rms_input"], np.sqrt((u**2).mean(axis=0)), rtol=1e-10)
+    np.testing.assert_allclose(values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(values["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-12)
+    carried, _, _, broken = jaxtank.sensitivities(case.loop, case.clock, ["rms_error", "max_level"], GAINS)
+    assert not broken
+    for m in ("rms_error", "max_level"):
+        np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
+
+
+@pytest.mark.parametrize("save_every", [1, 7, 100, 5000])
+def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
+    case = gouta("ngpc", {"clock.duration": 30.0})
+    every = jaxtank.simulate(case.loop, case.clock)
+    some = jaxtank.simulate(case.loop, case.clock, save_every=save_every)
+    assert len(some.t) == (case.clock.samples - 1) // save_every + 1
+    for a, b in zip(some, every):
+        np.testing.assert_allclose(a, np.asarray(b)[::save_every], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "flags, expected",
+    [
+        ("", f"--xla_backend_extra_options={_xla.OPTION}"),
+        ("--xla_foo=1", f"--xla_foo=1 --xla_backend_extra_options={_xla.OPTION}"),
+        ("--xla_backend_extra_options=a=1 --b", f"--xla_backend_extra_options=a=1,{_xla.OPTION} --b"),
+        (f"--xla_backend_extra_options={_xla.KEY}=5", f"--xla_backend_extra_options={_xla.KEY}=5"),
+    ],
+)
+def test_the_option_joins_what_the_user_set(flags, expected):
+    assert _xla.append_option(flags) == expected
+
+
+def python(code, **env):
+    """Run code in a fresh process; (stdout, stderr)."""
+    clean = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**clean, **env}, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+def test_the_option_is_set_on_import_and_can_be_switched_off():
+    show = "import jaxtank, os; print(os.environ.get('XLA_FLAGS', ''))"
+    assert _xla.OPTION in python(show)[0]
+    assert python(show, JAXTANK_XLA_OPTION="0")[0] == ""
+
+
+def test_a_late_import_warns_once():
+    late = "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop, tuning"
+    assert python(late)[1].count("jax had started before jaxtank") == 1
+    assert "jax had started" not in python("import jax; import jaxtank")[1]
+
+
+def test_the_option_off_gives_the_same_numbers():
+    code = (
+        "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import presets, Clock\n"
+        "case = presets.find('gouta2015/ngpc')\n"
+        "print(float(jaxtank.evaluate(case.loop, Clock(dt=0.1, duration=300.0), 'rms_error_total')['rms_error_total']).hex())"
+    )
+    on, off = (float.fromhex(python(code, JAXTANK_XLA_OPTION=v)[0]) for v in "10")
+    np.testing.assert_allclose(on, off, rtol=1e-12)
+
+
+def test_float32_runs_and_says_that_it_is_wrong():
+    code = (
+        "import jaxtank, warnings; from jaxtank import presets, Clock\n"
+        "case = presets.find('gouta2015/ngpc')\n"
+        "print(jaxtank.evaluate(case.loop, Clock(duration=50.0), 'rms_error_total')['rms_error_total'].dtype)"
+    )
+    out, err = python(code)
+    assert out == "float32"
+    assert "float32" in err and "jax_enable_x64" in err

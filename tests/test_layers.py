@@ -1,0 +1,86 @@
+"""The plan of the house: who may import whom, read from the source."""
+
+import ast
+from pathlib import Path
+
+import jaxtank
+import tuning
+
+LAYERS = [
+    {"errors", "_xla", "files"},
+    {"tree", "numerics", "invariants"},
+    {"records", "signals"},
+    {"plants", "sensors", "actuators"},
+    {"analysis"},
+    {"observers", "controllers"},
+    {"measures"},
+    {"loop"},
+    {"presets"},
+    {"rig", "plotting"},
+]
+ABOVE = [{"bounds"}, {"objective"}, {"screening", "solvers"}, {"search"}, {"report"}, {"manual", "bench"}, {"cli"}]
+RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer}
+RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for room in layer}
+
+# Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
+DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.search", "tuning.report")}
+
+
+def room(module):
+    return ".".join(module.split(".")[:2])
+
+
+def imports():
+    """(importing module, imported module) of every import of our own packages."""
+    for package in (jaxtank, tuning):
+        root = Path(package.__file__).parent
+        for path in sorted(root.rglob("*.py")):
+            name = ".".join([package.__name__, *path.relative_to(root).with_suffix("").parts]).removesuffix(".__init__")
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("jaxtank", "tuning"):
+                    for alias in node.names:
+                        yield name, f"{node.module}.{alias.name}" if "." not in node.module else node.module
+                elif isinstance(node, ast.Import):
+                    for alias in node.names:
+                        if alias.name.split(".")[0] in ("jaxtank", "tuning") and "." in alias.name:
+                            yield name, alias.name
+
+
+def test_every_room_has_its_place():
+    rooms = {room(name) for name, _ in imports() if "." in name} - {"jaxtank.__main__"}
+    assert rooms <= set(RANK)
+
+
+def test_no_import_looks_up():
+    seen = 0
+    for name, target in imports():
+        name, target = room(name), room(target)
+        if name == target or (name, target) in DOORS or target not in RANK or name not in RANK:
+            continue
+        seen += 1
+        assert RANK[target] <= RANK[name], f"{name} imports {target}, which is above it"
+    assert seen > 60
+
+
+def test_jaxtank_never_imports_tuning():
+    assert {name for name, target in imports() if name.startswith("jaxtank") and target.startswith("tuning")} == {"jaxtank.__main__"}
+
+
+def test_only_the_plotting_rooms_import_matplotlib():
+    found = set()
+    for package in (jaxtank, tuning):
+        for path in Path(package.__file__).parent.rglob("*.py"):
+            if "matplotlib" in path.read_text():
+                found.add(path.name)
+    assert found == {"plotting.py", "report.py", "search.py"}  # report closes and sizes figures, search names them in a docstring
+
+
+def test_no_pickle_eval_or_network():
+    for package in (jaxtank, tuning):
+        for path in Path(package.__file__).parent.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                    assert node.func.id not in ("eval", "exec"), path
+                if isinstance(node, (ast.Import, ast.ImportFrom)):
+                    names = [a.name for a in node.names] + [getattr(node, "module", "") or ""]
+                    assert not {"pickle", "marshal", "urllib", "socket", "requests"} & {n.split(".")[0] for n in names}, path

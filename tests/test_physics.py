@@ -1,0 +1,257 @@
+"""Tanks against closed forms, another solver, and what must hold of any network."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+import jaxtank
+from jaxtank.analysis import equilibrium
+from jaxtank.errors import EquilibriumError, InputError
+from jaxtank.loop import _integrate
+from jaxtank.numerics import ROOT_KNEE, floored_root, root
+from jaxtank.plants import TankNetwork, state_coupled_four_tank
+from jaxtank.plants.network import network
+from jaxtank.presets.gouta2015 import FAST_AREA
+from jaxtank.records import Clock
+
+QUIET = settings(deadline=None, max_examples=12, derandomize=True)
+
+
+def one_tank(area=20.0, drain=0.2, rim=30.0, **more):
+    return network(area=[area], drain=[drain], pump_gain=[5.0], feeds=((0, None),), rim=[rim], **more)
+
+
+def held(plant, x, u, dt, steps, integrator="rk4"):
+    """Levels after `steps` steps with the pumps held."""
+    step = jax.jit(lambda x: _integrate(plant, integrator, 0.0, x, u, None, dt))
+    x = tuple(jnp.asarray(v, dtype=float) for v in x)
+    for _ in range(steps):
+        x = step(x)
+    return np.array(x)
+
+
+def test_root_meets_its_docstring():
+    h = np.linspace(ROOT_KNEE, 40, 2001)
+    np.testing.assert_array_equal(root(h), np.sqrt(h))
+    below = np.linspace(0, ROOT_KNEE, 4001)
+    gap = np.sqrt(below) - np.asarray(root(below))
+    assert gap.min() > -1e-12
+    assert 0.17 < gap.max() / ROOT_KNEE**0.5 < 0.175
+    assert abs(below[gap.argmax()] / ROOT_KNEE - 0.13) < 0.01
+    assert root(jnp.float64(0.0)) == 0.0
+    assert root(jnp.float64(-0.5)) < 0.0  # draws a level back to zero
+
+
+@pytest.mark.parametrize("h, slope", [(-1.0, 15.0), (0.0, 15.0), (ROOT_KNEE / 2, 10.0), (ROOT_KNEE, 5.0), (4.0, 0.25)])
+def test_root_has_the_right_slope_everywhere(h, slope):
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(root)(h), slope, rtol=1e-12)
+
+
+@pytest.mark.parametrize("h, slope", [(-1.0, 0.0), (0.0, 0.0), (0.0099, 0.0), (0.01, 5.0), (4.0, 0.25)])
+def test_floored_root_has_the_right_slope_everywhere(h, slope):
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(derivative(floored_root)(h, 0.01), slope, rtol=1e-12)
+
+
+def test_second_derivatives_of_the_roots_are_finite_below_zero():
+    for f in (root, lambda h: floored_root(h, 0.01)):
+        for h in (-1.0, -1e-9, 0.0, 0.005, 0.01, 1.0):
+            assert np.isfinite(jax.jacfwd(jax.grad(f))(h)) and np.isfinite(jax.grad(jax.jacfwd(f))(h))
+
+
+def test_a_draining_tank_follows_its_closed_form():
+    """h(t) = (sqrt(h0) - c t / 2)^2 down to the film."""
+    plant = one_tank()
+    c = float(plant.drain[0]) * np.sqrt(2 * 981.0) / 20.0
+    for t in (1.0, 5.0, 10.0):
+        np.testing.assert_allclose(held(plant, (16.0,), (0.0,), 0.01, round(100 * t))[0], (4 - c * t / 2) ** 2, rtol=1e-11)
+
+
+def test_a_tank_runs_dry_and_stays():
+    plant = one_tank()
+    levels = [held(plant, (0.05,), (0.0,), 0.05, n)[0] for n in (20, 100, 400)]
+    assert levels[0] > levels[1] > levels[2] >= 0.0
+    assert levels[2] < 1e-9
+
+
+@pytest.mark.parametrize("integrator, order", [("rk4", 4), ("midpoint", 2)])
+def test_order_of_convergence(integrator, order):
+    plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
+    exact = solve_ivp(lambda t, x: plant.derivative(t, x, u, None), (0, 8), x, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    steps = np.array([4, 8, 16])
+    errors = [np.abs(held(plant, x, u, 8 / n, n, integrator) - exact).max() for n in steps]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert abs(-slope - order) < 0.25
+
+
+def test_a_run_agrees_with_lsoda():
+    plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
+    exact = solve_ivp(lambda t, x: plant.derivative(t, x, u, None), (0, 30), x, method="LSODA", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(held(plant, x, u, 0.01, 3000), exact, atol=1e-9)
+
+
+def test_smooth_root_moves_the_benchmark_by_less_than_its_promise(gouta):
+    """Against a knee a thousand times smaller, which is the exact root as long as no tank runs dry."""
+    case = gouta("ngpc")
+    plant = dataclasses.replace(case.loop.plant, knee=1e-5)
+    sharp = jaxtank.simulate(dataclasses.replace(case.loop, plant=plant), case.clock, save_every=100)
+    smooth = jaxtank.simulate(case.loop, case.clock, save_every=100)
+    assert np.abs(np.asarray(sharp.x) - np.asarray(smooth.x)).max() < 3e-4
+
+
+EQUILIBRIA = [  # spec 2.1
+    ((3, 3), (2.75332, 2.75332), (1.80603, 1.80603)),
+    ((8, 8), (7.34218, 7.34218), (2.94924, 2.94924)),
+    ((8, 14), (0.93885, 28.35800), (1.05462, 5.79609)),
+    ((16, 14), (18.70079, 9.56107), (4.70682, 3.36551)),
+    ((16, 10), (29.47178, 2.05263), (5.90882, 1.55938)),
+    ((12, 10), (15.16267, 6.02296), (4.23824, 2.67118)),
+]
+
+
+@pytest.mark.parametrize("r, upper, u", EQUILIBRIA)
+@pytest.mark.parametrize("area", [FAST_AREA, 353.43])
+def test_equilibria_of_the_four_tank(r, upper, u, area):
+    x, volts = equilibrium(state_coupled_four_tank(area), r)
+    np.testing.assert_allclose(x, (*r, *upper), atol=6e-6)
+    np.testing.assert_allclose(volts, u, atol=6e-6)
+
+
+@pytest.mark.parametrize("r, tank", [((16, 3), 4), ((3, 16), 3), ((16, 7), 4)])
+def test_no_equilibrium_is_told_with_the_tank(r, tank):
+    with pytest.raises(EquilibriumError, match=f"tank {tank}"):
+        equilibrium(state_coupled_four_tank(FAST_AREA), r)
+
+
+def test_equilibria_exist_between_the_ratios_of_the_spec():
+    plant = state_coupled_four_tank(FAST_AREA)
+    for ratio, exists in ((0.442, False), (0.444, True), (2.257, True), (2.259, False)):
+        if exists:
+            equilibrium(plant, (5.0 * ratio, 5.0))
+        else:
+            with pytest.raises(EquilibriumError):
+                equilibrium(plant, (5.0 * ratio, 5.0))
+
+
+def random_network(seed):
+    """A network of 1 to 6 tanks, each fed by a pump and pouring into some later ones and the basin."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 7))
+    links = tuple((i, j) for i in range(n) for j in range(i + 1, n) if rng.random() < 0.5)
+    feeds = tuple((i, int(rng.integers(n)) if rng.random() < 0.4 else None) for i in range(n))
+    plant = network(
+        area=rng.uniform(10, 400, n), drain=rng.uniform(0.05, 0.3, n), links=links, orifice=rng.uniform(0.02, 0.2, len(links)),
+        pump_gain=rng.uniform(2, 10, n), split=rng.uniform(0, 1, n), feeds=feeds, rim=np.full(n, 20.0), outputs=tuple(range(n)),
+    )
+    return plant, rng
+
+
+@QUIET
+@given(st.integers(0, 10_000), st.booleans())
+def test_mass_balance_with_the_liquid_lost_at_the_rim(seed, overflow):
+    """Stored volume = inflow - outflow - spilled, to round-off, by carrying the net inflow through the same Runge-Kutta step."""
+    plant, rng = random_network(seed)
+    plant = dataclasses.replace(plant, overflow=overflow)
+    x, u = tuple(rng.uniform(0, 20, plant.tanks)), tuple(rng.uniform(0, 12, plant.pumps))
+    d = tuple(rng.uniform(0, 30, plant.tanks))
+    stored, net, lost = float(np.dot(plant.area, x)), 0.0, 0.0
+    before = stored
+    for _ in range(40):
+        h = 0.5
+        k1 = plant.derivative(0, x, u, d)
+        x2 = tuple(a + h / 2 * b for a, b in zip(x, k1))
+        k2 = plant.derivative(0, x2, u, d)
+        x3 = tuple(a + h / 2 * b for a, b in zip(x, k2))
+        k3 = plant.derivative(0, x3, u, d)
+        x4 = tuple(a + h * b for a, b in zip(x, k3))
+        net += h / 6 * sum(w * float(plant.net_inflow(p, u, d)) for w, p in ((1, x), (2, x2), (2, x3), (1, x4)))
+        x, spilled = plant.spill(_integrate(plant, "rk4", 0.0, x, u, d, h))
+        lost += float(sum(spilled))
+    stored = float(np.dot(plant.area, np.array(x)))
+    np.testing.assert_allclose(stored - before, net - lost, atol=1e-10 * max(1.0, before, stored, abs(net)))
+    assert (lost > 0) <= overflow
+    if overflow:
+        assert np.all(np.array(x) <= 20.0)
+
+
+@QUIET
+@given(st.integers(0, 10_000))
+def test_levels_never_pass_below_zero_and_more_voltage_never_lowers_one(seed):
+    plant, rng = random_network(seed)
+    x, u = tuple(rng.uniform(0, 1, plant.tanks)), rng.uniform(0, 6, plant.pumps)
+    more = u + rng.uniform(0, 6, plant.pumps)
+    low, high = x, x
+    for _ in range(30):
+        low, high = (_integrate(plant, "rk4", 0.0, a, tuple(v), None, 0.05) for a, v in ((low, u), (high, more)))
+        assert np.all(np.array(low) > -1e-6)
+        assert np.all(np.array(high) >= np.array(low) - 1e-12)
+
+
+def test_swapped_channels_give_swapped_answers():
+    plant = state_coupled_four_tank(FAST_AREA)
+    a = held(plant, (8.0, 5.0, 12.0, 20.0), (3.0, 6.0), 0.1, 200)
+    b = held(plant, (5.0, 8.0, 20.0, 12.0), (6.0, 3.0), 0.1, 200)
+    np.testing.assert_allclose(a[[1, 0, 3, 2]], b, rtol=1e-13)
+
+
+def test_units_rescale():
+    """In metres and litres per second the same rig moves the same way."""
+    cm = state_coupled_four_tank(FAST_AREA)
+    m = TankNetwork(
+        **{f: getattr(cm, f) for f in ("links", "feeds", "outputs", "overflow", "split")},
+        area=cm.area * 1e-4, drain=cm.drain * 1e-4, orifice=cm.orifice * 1e-4, pump_gain=cm.pump_gain * 1e-6, gravity=cm.gravity * 1e-2,
+        rim=cm.rim * 1e-2, knee=cm.knee * 1e-2,
+    )  # fmt: skip
+    x, u = np.array([8.0, 5.0, 12.0, 20.0]), (3.0, 6.0)
+    np.testing.assert_allclose(held(m, tuple(x / 100), u, 0.1, 100) * 100, held(cm, tuple(x), u, 0.1, 100), rtol=1e-11)
+
+
+def test_rims_as_physics_stop_the_level_and_count_the_loss(gouta):
+    case = gouta("ngpc", {"plant.overflow": True})
+    values = jaxtank.evaluate(case.loop, case.clock, ["max_level", "overflow_volume"])
+    run = jaxtank.simulate(case.loop, case.clock, save_every=10)
+    np.testing.assert_array_equal(values["max_level"][2:], (30.0, 30.0))
+    assert np.all(np.asarray(values["overflow_volume"])[2:] > 10.0)
+    np.testing.assert_allclose(run.spilled[-1], values["overflow_volume"], rtol=1e-12)
+    assert np.all(np.diff(run.spilled, axis=0) >= 0)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"drain": [0.1, 0.1, 0.1]}, "plant.drain has 3 entries for 2"),
+        ({"links": ((0, 5),), "orifice": [0.1]}, "tank 5"),
+        ({"feeds": ((0, None), (7, None))}, "tank 7"),
+        ({"outputs": (4,)}, "tank 4"),
+    ],
+)
+def test_a_network_that_does_not_fit_together_is_refused(change, words):
+    plain = {"area": [10.0, 10.0], "drain": 0.1, "pump_gain": 5.0, "feeds": ((0, None), (1, None)), "rim": 20.0}
+    with pytest.raises(InputError, match=words):
+        network(**{**plain, **change})
+
+
+def test_a_quadruple_tank_splits_its_pumps():
+    """Johansson's topology: pump 1 to tanks 1 and 4, pump 2 to tanks 2 and 3; its equilibrium is a fixed point."""
+    plant = network(
+        area=[28, 32, 28, 32], drain=[0.071, 0.057, 0, 0], links=((2, 0), (3, 1)), orifice=[0.071, 0.057], pump_gain=[3.33, 3.35],
+        split=[0.7, 0.6], feeds=((0, 3), (1, 2)), rim=20.0, outputs=(0, 1),
+    )  # fmt: skip
+    x, u = equilibrium(plant, (12.4, 12.7))
+    np.testing.assert_allclose(x, (12.4, 12.7, 1.8, 1.4), atol=0.35)  # the published operating point, to its rounding
+    np.testing.assert_allclose(plant.derivative(0.0, tuple(x), tuple(u), None), np.zeros(4), atol=1e-12)
+
+
+def test_the_clock_does_not_drift():
+    clock = Clock(dt=0.01, duration=1200.0)
+    assert clock.samples == 120001
+    from jaxtank.signals import sample_times
+
+    assert sample_times(clock)[-1] == 1200.0 and sample_times(clock)[47000] == 470.0
