@@ -40,8 +40,23 @@ _HOMES = {
     "sensitivities": "jaxtank.loop",
     "check": "jaxtank.loop",
 }
-_ROOMS = ("analysis", "actuators", "controllers", "loop", "measures", "numerics", "observers", "plants", "plotting", "presets",
-          "records", "rig", "sensors", "signals", "tree")
+_ROOMS = (
+    "analysis",
+    "actuators",
+    "controllers",
+    "loop",
+    "measures",
+    "numerics",
+    "observers",
+    "plants",
+    "plotting",
+    "presets",
+    "records",
+    "rig",
+    "sensors",
+    "signals",
+    "tree",
+)
 
 __all__ = [*_HOMES, *_ROOMS]
 

@@ -18,9 +18,10 @@ class NonFiniteError(ArithmeticError):
 def nearest(name, names, count=3):
     """The `count` names closest to `name`, as the tail of an error message."""
     names = list(names)
-    close = difflib.get_close_matches(name, names, n=count, cutoff=0.3) or sorted(
-        names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio()
-    )[:count]
+    close = (
+        difflib.get_close_matches(name, names, n=count, cutoff=0.3)
+        or sorted(names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio())[:count]
+    )
     return f"; nearest: {', '.join(close)}" if close else ""
 
 

@@ -5,7 +5,6 @@ Row k of a run is the world at t_k before it moves: y_k is read, u_k is decided,
 derivatives of the measures along with the run. All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
 """
 
-import dataclasses
 import functools
 import math
 import warnings
@@ -161,7 +160,9 @@ def initial(loop, clock):
         x=tuple(loop.x0[i] + zero for i in range(loop.plant.tanks)),
         observer=loop.observer.init(),
         controller=loop.controller.init(),
-        actuator=jax.tree.map(lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, loop.actuator.init(clock)),
+        actuator=jax.tree.map(
+            lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, loop.actuator.init(clock)
+        ),
     )
 
 

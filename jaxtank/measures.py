@@ -88,9 +88,7 @@ def _saturation_excess(run, sample):
 
 
 def _outside(run, sample):
-    return tuple(
-        jnp.where((v < low) | (v > high), 1.0, 0.0) for v, low, high in zip(sample.command, run.low, run.high)
-    )
+    return tuple(jnp.where((v < low) | (v > high), 1.0, 0.0) for v, low, high in zip(sample.command, run.low, run.high))
 
 
 def _overshoot(run, sample, window):
@@ -192,24 +190,40 @@ def _overshoot_percent(run, acc):
 MEASURES = {
     "rms_error": Measure("cm", "output", ("e2",), _root_mean("e2"), "root mean square tracking error"),
     "rms_error_total": Measure(
-        "cm", "run", ("e2",), lambda run, acc: jnp.sqrt(sum(_mean(run, acc["e2"]))), "root of the mean squared errors of all outputs, summed"
+        "cm",
+        "run",
+        ("e2",),
+        lambda run, acc: jnp.sqrt(sum(_mean(run, acc["e2"]))),
+        "root of the mean squared errors of all outputs, summed",
     ),
     "ise": Measure("cm^2 s", "output", ("e2",), _per_run("e2", lambda run: run.dt), "integral of the squared error"),
     "iae": Measure("cm s", "output", ("abs_e",), _per_run("abs_e", lambda run: run.dt), "integral of the absolute error"),
     "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
     "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square voltage"),
-    "input_travel": Measure("V", "pump", ("travel",), lambda run, acc: _list(acc["travel"][1]), "sum of the absolute changes of voltage"),
+    "input_travel": Measure(
+        "V", "pump", ("travel",), lambda run, acc: _list(acc["travel"][1]), "sum of the absolute changes of voltage"
+    ),
     "saturated_fraction": Measure(
-        "-", "pump", ("outside",), _per_run("outside", lambda run: 1.0 / run.samples), "share of samples commanded outside the limits"
+        "-",
+        "pump",
+        ("outside",),
+        _per_run("outside", lambda run: 1.0 / run.samples),
+        "share of samples commanded outside the limits",
     ),
     "saturation_excess": Measure(
-        "-", "run", ("saturation_excess",), lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
+        "-",
+        "run",
+        ("saturation_excess",),
+        lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
         "mean of x/(1+x), x = voltage commanded outside the limits over their span",
     ),
     "max_level": Measure("cm", "tank", ("max_level",), _extremes("max_level"), "highest level"),
     "min_level": Measure("cm", "tank", ("min_level",), _extremes("min_level"), "lowest level"),
     "rms_over_rim": Measure(
-        "cm", "run", ("over_rim2",), lambda run, acc: jnp.sqrt(at_least(sum(_mean(run, acc["over_rim2"])), 1e-30)),
+        "cm",
+        "run",
+        ("over_rim2",),
+        lambda run, acc: jnp.sqrt(at_least(sum(_mean(run, acc["over_rim2"])), 1e-30)),
         "root of the mean squared rise past the rims, summed over tanks",
     ),
     "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
@@ -218,11 +232,16 @@ MEASURES = {
     ),
     "rise_time": Measure("s", "output", ("rise",), _rise, "longest time from 10 % to 90 % of a change", windows=True),
     "settling_time": Measure(
-        "s", "output", ("unsettled",), _settling,
+        "s",
+        "output",
+        ("unsettled",),
+        _settling,
         "longest time from the end of a change until its last sample outside +-5 % of it; negative: in the band before the change ended",
         windows=True,
     ),
-    "estimation_rms": Measure("cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"),
+    "estimation_rms": Measure(
+        "cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"
+    ),
     "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
 }
 
@@ -232,6 +251,11 @@ def check_names(names):
     for name in names:
         if name not in MEASURES:
             raise unknown("measure", name, MEASURES)
+
+
+def entries(name, plant):
+    """Number of entries of measure `name` for a plant: 1, or one per output, tank or pump."""
+    return {"run": 1, "output": len(plant.outputs), "tank": plant.tanks, "pump": plant.pumps}[MEASURES[name].per]
 
 
 def needs(names):

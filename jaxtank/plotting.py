@@ -3,7 +3,13 @@
 import matplotlib.pyplot as plt
 import numpy as np
 
-BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = "#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73"  # Okabe and Ito, colour-blind safe
+BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
+    "#D55E00",
+    "#0072B2",
+    "#000000",
+    "#CC79A7",
+    "#009E73",
+)  # Okabe and Ito, colour-blind safe
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -113,7 +119,14 @@ def convergence(ax, history, unit, limited):
         ax.plot(index[here & broken], cost[here & broken], "x", color=colour, markersize=4)
     best = np.minimum.accumulate(np.where(broken, np.inf, cost))
     shown = np.isfinite(best)
-    ax.plot(index[shown], best[shown], color=AFTER, linewidth=1.4, drawstyle="steps-post", label="best that holds every limit" if limited else "best")
+    ax.plot(
+        index[shown],
+        best[shown],
+        color=AFTER,
+        linewidth=1.4,
+        drawstyle="steps-post",
+        label="best that holds every limit" if limited else "best",
+    )
     ax.plot([], [], "x", color="0.4", label="breaks a limit") if broken.any() else None
     for s in np.unique(start)[1:]:
         ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
@@ -134,7 +147,9 @@ def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, log
         ax.set_ylim(low, high)
     ax.plot(*before, "s", color=BEFORE, label="before")
     ax.plot(*after, "o", color=AFTER, label="after")
-    ax.set(xlabel=f"{name} [{unit}]", ylabel=f"objective [{cost_unit}]", title="landscape", xscale="log" if logarithmic else "linear")
+    ax.set(
+        xlabel=f"{name} [{unit}]", ylabel=f"objective [{cost_unit}]", title="landscape", xscale="log" if logarithmic else "linear"
+    )
     ax.legend()
     return ax
 

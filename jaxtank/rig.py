@@ -1,28 +1,29 @@
 """A rig as a TOML file: a case of a paper and what is different about yours.
 
-    case = "gouta2015/backstepping"
+case = "gouta2015/backstepping"
 
-    [values]                     # any parameter by its dotted name
-    "controller.k1" = 0.01
-    "plant.area" = [21.2, 21.2, 21.2, 21.2]
-    "clock.dt" = 0.01
+[values]                     # any parameter by its dotted name
+"controller.k1" = 0.01
+"plant.area" = [21.2, 21.2, 21.2, 21.2]
+"clock.dt" = 0.01
 
-    [reference]                  # ramps between plateaus
-    initial = [3.0, 3.0]
-    changes = [[20.0, 1, 8.0]]   # time [s], output (from 1), level
-    ramp = 60.0
+[reference]                  # ramps between plateaus
+initial = [3.0, 3.0]
+changes = [[20.0, 1, 8.0]]   # time [s], output (from 1), level
+ramp = 60.0
 
-    [limits]                     # hard limits of `tune`
-    max_level = "rim"
+[limits]                     # hard limits of `tune`
+max_level = "rim"
 
-    [free]                       # what `tune` may change: [low, high] or [low, high, "log" or "linear"]
-    "controller.k1" = [0.001, 5.0]
+[free]                       # what `tune` may change: [low, high] or [low, high, "log" or "linear"]
+"controller.k1" = [0.001, 5.0]
 
-    [objective]                  # what it makes small: measure = weight
-    rms_error_total = 1.0
+[objective]                  # what it makes small: measure = weight
+rms_error_total = 1.0
 """
 
 import dataclasses
+import math
 import tomllib
 from pathlib import Path
 
@@ -34,11 +35,11 @@ from jaxtank import presets
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
-from jaxtank.measures import check_names
+from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.presets.base import Case, Free
 from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.signals import Ramps, ramps
-from jaxtank.tree import check_value, describe, get_value, is_component, split_index, walk, with_values
+from jaxtank.tree import _short, check_value, describe, get_value, is_component, walk, with_values
 
 TABLES = ("case", "name", "values", "reference", "limits", "free", "objective")
 REFERENCE_KEYS = ("initial", "changes", "ramp", "shape")
@@ -54,14 +55,16 @@ def load(path):
     text = read_text(path, "rig file")
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"rig file {str(path)!r} is not TOML: {error}") from None
+    except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
+        raise InputError(f"rig file {str(path)!r} is not TOML: {' '.join(str(error).split())}") from None
     except RecursionError:
         raise InputError(f"rig file {str(path)!r} is not TOML that can be read: it is nested too deeply") from None
     try:
         return from_table(table)
     except InputError as error:
         raise type(error)(f"rig file {str(path)!r}: {error}") from None
+    except RecursionError:
+        raise InputError(f"rig file {str(path)!r}: a value is nested too deeply") from None
 
 
 def from_table(table):
@@ -71,7 +74,7 @@ def from_table(table):
             raise unknown("key", key, TABLES)
         wanted = str if key in ("case", "name") else dict
         if not isinstance(value, wanted):
-            raise InputError(f"{key} = {value!r}: must be {'a text' if wanted is str else 'a table'}")
+            raise InputError(f"{key} = {_short(value)}: must be {'a text' if wanted is str else 'a table'}")
     if "case" not in table:
         raise InputError('a rig file needs case = "paper/case" to start from; `jaxtank list` prints them')
     case = presets.find(table["case"])
@@ -80,16 +83,57 @@ def from_table(table):
         case = case.replace(loop=dataclasses.replace(case.loop, reference=_reference(table["reference"], case.loop.reference)))
     case = set_values(case, table.get("values", {}))
     if "limits" in table:
-        check_names(table["limits"])
-        case = case.replace(limits=dict(table["limits"]))
+        case = case.replace(limits=check_limits(case.loop, table["limits"]))
     if "objective" in table:
-        check_names(table["objective"])
-        for measure, weight in table["objective"].items():
-            _number(f"objective.{measure}", weight)
-        case = case.replace(objective=dict(table["objective"]))
+        case = case.replace(objective=check_objective(table["objective"]))
     if "free" in table:
-        case = case.replace(free={name: _free(case, name, spec) for name, spec in table["free"].items()})
+        case = case.replace(free={name: _free(case.loop, name, spec) for name, spec in table["free"].items()})
     return check(case)
+
+
+def check_limits(loop, limits):
+    """`limits` as a dict, if every one is a measure with a finite number, one for each of its entries, or "rim" for max_level."""
+    check_names(limits)
+    for measure, value in limits.items():
+        count, unit = entries(measure, loop.plant), MEASURES[measure].unit
+        if isinstance(value, str) and value == "rim" and measure == "max_level":
+            continue
+        good = _is_numeric(value) and np.shape(value) in ((), (count,))
+        if not good or not np.all(np.isfinite(np.asarray(value, dtype=float))):
+            many = f", or {count} of them" if count > 1 else ""
+            rim = ', or "rim"' if measure == "max_level" else ""
+            raise InputError(f"limit {measure} = {_short(value)}: must be a finite number [{unit}]{many}{rim}")
+    return dict(limits)
+
+
+def check_objective(objective):
+    """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one of them above."""
+    check_names(objective)
+    for measure, weight in objective.items():
+        if not (_is_numeric(weight) and np.ndim(weight) == 0 and np.isfinite(weight) and weight >= 0):
+            raise InputError(f"objective {measure} = {_short(weight)}: must be a finite weight at or above 0")
+    if not any(objective.values()):
+        raise InputError("the objective has no measure with a weight above 0")
+    return {measure: float(weight) for measure, weight in objective.items()}
+
+
+def check_free(loop, name, low, high, scale="log"):
+    """The Free of a parameter, if it is a leaf in use and its range lies within what it allows."""
+    if name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS:
+        meta = {"kind": "static"}
+    else:
+        meta = describe(loop, name)
+    if meta["kind"] == "static":
+        raise InputError(f"free {name}: cannot be tuned, it is part of the compiled program and not a number with a derivative")
+    get_value(loop, name)
+    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
+    for end in (low, high):
+        check_value(f"free {name}", end, meta)
+    if scale not in ("log", "linear"):
+        raise InputError(f"free {name}: scale {scale!r} must be log or linear")
+    return Free(float(low), float(high), scale if low > 0 else "linear")
 
 
 def check(case):
@@ -110,16 +154,20 @@ def set_values(case, values):
     values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with the nearest), a value of the wrong
     kind or shape, and a value out of range.
     """
+    clock = {name: value for name, value in values.items() if name.startswith("clock.")}
+    if clock:
+        case = case.replace(clock=_set_clock(case.clock, clock))
     for name, value in values.items():
-        if name.startswith("clock."):
-            case = case.replace(clock=_set_clock(case.clock, name, value))
+        if name in clock:
             continue
         meta = describe(case.loop, name)
         if meta["kind"] == "static":
+            if "[" in name:
+                raise InputError(f"{name}: {name.split('[')[0]} has no entries, set it whole")
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
         if not _is_numeric(value):
-            raise InputError(f"{name} = {value!r}: must be a number or a list of numbers{_unit(meta)}")
+            raise InputError(f"{name} = {_short(value)}: must be a number or a list of numbers{_unit(meta)}")
         loop = with_values(case.loop, {name: value})
         check_value(name, get_value(loop, name), meta)
         case = case.replace(loop=loop)
@@ -143,7 +191,9 @@ def dump(case):
         changes = [[t, i + 1, float(v)] for (t, i), v in zip(reference.changes, np.asarray(reference.targets))]
         lines += [f"changes = {_toml(changes)}  # time [s], output (from 1), level [cm]"]
         lines += [f"ramp = {_toml(reference.ramp)}  # [s]", f"shape = {_toml(reference.shape)}"]
-    lines += ["", "[limits]"] + [f"{m} = {_toml(np.asarray(v).tolist() if not isinstance(v, str) else v)}" for m, v in case.limits.items()]
+    lines += ["", "[limits]"] + [
+        f"{m} = {_toml(np.asarray(v).tolist() if not isinstance(v, str) else v)}" for m, v in case.limits.items()
+    ]
     lines += ["", "[free]"] + [f"{_toml(n)} = {_toml(list(Free(*spec)))}" for n, spec in case.free.items()]
     lines += ["", "[objective]"] + [f"{m} = {_toml(float(w))}" for m, w in case.objective.items()]
     return "\n".join(lines) + "\n"
@@ -156,6 +206,10 @@ def save(case, path):
 
 def _origin(case):
     """The preset that a case came from: one with the same components, so that values are all there is to set."""
+    if not isinstance(case.loop.reference, Ramps):
+        raise InputError(
+            f"{case.name}: a reference of the kind {type(case.loop.reference).__name__} cannot be written to a rig file"
+        )
     structure = jax.tree.structure(_plain(case.loop))
     for paper in presets.PAPERS:
         cases = presets.load(paper).cases
@@ -169,6 +223,7 @@ def _origin(case):
 
 def _plain(loop):
     """The loop with what a rig file can set made alike, so that structures compare by their components."""
+
     def settle(tree):
         changed = {}
         for field in dataclasses.fields(tree):
@@ -181,8 +236,7 @@ def _plain(loop):
                 changed[field.name] = None
         return dataclasses.replace(tree, **changed)
 
-    loop = settle(loop)
-    return dataclasses.replace(loop, reference=type(loop.reference).__name__ and None)
+    return dataclasses.replace(settle(loop), reference=None)
 
 
 def _reference(table, old):
@@ -191,18 +245,18 @@ def _reference(table, old):
             raise unknown("key of [reference]", key, REFERENCE_KEYS)
     if not isinstance(old, Ramps):
         raise InputError("[reference] is for cases whose reference is made of ramps")
+    outputs = np.size(old.initial)
     initial = table.get("initial", np.asarray(old.initial).tolist())
-    if not (_is_numeric(initial) and np.shape(initial) == np.shape(old.initial)):
-        raise InputError(f"reference.initial = {initial!r}: must be a list of {np.size(old.initial)} levels [cm]")
+    if not (_is_numeric(initial) and np.shape(initial) == (outputs,) and np.all(np.isfinite(initial))):
+        raise InputError(f"reference.initial = {_short(initial)}: must be a list of {outputs} finite levels [cm]")
     changes = table.get("changes", [[t, i + 1, float(v)] for (t, i), v in zip(old.changes, np.asarray(old.targets))])
+    form = f"[time [s], output from 1 to {outputs}, level [cm]]"
     if not isinstance(changes, list):
-        raise InputError(f"reference.changes = {changes!r}: must be a list of [time [s], output (from 1), level [cm]]")
+        raise InputError(f"reference.changes = {_short(changes)}: must be a list of {form}")
     for change in changes:
-        good = isinstance(change, list) and len(change) == 3 and _is_numeric(change) and not isinstance(change[1], float)
-        if not (good and 1 <= change[1] <= np.size(old.initial)):
-            raise InputError(
-                f"reference.changes has {change!r}: must be [time [s], output from 1 to {np.size(old.initial)}, level [cm]]"
-            )
+        good = isinstance(change, list) and len(change) == 3 and all(np.ndim(v) == 0 and _is_numeric(v) for v in change)
+        if not (good and isinstance(change[1], int) and 1 <= change[1] <= outputs and np.all(np.isfinite(change))):
+            raise InputError(f"reference.changes has {_short(change)}: must be {form}, finite numbers")
     ramp = _number("reference.ramp", table.get("ramp", old.ramp))
     check_value("reference.ramp", ramp, describe_field(Ramps, "ramp"))
     return ramps(initial, [(float(t), i - 1, float(v)) for t, i, v in changes], ramp, table.get("shape", old.shape))
@@ -213,23 +267,25 @@ def describe_field(cls, name):
     return next(f.metadata for f in dataclasses.fields(cls) if f.name == name)
 
 
-def _free(case, name, spec):
-    describe(case.loop, name)
-    good = isinstance(spec, list) and len(spec) in (2, 3) and _is_numeric(spec[:2])
+def _free(loop, name, spec):
+    good = isinstance(spec, list) and len(spec) in (2, 3) and all(_is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
     if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
-        raise InputError(f'free.{name} = {spec!r}: must be [low, high] or [low, high, "log" or "linear"]')
-    return Free(*(float(v) for v in spec[:2]), *spec[2:])
+        raise InputError(f'free {name} = {_short(spec)}: must be [low, high] or [low, high, "log" or "linear"]')
+    return check_free(loop, name, *spec)
 
 
-def _set_clock(clock, name, value):
-    field = name.removeprefix("clock.")
-    if field not in CLOCK_UNITS:
-        raise unknown("parameter", name, [f"clock.{f}" for f in CLOCK_UNITS])
-    if field in ("dt", "duration"):
-        value = _number(name, value)
-    elif field == "substeps" and isinstance(value, float) and value == int(value):
-        value = int(value)
-    clock = dataclasses.replace(clock, **{field: value})
+def _set_clock(clock, values):
+    fields = {}
+    for name, value in values.items():
+        field = name.removeprefix("clock.")
+        if field not in CLOCK_UNITS:
+            raise unknown("parameter", name, [f"clock.{f}" for f in CLOCK_UNITS])
+        if field in ("dt", "duration"):
+            value = _number(name, value)
+        elif field == "substeps" and isinstance(value, float) and value.is_integer():
+            value = int(value)
+        fields[field] = value
+    clock = dataclasses.replace(clock, **fields)
     check_clock(clock)
     return clock
 
@@ -237,31 +293,38 @@ def _set_clock(clock, name, value):
 def _set_static(tree, name, path, value, meta):
     if len(path) > 1:
         return dataclasses.replace(tree, **{path[0]: _set_static(getattr(tree, path[0]), name, path[1:], value, meta)})
-    split_index(name)
     old = getattr(tree, path[0])
     if isinstance(old, tuple):
         raise InputError(f"{name} is the topology of the rig and cannot be set: choose another case")
     if meta["choices"] is not None:
         if value not in meta["choices"] or isinstance(value, bool) != isinstance(old, bool):
-            raise InputError(f"{name} = {value!r}: must be one of {', '.join(str(c).lower() if isinstance(c, bool) else c for c in meta['choices'])}")
+            raise InputError(
+                f"{name} = {value!r}: must be one of {', '.join(str(c).lower() if isinstance(c, bool) else c for c in meta['choices'])}"
+            )
         return dataclasses.replace(tree, **{path[0]: value})
     value = _number(name, value)
-    if isinstance(old, int) and value != int(value):
-        raise InputError(f"{name} = {value:g}: must be a whole number")
     check_value(name, value, meta)
+    if isinstance(old, int) and not value.is_integer():
+        raise InputError(f"{name} = {value:g}: must be a whole number")
     return dataclasses.replace(tree, **{path[0]: type(old)(value)})
 
 
 def _number(name, value):
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{name} = {value!r}: must be a number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not _is_numeric(value):
+        raise InputError(f"{name} = {_short(value)}: must be a number")
     return float(value)
 
 
 def _is_numeric(value):
-    if isinstance(value, list):
-        return all(_is_numeric(v) for v in value)
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """True for a number that a float can hold, and for lists of such numbers and arrays of a regular shape."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return np.issubdtype(value.dtype, np.number)
+    if isinstance(value, (list, tuple)):
+        return all(_is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+    try:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and float(value) is not None
+    except OverflowError:
+        return False
 
 
 def _unit(meta):
@@ -274,11 +337,13 @@ def _line(name, value, meta):
 
 
 def _toml(value):
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
     return repr(value)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxtank.errors import InputError, unknown
 
-_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)$")
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 
 
 def leaf(unit="-", doc="", *, low=None, high=None, strict=False, like=None):
@@ -83,9 +83,11 @@ def get_value(tree, name):
     """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if there is none."""
     base, index = split_index(name)
     values = parameters(tree)
-    if base not in values:
-        raise unknown("parameter", name, _all_names(tree))
-    return _entry(values[base], index, name)
+    if base in values:
+        return _entry(values[base], index, name)
+    if describe(tree, name)["kind"] == "leaf":
+        raise InputError(f"{base} is not in use: give it a value first, with --set {base}=VALUE or with_values")
+    raise unknown("parameter", name, values)
 
 
 def with_values(tree, values):
@@ -108,9 +110,9 @@ def with_values(tree, values):
 def split_index(name):
     """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError for a malformed name."""
     parts = name.split(".")
-    if not all(_STEP.match(p) for p in parts) or any("[" in p for p in parts[:-1]):
+    if not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
         raise InputError(f"{name!r} is not a parameter name: write component.field or component.field[i]")
-    base, bracket = _STEP.match(parts[-1]).groups()
+    base, bracket = _STEP.fullmatch(parts[-1]).groups()
     index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()
     return ".".join([*parts[:-1], base]), index
 
@@ -143,6 +145,15 @@ def check_value(name, value, meta):
     if high is not None and entry > high:
         raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
     raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
+
+
+def _short(value):
+    """`value` for a message, cut where it would fill the screen."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an int of thousands of digits, or a list in a list in a list ...
+        return f"a {type(value).__name__} too large to print"
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def _all_names(tree):
@@ -180,8 +191,10 @@ def _fitted(old, index, value, name):
     on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
     try:
         value = jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} = {value!r}: must be a number{'' if np.ndim(old) == 0 else ' or a list of numbers'}") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(
+            f"{name} = {_short(value)}: must be a number{'' if np.ndim(old) == 0 else ' or a list of numbers'}"
+        ) from None
     shape = np.shape(old)
     if index:
         _entry(old, index, name)

@@ -2,9 +2,10 @@
 
 import dataclasses
 
-import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 import jax
 import pytest
+
+import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 
 jax.config.update("jax_enable_x64", True)
 

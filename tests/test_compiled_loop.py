@@ -34,7 +34,9 @@ def test_the_loop_compiles_to_one_function(gouta, name):
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
     from jaxtank.measures import MEASURES as every
 
-    case = gouta("ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12})
+    case = gouta(
+        "ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12}
+    )
     assert loops_in(_evaluate.lower(case.loop, case.clock, tuple(every), jax.random.key(0), False).compile()) >= 1
 
 
@@ -65,9 +67,17 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
 
 def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
     case = gouta("backstepping")
-    stats = _sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile().memory_analysis()
+    stats = (
+        _sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile().memory_analysis()
+    )
     assert stats.temp_size_in_bytes < 10e6
-    reverse = jax.jit(jax.grad(lambda k1: evaluate_for_reverse(jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES)["rms_error_total"]))
+    reverse = jax.jit(
+        jax.grad(
+            lambda k1: evaluate_for_reverse(jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES)[
+                "rms_error_total"
+            ]
+        )
+    )
     assert reverse.lower(0.088).compile().memory_analysis().temp_size_in_bytes < 10e6
 
 

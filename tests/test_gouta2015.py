@@ -23,8 +23,17 @@ from jaxtank.records import Clock, Estimate, Tick
 from jaxtank.signals import Constant
 
 MEASURES = (
-    "rms_error", "rms_error_total", "ise", "max_error", "rms_input", "saturated_fraction", "max_level", "min_level", "input_travel",
-    "overshoot_percent", "settling_time",
+    "rms_error",
+    "rms_error_total",
+    "ise",
+    "max_error",
+    "rms_input",
+    "saturated_fraction",
+    "max_level",
+    "min_level",
+    "input_travel",
+    "overshoot_percent",
+    "settling_time",
 )
 
 
@@ -41,8 +50,48 @@ PLANT_B = [
     (60, "backstepping-ff", 0.0889, 0.0742, 0.1158, 9.5, 6.6, 0.50, 0.37, 4.025, 3.531, 0, 0, 33.21, 36.96, 0.218, 0.866, 32, 29),
     (30, "ngpc", 0.1636, 0.1389, 0.2146, 32.1, 23.1, 1.39, 0.80, 4.177, 3.671, 1.3, 1.5, 40.80, 47.17, 0.004, 0.159, 66, 58),
     (30, "backstepping", 0.5367, 0.4560, 0.7043, 345.7, 249.5, 3.01, 2.24, 4.065, 3.566, 0, 0, 33.71, 38.51, 0.147, 0.750, 33, 29),
-    (30, "backstepping-ff", 0.1917, 0.1636, 0.2520, 44.1, 32.1, 1.24, 0.92, 4.171, 3.660, 0.5, 0.6, 42.31, 48.36, 0.004, 0.117, 55, 50),
-    (20, "backstepping", 0.6255, 0.5314, 0.8208, 469.6, 338.9, 4.46, 3.33, 4.118, 3.614, 0.19, 0.24, 35.2, 41.9, 0.040, 0.451, 46, 40),
+    (
+        30,
+        "backstepping-ff",
+        0.1917,
+        0.1636,
+        0.2520,
+        44.1,
+        32.1,
+        1.24,
+        0.92,
+        4.171,
+        3.660,
+        0.5,
+        0.6,
+        42.31,
+        48.36,
+        0.004,
+        0.117,
+        55,
+        50,
+    ),
+    (
+        20,
+        "backstepping",
+        0.6255,
+        0.5314,
+        0.8208,
+        469.6,
+        338.9,
+        4.46,
+        3.33,
+        4.118,
+        3.614,
+        0.19,
+        0.24,
+        35.2,
+        41.9,
+        0.040,
+        0.451,
+        46,
+        40,
+    ),
     (20, "backstepping-ff", 0.2186, 0.2744, 0.3508, 57.3, 90.4, 1.00, 1.51, 4.250, 3.711, 3.1, 3.9, 45.4, 50.3, 0.0, 0.001, 65, 52),
 ]
 
@@ -53,7 +102,9 @@ def test_plant_b_rows_of_the_acceptance_table(row):
     got = measured(name, reference__ramp=float(ramp))
     np.testing.assert_allclose(got["rms_error"], (rms1, rms2), rtol=5e-3)
     np.testing.assert_allclose(got["rms_error_total"], total, rtol=5e-3)
-    np.testing.assert_allclose(got["ise"], (ise1, ise2), rtol=1e-2)  # printed to two or three digits; twice the tolerance of its root
+    np.testing.assert_allclose(
+        got["ise"], (ise1, ise2), rtol=1e-2
+    )  # printed to two or three digits; twice the tolerance of its root
     np.testing.assert_allclose(got["max_error"], (e1, e2), atol=0.011)  # printed to two decimals
     np.testing.assert_allclose(got["rms_input"], (u1, u2), rtol=5e-3)
     np.testing.assert_allclose(100 * got["saturated_fraction"], (sat1, sat2), atol=0.1)
@@ -178,7 +229,9 @@ UNIT_VECTORS = [
     (SECOND, FAST_AREA, "backstepping-ff", (-4.660910, 10.805255)),
 ]
 ALLOCATIONS = {
-    "ngpc": ((4.784652, 0), (0, 3.133349)), "backstepping": ((4.184597, 0), (0, 3.979105)), "backstepping-ff": ((4.672592, 0), (0, 5.115917)),
+    "ngpc": ((4.784652, 0), (0, 3.133349)),
+    "backstepping": ((4.184597, 0), (0, 3.979105)),
+    "backstepping-ff": ((4.672592, 0), (0, 5.115917)),
 }
 
 
@@ -328,7 +381,12 @@ def test_the_inversion_inverts():
     rng = np.random.default_rng(0)
     for h3, h4 in rng.uniform(0.05, 30, (50, 2)):
         s3, s4 = np.sqrt(h3), np.sqrt(h4)
-        b = 0.5 * np.array([[c.c2, c.c3], [c.c5, c.c6]], dtype=float) @ np.diag([1 / s3, 1 / s4]) @ np.diag([c.c8, c.c10]).astype(float)
+        b = (
+            0.5
+            * np.array([[c.c2, c.c3], [c.c5, c.c6]], dtype=float)
+            @ np.diag([1 / s3, 1 / s4])
+            @ np.diag([c.c8, c.c10]).astype(float)
+        )
         rest = np.array(decouple(c, s3, s4, 0.0, 0.0))
         columns = [np.array(decouple(c, s3, s4, *v)) - rest for v in ((1.0, 0.0), (0.0, 1.0))]
         np.testing.assert_allclose(b @ np.column_stack(columns), np.eye(2), atol=1e-12)

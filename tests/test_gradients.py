@@ -47,7 +47,14 @@ def agree(case, names, measure="rms_error_total", rtol=1e-5, atol=1e-9, step=STE
     return forward
 
 
-@pytest.mark.parametrize("name, names", [("ngpc", ["controller.Tp"]), ("backstepping", ["controller.k", "controller.k1"]), ("backstepping-ff", ["controller.k", "controller.k1"])])
+@pytest.mark.parametrize(
+    "name, names",
+    [
+        ("ngpc", ["controller.Tp"]),
+        ("backstepping", ["controller.k", "controller.k1"]),
+        ("backstepping-ff", ["controller.k", "controller.k1"]),
+    ],
+)
 @pytest.mark.parametrize("ramp", [60.0, 30.0])
 def test_published_gains_in_plant_b(gouta, name, names, ramp):
     agree(gouta(name, {"reference.ramp": ramp}), names)
@@ -155,6 +162,9 @@ def test_nan_is_told_with_time_tank_and_parameters(gouta):
 
     fields = {f.name: getattr(case.loop.controller, f.name) for f in dataclasses.fields(case.loop.controller)}
     broken = dataclasses.replace(case.loop, controller=jaxtank.component(Broken)(**fields))
-    for call in (lambda: jaxtank.evaluate(broken, case.clock, "rms_error"), lambda: jaxtank.simulate(broken, case.clock, save_every=10)):
+    for call in (
+        lambda: jaxtank.evaluate(broken, case.clock, "rms_error"),
+        lambda: jaxtank.simulate(broken, case.clock, save_every=10),
+    ):
         with pytest.raises(jaxtank.NonFiniteError, match=r"tank 1, 2, 3 .* t = 2\.01 s .* controller.Tp = 11"):
             call()

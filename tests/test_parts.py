@@ -28,7 +28,9 @@ def test_a_ramp_against_its_definition(shape, dt):
     s = (lambda x: x) if shape == "linear" else lambda x: 10 * x**3 - 15 * x**4 + 6 * x**5
     np.testing.assert_allclose(r, 3 + 5 * s(x1) - 3 * s(x2), atol=1e-12)
     if shape == "linear":
-        np.testing.assert_allclose(dr, 5 / 60 * ((t >= 20 - 1e-9) & (t < 80 - 1e-9)) - 3 / 60 * ((t >= 90 - 1e-9) & (t < 150 - 1e-9)), atol=1e-15)
+        np.testing.assert_allclose(
+            dr, 5 / 60 * ((t >= 20 - 1e-9) & (t < 80 - 1e-9)) - 3 / 60 * ((t >= 90 - 1e-9) & (t < 150 - 1e-9)), atol=1e-15
+        )
         assert not ddr.any()
     else:
         ds, dds = lambda x: 30 * x**2 * (1 - x) ** 2 / 60, lambda x: 60 * x * (1 - x) * (1 - 2 * x) / 3600
@@ -40,7 +42,7 @@ def test_an_s_curve_integrates_its_own_rates():
     clock = Clock(dt=0.01, duration=100.0)
     r, dr, ddr = (np.asarray(v[0]) for v in ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic").sample(clock))
     np.testing.assert_allclose(np.gradient(r, 0.01)[1:-1], dr[1:-1], atol=1e-6)
-    np.testing.assert_allclose(np.gradient(dr, 0.01)[1:-1], ddr[1:-1], atol=2e-6)
+    np.testing.assert_allclose(np.gradient(dr, 0.01)[1:-1], ddr[1:-1], atol=5e-6)  # at its ends the third derivative jumps
 
 
 def test_steps_and_overlapping_ramps():
@@ -83,7 +85,9 @@ def test_a_change_at_a_bad_time_or_channel_is_refused(change):
 # kinks
 
 
-@pytest.mark.parametrize("x, value, slope", [(-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (5.0, 5.0, 1.0), (12.0, 12.0, 1.0), (13.0, 12.0, 0.0)])
+@pytest.mark.parametrize(
+    "x, value, slope", [(-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (5.0, 5.0, 1.0), (12.0, 12.0, 1.0), (13.0, 12.0, 0.0)]
+)
 def test_clip(x, value, slope):
     f = lambda x: clip(x, 0.0, 12.0)
     assert (f(x), jax.grad(f)(x)) == (value, slope)
@@ -150,7 +154,13 @@ def test_noise_makes_the_voltage_travel_as_the_spec_says(gouta):
 
 
 def pumps(**more):
-    plain = {"low": number([0, 0]), "high": number([12, 12]), "stop": number([1.5, 1.5]), "pulse": number([3.3, 3.3]), "initial": number([2, 4])}
+    plain = {
+        "low": number([0, 0]),
+        "high": number([12, 12]),
+        "stop": number([1.5, 1.5]),
+        "pulse": number([3.3, 3.3]),
+        "initial": number([2, 4]),
+    }
     return PumpBank(**{**plain, **{k: number(v) if isinstance(v, list) else v for k, v in more.items()}})
 
 
@@ -210,14 +220,26 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
     for k, h in enumerate(levels):
         rk = target[k] if r is None else r[k]
         uk = 0.0 if u is None else u[k]
-        sample = Sample(t=jnp.float64(k), x=(jnp.float64(h),), y=(h,), x_hat=(h,), r=(rk,), e=(jnp.float64(h - rk),), command=(uk if command is None else command[k],), u=(jnp.float64(uk),), spilled=(0.0,))
+        sample = Sample(
+            t=jnp.float64(k),
+            x=(jnp.float64(h),),
+            y=(h,),
+            x_hat=(h,),
+            r=(rk,),
+            e=(jnp.float64(h - rk),),
+            command=(uk if command is None else command[k],),
+            u=(jnp.float64(uk),),
+            spilled=(0.0,),
+        )
         states = ms.update(run, states, sample, ((jnp.float64(target[k]), jnp.float64(step[k]), jnp.float64(since[k])),))
     return {m: np.asarray(v) for m, v in ms.read(run, states, names).items()}
 
 
 def test_overshoot_rise_and_settling_of_a_hand_made_step():
     levels = [0, 0, 2, 5, 8, 11, 10.6, 9.3, 10.2, 10]
-    got = folded(("overshoot_percent", "rise_time", "settling_time"), levels, [0] * 2 + [10] * 8, [0] * 2 + [10] * 8, [0, 0, *range(8)])
+    got = folded(
+        ("overshoot_percent", "rise_time", "settling_time"), levels, [0] * 2 + [10] * 8, [0] * 2 + [10] * 8, [0, 0, *range(8)]
+    )
     np.testing.assert_allclose(got["overshoot_percent"], 10.0)
     np.testing.assert_allclose(got["rise_time"], 3.0)  # from t = 2 (past 10 %) to t = 5 (past 90 %)
     np.testing.assert_allclose(got["settling_time"], 5.0)  # 9.3 at t = 7, five seconds after the change, is the last outside
@@ -229,7 +251,9 @@ def test_a_downward_step_has_its_overshoot_below():
 
 
 def test_saturation_is_of_the_command_and_its_excess_is_bounded():
-    got = folded(("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4, u=[0, 5, 12, 12], command=[-12, 5, 12, 24])
+    got = folded(
+        ("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4, u=[0, 5, 12, 12], command=[-12, 5, 12, 24]
+    )
     np.testing.assert_allclose(got["saturated_fraction"], 0.5)
     np.testing.assert_allclose(got["saturation_excess"], 0.25)  # (1/2 + 0 + 0 + 1/2) / 4
 

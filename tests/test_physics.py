@@ -147,8 +147,15 @@ def random_network(seed):
     links = tuple((i, j) for i in range(n) for j in range(i + 1, n) if rng.random() < 0.5)
     feeds = tuple((i, int(rng.integers(n)) if rng.random() < 0.4 else None) for i in range(n))
     plant = network(
-        area=rng.uniform(10, 400, n), drain=rng.uniform(0.05, 0.3, n), links=links, orifice=rng.uniform(0.02, 0.2, len(links)),
-        pump_gain=rng.uniform(2, 10, n), split=rng.uniform(0, 1, n), feeds=feeds, rim=np.full(n, 20.0), outputs=tuple(range(n)),
+        area=rng.uniform(10, 400, n),
+        drain=rng.uniform(0.05, 0.3, n),
+        links=links,
+        orifice=rng.uniform(0.02, 0.2, len(links)),
+        pump_gain=rng.uniform(2, 10, n),
+        split=rng.uniform(0, 1, n),
+        feeds=feeds,
+        rim=np.full(n, 20.0),
+        outputs=tuple(range(n)),
     )
     return plant, rng
 

@@ -108,8 +108,21 @@ def test_a_static_field_is_described_but_is_no_leaf(loop):
 
 @pytest.mark.parametrize(
     "name",
-    ["plant.area[", "plant.area[x]", "plant.area[0", "plant.area[-1]", "plant.area[]", "plant..area", "", ".", "plant[0].area",
-     "plant.area[0][0]", "plant.area[0].x", "plant.area [0]", "plant.area[0]\n"],
+    [
+        "plant.area[",
+        "plant.area[x]",
+        "plant.area[0",
+        "plant.area[-1]",
+        "plant.area[]",
+        "plant..area",
+        "",
+        ".",
+        "plant[0].area",
+        "plant.area[0][0]",
+        "plant.area[0].x",
+        "plant.area [0]",
+        "plant.area[0]\n",
+    ],
 )
 def test_a_malformed_name_is_told(loop, name):
     for ask in (get_value, lambda tree, name: with_values(tree, {name: 1.0})):
@@ -226,8 +239,12 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
 
     case = gouta("backstepping", {"x0": 5.0})  # away from rest, so that the gain is felt
     changes = [
-        {"controller.k1": 0.05}, {"controller.k1": np.float32(0.1)}, {"controller.k1": jnp.asarray(0.2)}, {"controller.k": 1},
-        {"plant.area[0]": 20.0}, {"plant.drain": [0.1, 0.2, 0.0, 0.0]},
+        {"controller.k1": 0.05},
+        {"controller.k1": np.float32(0.1)},
+        {"controller.k1": jnp.asarray(0.2)},
+        {"controller.k": 1},
+        {"plant.area[0]": 20.0},
+        {"plant.drain": [0.1, 0.2, 0.0, 0.0]},
     ]
     costs = [float(error(with_values(case.loop, values))) for values in changes]
     assert len(traces) == 1

@@ -1,11 +1,11 @@
 """What one does with a loop: tune its gains through the simulation, under limits.
 
-    import tuning
-    from jaxtank import presets
+import tuning
+from jaxtank import presets
 
-    result = tuning.tune(presets.load("gouta2015").cases["backstepping"])
-    print(result)
-    result.save("tuned")
+result = tuning.tune(presets.load("gouta2015").cases["backstepping"])
+print(result)
+result.save("tuned")
 """
 
 import importlib

@@ -27,7 +27,9 @@ def c_loop(folder):
     if shutil.which("gcc") is None:
         return None
     library = Path(folder) / "floor.so"
-    subprocess.run(["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True)
+    subprocess.run(
+        ["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True
+    )
     function = ctypes.CDLL(str(library)).four_tank
     function.restype = ctypes.c_double
     return function
@@ -47,7 +49,9 @@ def c_runner(function, case, rk4=True):
     dt, *rest = (ctypes.c_double(v) for v in real)
 
     def run():
-        rms = function(pointer(numbers), ctypes.c_long(clock.samples), dt, int(rk4), *rest, pointer(x0), pointer(r), pointer(result))
+        rms = function(
+            pointer(numbers), ctypes.c_long(clock.samples), dt, int(rk4), *rest, pointer(x0), pointer(r), pointer(result)
+        )
         return rms, result[1:].copy()
 
     return run
@@ -103,7 +107,9 @@ def measure(rounds=7):
         rms, top = results["C loop, backstepping"]
         ours = results[CASES[0]]
         found["ratio_to_c"] = statistics.median(a / b for a, b in zip(seconds[CASES[0]], seconds["C loop, backstepping"]))
-        found["difference_to_c_cm"] = float(max(abs(rms - float(ours["rms_error_total"])), np.max(np.abs(top - np.asarray(ours["max_level"])))))
+        found["difference_to_c_cm"] = float(
+            max(abs(rms - float(ours["rms_error_total"])), np.max(np.abs(top - np.asarray(ours["max_level"]))))
+        )
     found["notes"] = _notes(found, function)
     return found
 
@@ -111,18 +117,29 @@ def measure(rounds=7):
 def _notes(found, function):
     notes = []
     if not found["provenance"]["xla_option"]:
-        notes.append("the XLA option for fast loops is off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): runs are about 16 times slower")
+        notes.append(
+            "the XLA option for fast loops is off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): runs are about 16 times slower"
+        )
     if function is None:
         notes.append("no gcc here, so there is no C loop to compare with")
     if found["provenance"]["backend"] != "cpu":
-        notes.append(f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small steps and belongs on a CPU")
+        notes.append(
+            f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small steps and belongs on a CPU"
+        )
     return notes
 
 
 def text(found):
     """The page of `jaxtank bench`."""
     rows = [
-        [n, f"{r['ns_per_step']:.0f}", f"{r['ms']:.2f}", f"{100 * r['spread']:.0f} %", "-" if r["first_call_s"] is None else f"{r['first_call_s']:.2f}", f"{r['times_the_run']:.2f}"]
+        [
+            n,
+            f"{r['ns_per_step']:.0f}",
+            f"{r['ms']:.2f}",
+            f"{100 * r['spread']:.0f} %",
+            "-" if r["first_call_s"] is None else f"{r['first_call_s']:.2f}",
+            f"{r['times_the_run']:.2f}",
+        ]
         for n, r in found["rows"].items()
     ]
     lines = [
@@ -131,6 +148,9 @@ def text(found):
         report.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
     ]
     if "ratio_to_c" in found:
-        lines += ["", f"backstepping over the C loop of the same arithmetic (gcc -O3 -march=native): {found['ratio_to_c']:.2f}; "
-                  f"the two agree to {found['difference_to_c_cm']:.1e} cm"]
+        lines += [
+            "",
+            f"backstepping over the C loop of the same arithmetic (gcc -O3 -march=native): {found['ratio_to_c']:.2f}; "
+            f"the two agree to {found['difference_to_c_cm']:.1e} cm",
+        ]
     return "\n".join([*lines, *found["notes"]])

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.presets.base import Free
-from jaxtank.tree import check_value, describe, get_value, split_index
+from jaxtank.rig import check_free
+from jaxtank.tree import describe, get_value, split_index
 
 
 class Bound(NamedTuple):
@@ -48,23 +48,14 @@ def bounds(loop, free):
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
     found = []
     for name, spec in free.items():
-        low, high, scale = Free(*spec)
-        meta = describe(loop, name)
-        if meta["kind"] == "static":
-            raise InputError(f"{name} cannot be tuned: it is part of the compiled program, not a number with a derivative")
-        unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-        if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            raise InputError(f"--free {name}={low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
-        for end in (low, high):
-            check_value(f"--free {name}", end, meta)
-        if scale == "log" and low <= 0:
-            scale = "linear"
-        base, index = split_index(name)
+        low, high, scale = check_free(loop, name, *spec)
+        unit = describe(loop, name)["unit"]
+        base, _ = split_index(name)
         value = get_value(loop, name)
         names = [name] if np.ndim(value) == 0 else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
-        found += [Bound(n, float(low), float(high), scale, meta["unit"]) for n in names]
+        found += [Bound(n, float(low), float(high), scale, unit) for n in names]
     names = [b.name for b in found]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"--free {name} is given twice")
+            raise InputError(f"free {name} is given twice")
     return found

@@ -20,25 +20,25 @@ class Parser(argparse.ArgumentParser):
         words = [w.strip("'") for w in message.split() if w.startswith("'")] if "invalid choice" in message else []
         if words:
             choices = [w.strip("(),'") for w in message.split("choose from")[-1].split()]
-            message = f"unknown {'command' if 'command' in message else 'choice'} {words[0].rstrip(',')!r}{nearest(words[0], choices)}"
-        elif "unrecognized arguments:" in message:
-            word = message.split(": ", 1)[1].split()[0]
-            known = [o for a in self._every_action() for o in a.option_strings]
-            message = f"unknown option {word!r}{nearest(word.split('=')[0], known)}"
+            message = f"unknown command {words[0]!r}{nearest(words[0], choices)}"
         raise InputError(message)
 
-    def _every_action(self):
+    def options(self, command):
+        """The options of one command."""
         for action in self._actions:
-            yield action
-            if isinstance(action, argparse._SubParsersAction):
-                for parser in action.choices.values():
-                    yield from parser._actions
+            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
+                return [o for a in action.choices[command]._actions for o in a.option_strings]
+        return [o for a in self._actions for o in a.option_strings]
 
 
 def parser():
     """The argument parser of every command."""
-    top = Parser(prog="jaxtank", description="Differentiable liquid-tank rigs, the controllers of five papers, and a tuner that works "
-                 "through the simulation.", epilog="Start with: jaxtank list; jaxtank tune gouta2015/backstepping --out tuned")
+    top = Parser(
+        prog="jaxtank",
+        description="Differentiable liquid-tank rigs, the controllers of five papers, and a tuner that works "
+        "through the simulation.",
+        epilog="Start with: jaxtank list; jaxtank tune gouta2015/backstepping --out tuned",
+    )
     top.add_argument("--version", action="store_true", help="print the version and exit")
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
 
@@ -48,7 +48,14 @@ def parser():
 
     case = argparse.ArgumentParser(add_help=False)
     case.add_argument("case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml')
-    case.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="values", help="set a parameter by its dotted name; repeatable")
+    case.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        dest="values",
+        help="set a parameter by its dotted name; repeatable",
+    )
     case.add_argument("--dt", type=str, metavar="S", help="sampling period [s], short for --set clock.dt=S")
 
     run = argparse.ArgumentParser(add_help=False)
@@ -60,9 +67,27 @@ def parser():
     commands.add_parser("simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures")
     tune = commands.add_parser("tune", parents=[common, case, run], help="tune the gains of a case under its limits")
     tune.add_argument("--method", default="auto", metavar="NAME", help="auto (default), trf, slsqp, lbfgs or adam")
-    tune.add_argument("--free", action="append", default=[], metavar="NAME=LOW:HIGH", help="a parameter to tune; replaces the case's own; repeatable")
-    tune.add_argument("--limit", action="append", default=[], metavar="MEASURE=VALUE", help="a hard limit; MEASURE=none drops one, none drops all; repeatable")
-    tune.add_argument("--objective", action="append", default=[], metavar="MEASURE=WEIGHT", help="what is made small (default rms_error_total=1); repeatable")
+    tune.add_argument(
+        "--free",
+        action="append",
+        default=[],
+        metavar="NAME=LOW:HIGH",
+        help="a parameter to tune; replaces the case's own; repeatable",
+    )
+    tune.add_argument(
+        "--limit",
+        action="append",
+        default=[],
+        metavar="MEASURE=VALUE",
+        help="a hard limit; MEASURE=none drops one, none drops all; repeatable",
+    )
+    tune.add_argument(
+        "--objective",
+        action="append",
+        default=[],
+        metavar="MEASURE=WEIGHT",
+        help="what is made small (default rms_error_total=1); repeatable",
+    )
     tune.add_argument("--starts", default="8", metavar="N", help="local searches (default 8)")
     tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
     tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
@@ -75,7 +100,14 @@ def parser():
 def main(argv=None):
     """Run the command; returns the exit code."""
     try:
-        args = parser().parse_args(argv)
+        top = parser()
+        args, rest = top.parse_known_args(argv)
+        if rest:
+            kind = "option" if rest[0].startswith("-") else "argument"
+            raise InputError(
+                f"unknown {kind} {rest[0]!r}"
+                + (nearest(rest[0].split("=")[0], top.options(args.command)) if kind == "option" else "")
+            )
         if args.version:
             import jaxtank
 
@@ -99,7 +131,10 @@ def main(argv=None):
     except Exception as error:
         if os.environ.get("JAXTANK_TRACEBACK"):
             raise
-        print(f"jaxtank: internal error: {type(error).__name__}: {_one_line(error)} (JAXTANK_TRACEBACK=1 shows where)", file=sys.stderr)
+        print(
+            f"jaxtank: internal error: {type(error).__name__}: {_one_line(error)} (JAXTANK_TRACEBACK=1 shows where)",
+            file=sys.stderr,
+        )
         return 1
 
 
@@ -257,7 +292,11 @@ def _simulate(args):
         print(report.dumps(payload))
     else:
         print(f"{case.name}: {case.title}\n")
-        rows = [[m, s.unit, report.numbers(values[m]), s.doc] for m, s in ms.MEASURES.items() if m in values and m != "time_of_max_level"]
+        rows = [
+            [m, s.unit, report.numbers(values[m]), s.doc]
+            for m, s in ms.MEASURES.items()
+            if m in values and m != "time_of_max_level"
+        ]
         print(report.table(rows, ["measure", "unit", "value", ""]))
     _written(written, args)
     return 0
@@ -266,10 +305,13 @@ def _simulate(args):
 def _tune(args):
     _out(args)
     seed, case = _seed(args), _open(args)
+    from jaxtank.rig import check_objective
     from tuning import report, search
 
     free = dict(_pair("--free", text, _range) for text in args.free) or None
     objective = dict(_pair("--objective", text, lambda v: _number("--objective", v)) for text in args.objective) or None
+    if objective:
+        objective = check_objective(objective)
     result = search.tune(
         case,
         args.method,

@@ -35,10 +35,22 @@ def json_of(case):
         for name, value, meta in walk(case.loop, kind=kind):
             low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
             parameters[name] = {
-                "value": report.clean(value), "unit": meta["unit"], "low": low, "high": high, "static": kind == "static", "about": meta["doc"]
+                "value": report.clean(value),
+                "unit": meta["unit"],
+                "low": low,
+                "high": high,
+                "static": kind == "static",
+                "about": meta["doc"],
             }
     for name, unit in CLOCK_UNITS.items():
-        parameters[f"clock.{name}"] = {"value": getattr(case.clock, name), "unit": unit, "low": None, "high": None, "static": True, "about": ""}
+        parameters[f"clock.{name}"] = {
+            "value": getattr(case.clock, name),
+            "unit": unit,
+            "low": None,
+            "high": None,
+            "static": True,
+            "about": "",
+        }
     return {
         "case": case.name,
         "title": case.title,
@@ -64,7 +76,15 @@ def text(case):
             continue
         value = p["value"]
         shown = _shown(value, p["static"])
-        rows.append([name + ("*" if p["static"] else ""), shown, p["unit"], f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else "", p["about"]])
+        rows.append(
+            [
+                name + ("*" if p["static"] else ""),
+                shown,
+                p["unit"],
+                f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else "",
+                p["about"],
+            ]
+        )
     law = (type(case.loop.controller).__doc__ or "").strip().split("\n\n")[0]
     parts = [
         f"{page['case']}: {page['title']}",

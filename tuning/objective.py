@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.errors import InputError
+from jaxtank.rig import check_limits, check_objective
 from jaxtank.tree import get_value, with_values
 from tuning.bounds import bounds
 
@@ -18,6 +19,12 @@ FORWARD_LIMIT = 10
 
 LOWER = {"min_level"}
 """Measures whose limit is a lower one."""
+
+EXPLODED = 1e9
+"""Size at which a cost, a margin or a slope is no longer a number to search with."""
+
+NOT_A_NUMBER = 1e6
+"""Amount by which a measure that is not a number is taken to break its limit."""
 
 
 class Limit(NamedTuple):
@@ -57,8 +64,8 @@ class Point(NamedTuple):
 
     @property
     def finite(self):
-        """True if cost, margins and derivatives are numbers."""
-        return all(np.all(np.isfinite(v)) for v in (self.cost, self.gradient, self.margins, self.margin_slopes))
+        """True if cost, margins and derivatives are numbers one can search with; a slope of 1e9 is that of a loop that has gone unstable."""
+        return all(np.all(np.abs(v) < EXPLODED) for v in (self.cost, self.gradient, self.margins, self.margin_slopes))
 
 
 def resolve_limits(case, limits=None):
@@ -68,28 +75,14 @@ def resolve_limits(case, limits=None):
     an unknown measure or a value that is no number.
     """
     found = []
-    for measure, value in (case.limits if limits is None else limits).items():
-        ms.check_names([measure])
-        if isinstance(value, str):
-            if value != "rim" or measure != "max_level":
-                raise InputError(f"--limit {measure}={value}: must be a number (or, for max_level, 'rim')")
-            if case.loop.plant.overflow:
-                measure, value = "overflow_volume", np.zeros(case.loop.plant.tanks)
-            else:
-                value = np.asarray(case.loop.plant.rim)
-        count = entries(case.loop, measure)
-        array = np.asarray(value, dtype=float)
-        if array.shape not in ((), (count,)) or not np.all(np.isfinite(array)):
-            unit = ms.MEASURES[measure].unit
-            raise InputError(f"--limit {measure}={value}: must be a finite number [{unit}], or one for each of its {count} entries")
-        found += [Limit(measure, i, float(v)) for i, v in enumerate(np.broadcast_to(array, (count,)))]
+    for measure, value in check_limits(case.loop, case.limits if limits is None else limits).items():
+        if isinstance(value, str) and case.loop.plant.overflow:
+            measure, value = "overflow_volume", 0.0
+        elif isinstance(value, str):
+            value = np.asarray(case.loop.plant.rim)
+        count = ms.entries(measure, case.loop.plant)
+        found += [Limit(measure, i, float(v)) for i, v in enumerate(np.broadcast_to(np.asarray(value, dtype=float), (count,)))]
     return found
-
-
-def entries(loop, measure):
-    """Number of entries of a measure for this loop."""
-    sizes = {"run": 1, "output": len(loop.plant.outputs), "tank": loop.plant.tanks, "pump": loop.plant.pumps}
-    return sizes[ms.MEASURES[measure].per]
 
 
 class Problem:
@@ -102,13 +95,7 @@ class Problem:
     def __init__(self, case, free=None, objective=None, limits=None, key=None):
         self.case, self.loop, self.clock, self.key = case, case.loop, case.clock, key
         self.bounds = bounds(case.loop, case.free if free is None else free)
-        self.objective = dict(case.objective if objective is None else objective)
-        ms.check_names(self.objective)
-        for measure, weight in self.objective.items():
-            if not (np.isfinite(weight) and weight >= 0):
-                raise InputError(f"--objective {measure}={weight}: must be a finite weight at or above 0")
-        if not any(self.objective.values()):
-            raise InputError("the objective has no measure with a weight above 0")
+        self.objective = check_objective(case.objective if objective is None else objective)
         self.limits = resolve_limits(case, limits)
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
@@ -157,6 +144,7 @@ class Problem:
         table = [{m: np.asarray(v[i]) for m, v in measures.items()} for i in range(len(zs))]
         return np.array([self.cost(row) for row in table]), np.array([self.margins(row) for row in table]).reshape(len(zs), -1)
 
+    @np.errstate(over="ignore", invalid="ignore")  # what explodes is told by Point.finite
     def point(self, z):
         """The Point at z: one run at the case's own step, with derivatives."""
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
@@ -167,13 +155,15 @@ class Problem:
         measures = {m: np.asarray(v) for m, v in measures.items()}
         slopes = {m: np.asarray(v).reshape(-1, len(z)) * per_z for m, v in slopes.items()}
         gradient = sum(w * slopes[m].sum(axis=0) for m, w in self.objective.items())
+        margins = self.margins(measures)
         margin_slopes = np.array([-limit.sign * slopes[limit.measure][limit.index] for limit in self.limits]).reshape(-1, len(z))
+        margin_slopes[np.isneginf(margins)] = 0.0  # a measure that is no number (never settled) breaks its limit and has no slope
         found = Point(
             z=z,
             cost=self.cost(measures),
             gradient=gradient,
             gauss_newton=np.asarray(gauss_newton) * np.outer(per_z, per_z),
-            margins=self.margins(measures),
+            margins=np.maximum(margins, -NOT_A_NUMBER),
             margin_slopes=margin_slopes,
             measures=measures,
         )

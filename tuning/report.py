@@ -12,8 +12,18 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.files import check_folder, write_atomic
 
-SHOWN = ("rms_error", "rms_error_total", "max_error", "max_level", "min_level", "overshoot_percent", "settling_time", "rms_input",
-         "input_travel", "saturated_fraction")
+SHOWN = (
+    "rms_error",
+    "rms_error_total",
+    "max_error",
+    "max_level",
+    "min_level",
+    "overshoot_percent",
+    "settling_time",
+    "rms_input",
+    "input_travel",
+    "saturated_fraction",
+)
 REASONS = {
     "overshoot_percent": "the reference does not change",
     "rise_time": "no change of the setpoint was followed to 90 % of its height",
@@ -109,25 +119,66 @@ def json_of(result):
 def text(result):
     """The result as a page of text."""
     unit = objective_unit(result.objective["terms"])
-    head = [f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
-            f"{result.evaluations['gradients']} of them with gradients, {result.wall_s:.1f} s)", ""]
+    head = [
+        f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
+        f"{result.evaluations['gradients']} of them with gradients, {result.wall_s:.1f} s)",
+        "",
+    ]
     rows = [
-        [n, p["unit"], number(p["before"]), number(p["after"]), f"{number(p['lower'])} : {number(p['upper'])}", f"at {p['at_bound']} bound" if p["at_bound"] else ""]
+        [
+            n,
+            p["unit"],
+            number(p["before"]),
+            number(p["after"]),
+            f"{number(p['lower'])} : {number(p['upper'])}",
+            f"at {p['at_bound']} bound" if p["at_bound"] else "",
+        ]
         for n, p in result.parameters.items()
     ]
     parts = [table(rows, ["parameter", "unit", "before", "after", "range", ""]), ""]
     rows = [["objective", unit, number(result.objective["before"]), number(result.objective["after"])]]
     for m in SHOWN:
         if m in result.measures["after"] and not (m == "rms_error_total" and set(result.objective["terms"]) == {m}):
-            rows.append([m, ms.MEASURES[m].unit, numbers(result.measures["before"][m], 4), numbers(result.measures["after"][m], 5 if "level" in m else 4)])
+            rows.append(
+                [
+                    m,
+                    ms.MEASURES[m].unit,
+                    numbers(result.measures["before"][m], 4),
+                    numbers(result.measures["after"][m], 5 if "level" in m else 4),
+                ]
+            )
     parts += [table(rows, ["measure", "unit", "before", "after"]), ""]
     if result.constraints:
         rows = [
-            [c["name"], c["unit"], number(c["limit"], 7), number(c["value"], 7), number(c["margin"], 3), f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-"]
+            [
+                c["name"],
+                c["unit"],
+                number(c["limit"], 7),
+                number(c["value"], 7),
+                number(c["margin"], 3),
+                f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
+            ]
             for c in result.constraints
         ]
-        parts += [table(rows, ["limit", "unit", "at most" if not any("min_level" in c["measure"] for c in result.constraints) else "limit", "value", "margin", "reached at"]), ""]
-    rims = "rims are physics: liquid past them is lost" if result.tuned.loop.plant.overflow else "rims are limits: a level may rise past one"
+        parts += [
+            table(
+                rows,
+                [
+                    "limit",
+                    "unit",
+                    "at most" if not any("min_level" in c["measure"] for c in result.constraints) else "limit",
+                    "value",
+                    "margin",
+                    "reached at",
+                ],
+            ),
+            "",
+        ]
+    rims = (
+        "rims are physics: liquid past them is lost"
+        if result.tuned.loop.plant.overflow
+        else "rims are limits: a level may rise past one"
+    )
     return "\n".join([*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s", _wrap(result.message)])
 
 
@@ -144,7 +195,14 @@ def objective_unit(terms):
 def trajectory_csv(run):
     """A trajectory as CSV with units in the header."""
     columns = [("t [s]", np.asarray(run.t))]
-    for name, field, unit in (("h", "x", "cm"), ("y", "y", "cm"), ("r", "r", "cm"), ("u", "u", "V"), ("command", "command", "V"), ("spilled", "spilled", "cm^3")):
+    for name, field, unit in (
+        ("h", "x", "cm"),
+        ("y", "y", "cm"),
+        ("r", "r", "cm"),
+        ("u", "u", "V"),
+        ("command", "command", "V"),
+        ("spilled", "spilled", "cm^3"),
+    ):
         values = np.asarray(getattr(run, field))
         columns += [(f"{name}{i + 1} [{unit}]", values[:, i]) for i in range(values.shape[1])]
     out = io.StringIO()
@@ -179,9 +237,14 @@ def figures(result, runs=None):
     unit = objective_unit(result.objective["terms"])
     tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level"}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
-    title = f"{result.tuned.name}: objective {number(result.objective['before'], 4)} -> {number(result.objective['after'], 4)} {unit}   (" + ", ".join(
-        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}" for n, p in list(result.parameters.items())[:4]
-    ) + ")"
+    title = (
+        f"{result.tuned.name}: objective {number(result.objective['before'], 4)} -> {number(result.objective['after'], 4)} {unit}   ("
+        + ", ".join(
+            f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}"
+            for n, p in list(result.parameters.items())[:4]
+        )
+        + ")"
+    )
     drawn = {"responses": plotting.responses(result.tuned.loop, runs, title, limits)}
     with plt.rc_context(plotting.STYLE):
         if result.history:
@@ -207,8 +270,16 @@ def _landscape(ax, result, unit):
         violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
         b = problem.bounds[0]
         return plotting.curve(
-            ax, b.from_unit(grid), costs, violation, b.name, b.unit, unit,
-            (result.parameters[b.name]["before"], result.objective["before"]), (result.parameters[b.name]["after"], result.objective["after"]), b.scale == "log",
+            ax,
+            b.from_unit(grid),
+            costs,
+            violation,
+            b.name,
+            b.unit,
+            unit,
+            (result.parameters[b.name]["before"], result.objective["before"]),
+            (result.parameters[b.name]["after"], result.objective["after"]),
+            b.scale == "log",
         )
     first, second = sorted(np.argsort(-_felt(problem, z))[:2])
     side = np.linspace(0.0, 1.0, 24)
@@ -219,8 +290,17 @@ def _landscape(ax, result, unit):
     worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
     x, y = problem.bounds[first], problem.bounds[second]
     plotting.contours(
-        ax, x.from_unit(a), y.from_unit(c), costs.reshape(a.shape), worst.reshape(a.shape), (x.name, y.name), (x.unit, y.unit), unit,
-        (x.from_unit(z0[first]), y.from_unit(z0[second])), (x.from_unit(z[first]), y.from_unit(z[second])), (x.scale == "log", y.scale == "log"),
+        ax,
+        x.from_unit(a),
+        y.from_unit(c),
+        costs.reshape(a.shape),
+        worst.reshape(a.shape),
+        (x.name, y.name),
+        (x.unit, y.unit),
+        unit,
+        (x.from_unit(z0[first]), y.from_unit(z0[second])),
+        (x.from_unit(z[first]), y.from_unit(z[second])),
+        (x.scale == "log", y.scale == "log"),
     )
     if len(z) > 2:
         ax.set_title("landscape (slice through the answer)")
@@ -257,7 +337,9 @@ def save_run(case, run, payload, folder):
 
     check_folder(folder)
     picture = plotting.responses(case.loop, {case.name: run}, case.title)
-    return write_files(Path(folder), {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run), "responses.png": _png(picture)})
+    return write_files(
+        Path(folder), {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run), "responses.png": _png(picture)}
+    )
 
 
 def write_files(folder, files):

@@ -74,7 +74,9 @@ class TuningResult:
         return text(self)
 
 
-def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=8, seed=0, screening=64, iterations=60, progress=None):
+def tune(
+    case, method="auto", *, free=None, objective=None, limits=None, starts=8, seed=0, screening=64, iterations=60, progress=None
+):
     """Better values for the free parameters of a case, under its limits.
 
     case: presets Case; method: "auto" (trf without limits, slsqp with them), "slsqp", "trf", "lbfgs" or "adam"; free: {name: (low,
@@ -85,7 +87,9 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
     """
     began = time.perf_counter()
     if jax.numpy.result_type(float) != np.float64:
-        raise InputError("tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)")
+        raise InputError(
+            "tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)"
+        )
     for name, value, low in (("starts", starts, 1), ("screening", screening, 1), ("iterations", iterations, 1)):
         if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
             raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
@@ -96,6 +100,12 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
     method = _method(method, problem)
     first = problem.start()
     before = run_measures(case.loop, case.clock, key)  # a start that is not finite is an input error, told by evaluate
+
+    for measure in problem.objective:
+        if not np.all(np.isfinite(before[measure])):
+            raise InputError(
+                f"objective {measure} is not a number at the starting values (it cannot be measured on this run), so it cannot be tuned"
+            )
 
     search, outcomes, interrupted, redone = None, [], False, 0
     report = _reporter(progress, problem, starts)
@@ -110,7 +120,7 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
             count, converged = len(search.history), METHODS[method](search, z, iterations)
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
-        if method in ("slsqp", "trf"):
+        if method in ("slsqp", "trf") and search.best is not None:
             slsqp(search, search.best.z, iterations, tolerance=1e-12)
     except KeyboardInterrupt:
         interrupted = True
@@ -123,7 +133,7 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
     after = run_measures(tuned.loop, tuned.clock, key)
     checked = _constraints(problem, after, tuned)
     holds = all(c["margin"] >= 0 for c in checked)
-    status = "interrupted" if interrupted else _status(outcomes, holds)
+    status = "interrupted" if interrupted else _status(outcomes, holds, best)
     return TuningResult(
         case=case,
         tuned=tuned,
@@ -132,7 +142,11 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
         message=_message(status, problem, outcomes, checked, _constraints(problem, before, case), z, redone),
         parameters={
             b.name: {
-                "before": float(get_value(case.loop, b.name)), "after": values[b.name], "unit": b.unit, "lower": b.low, "upper": b.high,
+                "before": float(get_value(case.loop, b.name)),
+                "after": values[b.name],
+                "unit": b.unit,
+                "lower": b.low,
+                "upper": b.high,
                 "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
             }
             for b, v in zip(problem.bounds, z)
@@ -141,7 +155,10 @@ def tune(case, method="auto", *, free=None, objective=None, limits=None, starts=
         measures={"before": before, "after": after},
         constraints=checked,
         evaluations={
-            "simulations": problem.simulations, "gradients": problem.gradients, "non_finite": problem.non_finite, "redone_at_true_step": redone
+            "simulations": problem.simulations,
+            "gradients": problem.gradients,
+            "non_finite": problem.non_finite,
+            "redone_at_true_step": redone,
         },
         wall_s=time.perf_counter() - began,
         history=search.history if search else [],
@@ -176,8 +193,8 @@ def _outcome(search, z, count, converged):
     mine = search.history[count:]
     reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
     if reached is None:  # every point it asked for was known already
-        point = search.memory[np.clip(z, 0, 1).tobytes()] if np.clip(z, 0, 1).tobytes() in search.memory else search.best
-        reached = (search.start, point.cost, search.violation(point), tuple(point.z))
+        point = search.memory.get(np.clip(z, 0, 1).tobytes(), search.best or search.last_finite)
+        reached = (search.start, float(point.cost), search.violation(point), tuple(point.z))
     return {
         "from": search.problem.values(z),
         "to": search.problem.values(reached[3]),
@@ -209,7 +226,9 @@ def _constraints(problem, after, tuned):
     return checked
 
 
-def _status(outcomes, holds):
+def _status(outcomes, holds, best):
+    if best is None:
+        return "not_converged"
     if not holds:
         return "infeasible"
     return "converged" if any(o["converged"] for o in outcomes) else "not_converged"

@@ -4,8 +4,13 @@ import numpy as np
 import optax
 from scipy.optimize import least_squares, minimize, nnls
 
+from tuning.objective import EXPLODED
+
 BACKOFF = 1e-6
 """Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
+
+STEEPEST = 10.0
+"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
 
 
 class Search:
@@ -24,7 +29,8 @@ class Search:
         if key not in self.memory:
             point = self.problem.point(z)
             self.memory[key] = point
-            self.history.append((self.start, point.cost, self.violation(point), tuple(z)))
+            broken = self.violation(point) if point.finite else np.inf
+            self.history.append((self.start, float(point.cost), broken, tuple(z)))
             if point.finite:
                 self.last_finite = point
                 if self.best is None or self.better(point, self.best):
@@ -61,7 +67,12 @@ def slsqp(search, z, iterations, tolerance=1e-8):
     if search.problem.limits:
         constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
     done = minimize(
-        search.cost, z, jac=True, method="SLSQP", bounds=[(0.0, 1.0)] * len(z), constraints=constraints,
+        search.cost,
+        z,
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * len(z),
+        constraints=constraints,
         options={"maxiter": iterations, "ftol": tolerance},
     )
     # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
@@ -73,7 +84,7 @@ def trf(search, z, iterations, tolerance=1e-10):
 
     def model(z):
         point = search.point(z)
-        if not point.finite:
+        if not point.finite or not np.all(np.abs(point.gauss_newton) < EXPLODED**2):
             return np.full(len(z) + 1, 1e3), np.eye(len(z) + 1, len(z))
         normal = 0.5 * point.gauss_newton / search.scale**2
         slope = point.cost * point.gradient / search.scale**2
@@ -83,8 +94,15 @@ def trf(search, z, iterations, tolerance=1e-10):
         return np.append(head, rest), np.vstack([root.T, np.zeros(len(z))])
 
     done = least_squares(
-        lambda z: model(z)[0], np.clip(z, 1e-9, 1 - 1e-9), jac=lambda z: model(z)[1], bounds=(0.0, 1.0), method="trf",
-        ftol=tolerance, xtol=tolerance, gtol=tolerance, max_nfev=iterations,
+        lambda z: model(z)[0],
+        np.clip(z, 1e-9, 1 - 1e-9),
+        jac=lambda z: model(z)[1],
+        bounds=(0.0, 1.0),
+        method="trf",
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
+        max_nfev=iterations,
     )
     return bool(done.success)
 
@@ -95,12 +113,18 @@ def lbfgs(search, z, iterations):
 
 
 def adam(search, z, iterations):
-    """optax's Adam, limits by augmented Lagrangian, projected into the box."""
-    return _augmented(search, z, iterations, optax.adam(optax.cosine_decay_schedule(0.05, max(iterations, 1), 0.02)), descend=False)
+    """optax's Adam, limits by augmented Lagrangian, projected into the box. Its steps are small: five to an iteration."""
+    steps = 5 * iterations
+    schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
+    return _augmented(search, z, steps, optax.adam(schedule), descend=False)
+
+
+def _rounds(search):
+    return 4 if search.problem.limits else 1
 
 
 def _augmented(search, z, iterations, optimiser, descend):
-    weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, 4 if search.problem.limits else 1
+    weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, _rounds(search)
     moved = np.inf
 
     def value(z):
@@ -115,6 +139,7 @@ def _augmented(search, z, iterations, optimiser, descend):
         state = optimiser.init(z)
         for _ in range(max(1, iterations // rounds)):
             f, g = value(z)
+            g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
             update, state = optimiser.update(g, state, z)
             step = np.asarray(update) if not descend else -np.asarray(update)
             new = np.clip(z + step, 0.0, 1.0)
@@ -123,7 +148,7 @@ def _augmented(search, z, iterations, optimiser, descend):
                 step, halvings = 0.5 * step, halvings + 1
                 new = np.clip(z + step, 0.0, 1.0)
             moved, z = float(np.linalg.norm(new - z)), new
-            if moved < 1e-7:
+            if moved < 1e-6:
                 break
         if len(weights):
             weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])

@@ -31,7 +31,9 @@ class TankNetwork(Plant):
     links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
     feeds: tuple = static(doc="((first tank, second tank or None), ...) one per pump")
     outputs: tuple = static(doc="tanks whose levels are controlled")
-    overflow: bool = static(doc="rims are physics: a level stops there and the liquid is lost", choices=(False, True), default=False)
+    overflow: bool = static(
+        doc="rims are physics: a level stops there and the liquid is lost", choices=(False, True), default=False
+    )
     knee: float = static("cm", "level below which outflow turns laminar", low=0.0, strict=True, default=0.01)
 
     @property

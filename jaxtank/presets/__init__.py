@@ -1,7 +1,7 @@
 """The papers, one file each: rigs, cases, published numbers, what may be tuned, what is uncertain, departures.
 
-    preset = presets.load("gouta2015")
-    case = preset.cases["backstepping"]     # .loop .clock .limits
+preset = presets.load("gouta2015")
+case = preset.cases["backstepping"]     # .loop .clock .limits
 """
 
 import importlib

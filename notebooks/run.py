@@ -1,0 +1,31 @@
+"""Execute the notebooks of this folder, top to bottom.
+
+    python notebooks/run.py            in full, and keep the outputs in the files
+    python notebooks/run.py --fast     with JAXTANK_NOTEBOOK_FAST=1 (coarse steps, few starts), outputs thrown away
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+
+def main():
+    fast = "--fast" in sys.argv[1:]
+    os.environ["JAXTANK_NOTEBOOK_FAST"] = "1" if fast else "0"
+    for path in sorted(Path(__file__).parent.glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}).execute()
+        print(f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells ran")
+        if not fast:
+            for cell in notebook.cells:
+                cell.metadata.pop("execution", None)
+            notebook.metadata["kernelspec"] = {"display_name": "Python 3", "language": "python", "name": "python3"}
+            notebook.metadata.get("language_info", {}).pop("version", None)
+            nbformat.write(notebook, path)
+
+
+if __name__ == "__main__":
+    main()
