@@ -118,7 +118,7 @@ def test_equal_levels(gouta):
 
 @pytest.mark.parametrize("ramp", [30.0, 20.0])
 def test_through_the_box_qp(gouta, ramp):
-    agree(gouta("ngpc-boxqp", {"reference.ramp": ramp}), ["controller.Tp"])
+    agree(gouta("ngpc-boxqp", {"reference.ramp": ramp, "clock.dt": 0.05}), ["controller.Tp"])
 
 
 def test_through_plant_sensor_actuator_and_reference(gouta):
@@ -129,7 +129,7 @@ def test_through_plant_sensor_actuator_and_reference(gouta):
 
 
 def test_spills_and_penalties(gouta):
-    case = gouta("ngpc", {"reference.ramp": 30.0})
+    case = gouta("ngpc", {"reference.ramp": 30.0, "clock.dt": 0.05})
     agree(case, ["controller.Tp"], "rms_over_rim")
     agree(case, ["controller.Tp"], "saturation_excess", atol=1e-8)
 

@@ -20,7 +20,7 @@ from jaxtank.plants.network import network
 from jaxtank.presets.gouta2015 import FAST_AREA
 from jaxtank.records import Clock
 
-QUIET = settings(deadline=None, max_examples=12, derandomize=True)
+QUIET = settings(deadline=None, max_examples=8, derandomize=True)
 
 
 def one_tank(area=20.0, drain=0.2, rim=30.0, **more):
