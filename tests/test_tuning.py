@@ -62,6 +62,17 @@ def test_the_answer_says_which_tank_is_tight_and_when(limited):
     assert "starting values break a limit (max_level of tank 3" in limited.message and "tank 4" in limited.message
 
 
+def test_the_answer_says_which_gain_is_barely_felt(gouta, limited):
+    """k acts through k + k1 alone; at the answer a tenth of it changes the error by a hundredth of a percent (checked by runs)."""
+    k = limited.parameters["controller.k"]
+    less = rig.set_values(
+        gouta("backstepping"), {"controller.k": 0.9 * k["after"], "controller.k1": limited.parameters["controller.k1"]["after"]}
+    )
+    error = float(jaxtank.evaluate(less.loop, less.clock, "rms_error_total")["rms_error_total"])
+    np.testing.assert_allclose(k["felt_percent"], 100 * abs(error / limited.objective["after"] - 1), rtol=1e-4)
+    assert "controller.k is barely felt" in limited.message and "controller.k1 is barely felt" not in limited.message
+
+
 def test_eight_distinct_starts_agree(limited):
     starts = np.log([[s["from"][n] for n in ("controller.k", "controller.k1")] for s in limited.starts])
     apart = np.linalg.norm(starts[:, None] - starts[None], axis=-1) + 99 * np.eye(len(starts))

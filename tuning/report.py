@@ -131,11 +131,12 @@ def text(result):
             number(p["before"]),
             number(p["after"]),
             f"{number(p['lower'])} : {number(p['upper'])}",
+            "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
             f"at {p['at_bound']} bound" if p["at_bound"] else "",
         ]
         for n, p in result.parameters.items()
     ]
-    parts = [table(rows, ["parameter", "unit", "before", "after", "range", ""]), ""]
+    parts = [table(rows, ["parameter", "unit", "before", "after", "range", "10 % of it moves the objective by", ""]), ""]
     rows = [["objective", unit, number(result.objective["before"]), number(result.objective["after"])]]
     for m in SHOWN:
         if m in result.measures["after"] and not (m == "rms_error_total" and set(result.objective["terms"]) == {m}):

@@ -22,6 +22,9 @@ from tuning.solvers import METHODS, Search, optimality, slsqp
 REPORTED = tuple(m for m in ms.MEASURES if m not in ("time_of_max_level",))
 """Measures in a result, before and after."""
 
+BARELY = 0.5
+"""Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
+
 STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
 
 
@@ -29,9 +32,10 @@ STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
 class TuningResult:
     """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
 
-    parameters: {name: {before, after, unit, lower, upper, at_bound}}; measures: {"before": {}, "after": {}}; constraints: one dict per
-    limit with value, margin, tank and time; history: (start, cost, violation [unit of the limit], z) of every evaluation; starts: one
-    dict per local search. case and tuned are the Case before and after.
+    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent}}, the last how much 10 % of the value changes the
+    objective [%]; measures: {"before": {}, "after": {}}; constraints: one dict per limit with value, margin, tank and time; history:
+    (start, cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search. case and tuned are the Case
+    before and after.
     """
 
     case: Any
@@ -129,7 +133,8 @@ def tune(
     values = problem.values(z)
     if best is not None and np.array_equal(z, first):
         values = {b.name: float(get_value(case.loop, b.name)) for b in problem.bounds}
-    tuned = case.replace(name=case.name, loop=with_values(case.loop, values))
+    felt = [None] * len(z) if interrupted or best is None else _felt(problem, z)
+    tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
     checked = _constraints(problem, after, tuned)
     holds = all(c["margin"] >= 0 for c in checked)
@@ -139,7 +144,7 @@ def tune(
         tuned=tuned,
         method=method,
         status=status,
-        message=_message(status, problem, outcomes, checked, _constraints(problem, before, case), z, redone),
+        message=_message(status, problem, outcomes, checked, _constraints(problem, before, case), z, felt, redone),
         parameters={
             b.name: {
                 "before": float(get_value(case.loop, b.name)),
@@ -148,8 +153,9 @@ def tune(
                 "lower": b.low,
                 "upper": b.high,
                 "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
+                "felt_percent": f,
             }
-            for b, v in zip(problem.bounds, z)
+            for b, v, f in zip(problem.bounds, z, felt)
         },
         objective={"before": problem.cost(before), "after": problem.cost(after), "terms": problem.objective},
         measures={"before": before, "after": after},
@@ -205,6 +211,19 @@ def _outcome(search, z, count, converged):
     }
 
 
+def _felt(problem, z):
+    """Percent by which the objective changes when each parameter alone goes 10 % up or down (of its range where that is linear)."""
+    trials = [z]
+    for i, b in enumerate(problem.bounds):
+        value = float(b.from_unit(z[i]))
+        for factor in (-0.1, 0.1):
+            moved = b.to_unit(value * (1 + factor)) if b.scale == "log" else z[i] + factor
+            trials.append(np.where(np.arange(len(z)) == i, np.clip(moved, 0.0, 1.0), z))
+    costs, _ = problem.screen(np.array(trials), problem.clock)
+    change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
+    return [float(c) if np.isfinite(c) else None for c in change]
+
+
 def _constraints(problem, after, tuned):
     checked = []
     for limit in problem.limits:
@@ -234,7 +253,7 @@ def _status(outcomes, holds, best):
     return "converged" if any(o["converged"] for o in outcomes) else "not_converged"
 
 
-def _message(status, problem, outcomes, checked, started, z, redone):
+def _message(status, problem, outcomes, checked, started, z, felt, redone):
     """One paragraph for people: what was found, what is tight, what to doubt."""
     words = []
     broken = [c for c in checked if c["margin"] < 0]
@@ -257,9 +276,11 @@ def _message(status, problem, outcomes, checked, started, z, redone):
         words.append(f"tight: {c['name']}{when} ({c['value']:.6g} of {c['limit']:.6g} {c['unit']})")
     if checked and not tight and not broken:
         words.append("no limit is tight")
-    for b, v in zip(problem.bounds, z):
+    for b, v, f in zip(problem.bounds, z, felt):
         if v < 1e-6 or v > 1 - 1e-6:
             words.append(f"{b.name} ends at its {'lower' if v < 0.5 else 'upper'} bound, {b.low if v < 0.5 else b.high:g} {b.unit}")
+        if f is not None and f < BARELY:
+            words.append(f"{b.name} is barely felt: 10 % changes the objective by {f:.2g} %")
     held = [o for o in outcomes if o["violation"] == 0.0] or outcomes
     if held:
         best = min(o["cost"] for o in held)

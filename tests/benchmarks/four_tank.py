@@ -11,10 +11,10 @@ import statistics
 import sys
 import tempfile
 
-import jaxtank  # noqa: F401  (before jax starts)
 import jax
 import numpy as np
 
+import jaxtank  # noqa: F401  (before jax starts)
 from jaxtank import loop, presets
 from jaxtank.tree import with_values
 from tuning import bench, report
