@@ -12,7 +12,9 @@ from jax.extend.core import Literal
 
 def scan(body, carry, xs, length):
     """jax.lax.scan(body, carry, xs, length), less what need not be in the loop. Values and derivatives are the same."""
-    closed, shape = jax.make_jaxpr(body, return_shape=True)(_like(carry), jax.tree.map(lambda a: _like(a[0]), xs))
+    closed, shape = jax.make_jaxpr(body, return_shape=True)(
+        _like(carry), jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), xs)
+    )
     jaxpr, structure = closed.jaxpr, jax.tree.structure(shape)
     once, inside, same = _split(jaxpr)
     constants = dict(zip(jaxpr.constvars, closed.consts))

@@ -69,22 +69,48 @@ def check(loop, clock, key=None):
     Only concrete leaves are looked at, so that it costs nothing inside a trace.
     """
     check_clock(clock)
-    traced = any(isinstance(v, jax.core.Tracer) for v in jax.tree_util.tree_leaves(loop))
-    if np.shape(loop.x0)[-1:] != (loop.plant.tanks,):
-        raise InputError(f"x0 has shape {np.shape(loop.x0)}: must be ({loop.plant.tanks},), one level per tank")
-    if loop.reference.channels != len(loop.plant.outputs):
-        raise InputError(f"the reference has {loop.reference.channels} channels for {len(loop.plant.outputs)} outputs")
-    if traced:
-        return
+    plant, actuator = loop.plant, loop.actuator
+    if np.shape(loop.x0)[-1:] != (plant.tanks,):
+        raise InputError(f"x0 has shape {np.shape(loop.x0)}: must be ({plant.tanks},), one level per tank")
+    if loop.reference.channels != len(plant.outputs):
+        raise InputError(f"the reference has {loop.reference.channels} channels for {len(plant.outputs)} outputs")
+    if loop.disturbance is not None and loop.disturbance.channels != plant.tanks:
+        raise InputError(
+            f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks: give one inflow per tank"
+        )
+    if actuator.saturation == "boxqp" and (plant.pumps != 2 or type(loop.controller).input_metric is Controller.input_metric):
+        raise InputError("actuator.saturation = 'boxqp': needs two pumps and a law with a cost to allocate by (its input_metric)")
+    samples = actuator.delay / clock.dt
+    if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
+        raise InputError(
+            f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of {clock.dt:g} s, at most {clock.duration:g} s"
+        )
     check_leaves(loop)
-    for i, (low, high) in enumerate(zip(np.ravel(loop.actuator.low), np.ravel(loop.actuator.high))):
-        if not low < high:
-            raise InputError(f"actuator.low[{i}] = {low:g} V: must be below actuator.high[{i}] = {high:g} V")
-    loop.controller.check(loop.reference)
-    if loop.actuator.delay > clock.duration:
-        raise InputError(f"actuator.delay = {loop.actuator.delay:g} s: must be at most clock.duration = {clock.duration:g} s")
-    if key is None and np.any(np.asarray(loop.sensor.noise) > 0):
+    _check_order(actuator, "low", "high")
+    if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
+        _check_order(actuator, "stop", "dead_zone", equal=True)
+    if actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse":
+        _check_order(actuator, "dead_zone", "pulse")
+        _check_order(actuator, "pulse", "high", equal=True)
+    if not _traced(loop.controller, loop.reference):
+        loop.controller.check(loop.reference)
+    if key is None and not _traced(loop.sensor.noise) and np.any(np.asarray(loop.sensor.noise) > 0):
         raise InputError(f"sensor.noise = {np.asarray(loop.sensor.noise)} cm: give a key (or --seed), or set it to 0")
+
+
+def _traced(*trees):
+    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(trees))
+
+
+def _check_order(actuator, lower, upper, equal=False):
+    """Raise InputError unless each pump's `lower` is below its `upper` (or equal to it)."""
+    a, b = getattr(actuator, lower), getattr(actuator, upper)
+    if _traced(a, b):
+        return
+    for i, (low, high) in enumerate(zip(np.ravel(a), np.ravel(b))):
+        if not (low <= high if equal else low < high):
+            most = "at most" if equal else "below"
+            raise InputError(f"actuator.{lower}[{i}] = {low:g} V: must be {most} actuator.{upper}[{i}] = {high:g} V")
 
 
 def simulate(loop, clock, key=None, save_every=1):
@@ -96,7 +122,7 @@ def simulate(loop, clock, key=None, save_every=1):
     check(loop, clock, key)
     if not isinstance(save_every, int) or save_every < 1:
         raise InputError(f"save_every = {save_every!r}: must be a whole number of at least 1 sample")
-    trajectory, broken = _simulate(loop, clock, key, save_every)
+    trajectory, broken = _simulate(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
     return trajectory
 
@@ -114,10 +140,16 @@ def evaluate(loop, clock, measures, key=None):
     return values
 
 
+def evaluate_and_flag(loop, clock, measures, key=None):
+    """(`evaluate`'s values, True if the run stopped being finite); checks nothing, raises nothing: for batches and searches."""
+    return _evaluate(loop, clock, _names(measures), key, False)
+
+
 def evaluate_for_reverse(loop, clock, measures, key=None):
     """`evaluate` with the run cut into about sqrt(samples) pieces that are recomputed on the way back, for reverse mode.
 
-    Same values; memory of a gradient grows with the root of the samples. Best above about ten parameters (methods: reverse).
+    Same values, but never NonFiniteError; memory of a gradient grows with the root of the
+    samples. Best above about ten parameters.
     """
     names = _names(measures)
     check(loop, clock, key)
@@ -129,8 +161,12 @@ def sensitivities(loop, clock, measures, values, key=None):
 
     values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth
     it to about ten). Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix
-    2/N sum_k sum_i grad(e_i) grad(e_i)' [cm^2 per unit^2], True if the run stopped being finite); P in the order of `values`.
+    2/N sum_k sum_i grad(e_i) grad(e_i)' [cm^2 per unit^2], True if the run stopped being finite), P in the order of `values`.
+    key as in `evaluate`. Raises InputError at the door; a run that is not finite is told by the flag.
     """
+    if not values:
+        raise InputError("sensitivities needs at least one parameter: values is empty")
+    check(with_values(loop, values), clock, key)
     return _sensitivities(loop, clock, _names(measures), tuple(values), tuple(values.values()), key)
 
 
@@ -221,7 +257,7 @@ def _run(loop, clock):
 
 def _zero(loop):
     """0.0 of the type in which the run is done: what x0 becomes inside jax. float32 is named, for it would be wrong here."""
-    dtype = jnp.result_type(loop.x0)
+    dtype = jnp.result_type(loop.x0, jnp.float32 if jnp.result_type(loop.x0) == jnp.float32 else float)
     if dtype == jnp.float32:
         _warn_float32()
     return jnp.zeros((), dtype)

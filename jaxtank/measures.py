@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.errors import unknown
-from jaxtank.numerics import at_least
+from jaxtank.numerics import at_least, root_of_mean
 
 BAND = 0.05
 """Half width of the settling band, as a share of the step [-]."""
@@ -99,12 +99,24 @@ def _overshoot(run, sample, window):
     )
 
 
-def _unsettled(run, sample, window):
-    """Time since the change ended, while the output is outside the band [s]; a large negative number inside it."""
-    return tuple(
-        jnp.where((step != 0.0) & (jnp.abs(r + e - target) > BAND * jnp.abs(step)), since, -1e9)
-        for (target, step, since), r, e in zip(window, sample.r, sample.e)
-    )
+def _start_settling(run):
+    return tuple((run.zero, run.zero - 1e9, run.zero, run.zero - 1e9) for _ in range(run.outputs))
+
+
+def _update_settling(run, state, sample, window):
+    """Per output (target now, time since its change ended at the last sample outside the band [s], 1 if still outside, worst so far)."""
+    new = []
+    for (old, last, outside, worst), (target, step, since), r, e in zip(state, window, sample.r, sample.e):
+        worst = jnp.where((target != old) & (_settled(last, outside) > worst), _settled(last, outside), worst)
+        last = jnp.where(target != old, -1e9, last)
+        out = (step != 0.0) & (jnp.abs(r + e - target) > BAND * jnp.abs(step))
+        new.append((target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst))
+    return tuple(new)
+
+
+def _settled(last, outside):
+    """Settling time of a change that is over: infinite if its last sample was outside the band."""
+    return jnp.where(outside > 0, jnp.inf, last)
 
 
 def _start_rise(run):
@@ -145,7 +157,7 @@ ACCUMULATORS = {
     "min_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf),
     "max_error": _extreme(lambda run: run.outputs, lambda run, s, w: tuple(jnp.abs(e) for e in s.e), lambda a, b: a > b, -jnp.inf),
     "overshoot": _extreme(lambda run: run.outputs, _overshoot, lambda a, b: a > b, -1.0),
-    "unsettled": _extreme(lambda run: run.outputs, _unsettled, lambda a, b: a > b, -1e9),
+    "settling": Accumulator(_start_settling, _update_settling),
     "rise": Accumulator(_start_rise, _update_rise),
     "travel": Accumulator(
         lambda run: (_filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0), _update_travel
@@ -162,7 +174,7 @@ def _list(values):
 
 
 def _root_mean(name):
-    return lambda run, acc: jnp.sqrt(_list(_mean(run, acc[name])))
+    return lambda run, acc: root_of_mean(_list(_mean(run, acc[name])))
 
 
 def _extremes(name, index=0):
@@ -174,8 +186,8 @@ def _per_run(name, scale):
 
 
 def _settling(run, acc):
-    settled = _list([pair[0] for pair in acc["unsettled"]])
-    return jnp.where(settled < -1e8, jnp.nan, settled)
+    worst = _list([jnp.maximum(worst, _settled(last, outside)) for _, last, outside, worst in acc["settling"]])
+    return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
 def _rise(run, acc):
@@ -193,7 +205,7 @@ MEASURES = {
         "cm",
         "run",
         ("e2",),
-        lambda run, acc: jnp.sqrt(sum(_mean(run, acc["e2"]))),
+        lambda run, acc: root_of_mean(sum(_mean(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
     ),
     "ise": Measure("cm^2 s", "output", ("e2",), _per_run("e2", lambda run: run.dt), "integral of the squared error"),
@@ -223,20 +235,23 @@ MEASURES = {
         "cm",
         "run",
         ("over_rim2",),
-        lambda run, acc: jnp.sqrt(at_least(sum(_mean(run, acc["over_rim2"])), 1e-30)),
+        lambda run, acc: root_of_mean(sum(_mean(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
     ),
     "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
     "overshoot_percent": Measure(
         "%", "output", ("overshoot",), _overshoot_percent, "worst overshoot of a change, in percent of it", windows=True
     ),
-    "rise_time": Measure("s", "output", ("rise",), _rise, "longest time from 10 % to 90 % of a change", windows=True),
+    "rise_time": Measure(
+        "s", "output", ("rise",), _rise, "longest time from 10 % to 90 % of a change, of those followed so far", windows=True
+    ),
     "settling_time": Measure(
         "s",
         "output",
-        ("unsettled",),
+        ("settling",),
         _settling,
-        "longest time from the end of a change until its last sample outside +-5 % of it; negative: in the band before the change ended",
+        "longest time from the end of a change to its last sample outside +-5 % of it; "
+        "negative: inside before the change ended; none: never settled",
         windows=True,
     ),
     "estimation_rms": Measure(

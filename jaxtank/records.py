@@ -44,8 +44,8 @@ def check_clock(clock):
         raise InputError(f"clock.dt = {clock.dt:g} s: must be at most clock.duration = {clock.duration:g} s")
     if clock.samples > LARGEST_RUN:
         raise InputError(f"clock.duration / clock.dt = {clock.samples - 1} samples: must be at most {LARGEST_RUN}")
-    if not isinstance(clock.substeps, int) or isinstance(clock.substeps, bool) or not 1 <= clock.substeps <= 1000:
-        raise InputError(f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 1000")
+    if not isinstance(clock.substeps, int) or isinstance(clock.substeps, bool) or not 1 <= clock.substeps <= 10:
+        raise InputError(f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 10")
     if clock.integrator not in INTEGRATORS:
         raise InputError(f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
 

@@ -140,7 +140,7 @@ def check(case):
     """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
     lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
     if isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
-        for values in case.loop.reference.plateaus():
+        for values in case.loop.reference.plateaus(case.clock.duration):
             try:
                 equilibrium(case.loop.plant, values)
             except EquilibriumError as error:
@@ -211,14 +211,16 @@ def _origin(case):
             f"{case.name}: a reference of the kind {type(case.loop.reference).__name__} cannot be written to a rig file"
         )
     structure = jax.tree.structure(_plain(case.loop))
-    for paper in presets.PAPERS:
-        cases = presets.load(paper).cases
-        if case.name in (f"{paper}/{c}" for c in cases):
-            return case.name
-        for other in cases.values():
-            if jax.tree.structure(_plain(other.loop)) == structure:
-                return other.name
-    raise InputError(f"{case.name}: no preset has these components, so the case cannot be written as a rig file")
+    alike = [c for p in presets.PAPERS for c in presets.load(p).cases.values() if jax.tree.structure(_plain(c.loop)) == structure]
+    if not alike:
+        raise InputError(f"{case.name}: no preset has these components, so the case cannot be written as a rig file")
+    mine = _statics(case.loop)
+    # its own preset, or the one with the most in common: its title is the one the file will show
+    return max(alike, key=lambda c: (c.name == case.name, sum(a == b for a, b in zip(mine, _statics(c.loop))))).name
+
+
+def _statics(loop):
+    return [value for _, value, _ in walk(loop, kind="static")] + [np.asarray(loop.plant.area).tolist()]
 
 
 def _plain(loop):

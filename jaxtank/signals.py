@@ -38,7 +38,7 @@ class Signal(abc.ABC):
 class Constant(Signal):
     """A signal that does not change."""
 
-    level: np.ndarray = leaf("cm", "(channels,) value")
+    level: np.ndarray = leaf("-", "(channels,) value, in the unit of what it stands for: cm of a setpoint, cm^3/s of a disturbance")
 
     @property
     def channels(self):
@@ -101,17 +101,19 @@ class Ramps(Signal):
             last[i] = self.targets[j]
         return tuple(zip(target, step, since))
 
-    def plateaus(self):
-        """(plateaus, channels) the values between changes, as host numbers: each change taken as finished."""
+    def plateaus(self, until=math.inf):
+        """(plateaus, channels) the values held between changes, as host numbers: those whose changes end before the next and `until` [s]."""
         values, now = [], np.array(self.initial, dtype=float)
         values.append(now.copy())
         by_time = {}
         for j, (start, i) in enumerate(self.changes):
             by_time.setdefault(start, []).append((i, float(self.targets[j])))
-        for start in sorted(by_time):
+        starts = sorted(by_time)
+        for start, following in zip(starts, [*starts[1:], math.inf]):
             for i, target in by_time[start]:
                 now[i] = target
-            values.append(now.copy())
+            if start + self.ramp <= min(following, until):
+                values.append(now.copy())
         return np.array(values)
 
 

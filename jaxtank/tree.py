@@ -178,7 +178,7 @@ def _replace(tree, path, index, value, name):
         if not is_component(child):
             raise LookupError(name)
         return dataclasses.replace(tree, **{head: _replace(child, rest, index, value, name)})
-    if is_component(child) or fields[head].metadata.get("kind") == "static":
+    if is_component(child) or fields[head].metadata.get("kind") != "leaf":
         raise LookupError(name)
     like = fields[head].metadata.get("like")
     if child is None and like is not None:

@@ -1,7 +1,5 @@
 """Everything here runs in float64; a test of float32 says so and runs in a process of its own."""
 
-import dataclasses
-
 import jax
 import pytest
 
@@ -21,13 +19,3 @@ def gouta():
         return rig.set_values(cases[name], values or {})
 
     return case
-
-
-@pytest.fixture(scope="session")
-def with_start():
-    """A case that starts from other levels."""
-
-    def start(case, x0):
-        return case.replace(loop=dataclasses.replace(case.loop, x0=x0))
-
-    return start

@@ -128,6 +128,20 @@ def test_through_plant_sensor_actuator_and_reference(gouta):
     agree(case, names, rtol=2e-5)
 
 
+@pytest.mark.parametrize("samples", [110, 121, 122])
+def test_reverse_mode_for_every_number_of_samples(gouta, samples):
+    """The run is cut into about sqrt(samples) pieces; squares leave no remainder."""
+    case = gouta("ngpc", {"clock.dt": 0.1, "clock.duration": round(0.1 * (samples - 1), 1), "x0": [3.5, 3.0, 3.0, 3.0]})
+    assert case.clock.samples == samples
+    agree(case, ["controller.Tp"])
+
+
+def test_a_measure_that_is_zero_throughout_has_slope_zero(gouta):
+    case = gouta("ngpc", {"clock.dt": 0.1, "actuator.dead_zone": 11.0, "clock.duration": 20.0})
+    f, z = sloped(case, ["controller.Tp"], "rms_input")
+    np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((2, 1)))
+
+
 def test_spills_and_penalties(gouta):
     case = gouta("ngpc", {"reference.ramp": 30.0, "clock.dt": 0.05})
     agree(case, ["controller.Tp"], "rms_over_rim")

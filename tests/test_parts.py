@@ -141,6 +141,29 @@ def test_noise_without_a_key_is_refused(gouta):
         jaxtank.evaluate(case.loop, case.clock, "rms_error")
 
 
+def test_noise_without_a_key_is_refused_inside_jit_and_by_sensitivities(gouta):
+    case = gouta("ngpc", {"sensor.noise": 0.1})
+    run = lambda Tp: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, "rms_error")
+    with pytest.raises(InputError, match=r"sensor\.noise"):
+        jax.jit(run)(11.0)
+    with pytest.raises(InputError, match=r"sensor\.noise"):
+        jaxtank.sensitivities(case.loop, case.clock, "rms_error", {"controller.Tp": 11.0})
+
+
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"actuator.dead_zone": 5.0, "actuator.dead_zone_kind": "pulse"}, "actuator.dead_zone"),
+        ({"actuator.dead_zone": 1.0, "actuator.dead_zone_kind": "hysteresis"}, "actuator.stop"),
+        ({"actuator.delay": 0.015}, "whole number of samples"),
+    ],
+)
+def test_pumps_that_make_no_sense_are_refused(gouta, values, words):
+    case = gouta("ngpc", values)
+    with pytest.raises(InputError, match=words):
+        jaxtank.evaluate(case.loop, case.clock, "rms_error")
+
+
 def test_noise_makes_the_voltage_travel_as_the_spec_says(gouta):
     """5 mV on each sensor: travel of pump 1 is about 19,400 V with NGPC and 11,100 V with backstepping (spec 8.1)."""
     noise = [0.005 * a for a in (9.4458, 8.7106, 8.5106, 9.3458)]
@@ -243,6 +266,16 @@ def test_overshoot_rise_and_settling_of_a_hand_made_step():
     np.testing.assert_allclose(got["overshoot_percent"], 10.0)
     np.testing.assert_allclose(got["rise_time"], 3.0)  # from t = 2 (past 10 %) to t = 5 (past 90 %)
     np.testing.assert_allclose(got["settling_time"], 5.0)  # 9.3 at t = 7, five seconds after the change, is the last outside
+
+
+def test_what_never_settles_is_not_given_a_time():
+    levels, target = [0, 0, 5, 9.8, 10, 10, 15, 15], [0, 0, 10, 10, 10, 10, 20, 20]
+    step, since = [0, 0, 10, 10, 10, 10, 10, 10], [0, 0, 0, 1, 2, 3, 0, 1]
+    assert folded(("settling_time",), levels, target, step, since)["settling_time"] == np.inf
+    # outside at the end of the first change, settled in the second: still not settled
+    levels = [0, 0, 5, 5, 5, 5, 20, 20]
+    assert folded(("settling_time",), levels, target, step, since)["settling_time"] == np.inf
+    assert np.isnan(folded(("settling_time",), [1] * 4, [1] * 4, [0] * 4, [0] * 4)["settling_time"])
 
 
 def test_a_downward_step_has_its_overshoot_below():

@@ -171,7 +171,7 @@ def test_results_stay_in_the_box_and_are_never_worse_than_the_start(gouta):
 def test_limits_that_cannot_be_met_are_told(gouta):
     result = quick(gouta, limits={"max_level": 5.0})
     assert not result.success and result.status == "infeasible"
-    assert "no point meets every limit" in result.message
+    assert "no point was found that meets every limit" in result.message
 
 
 def test_lower_limits_and_several_measures(gouta):
@@ -185,6 +185,25 @@ def test_rims_as_physics_turn_the_limit_into_one_of_overflow(gouta):
     result = quick(gouta, values={"plant.overflow": True})
     assert {c["measure"] for c in result.constraints} == {"overflow_volume"}
     assert "rims are physics" in repr(result)
+
+
+def test_a_limit_of_no_overflow_can_be_met_and_is_held_by_the_answer(gouta):
+    case = gouta("backstepping", {**FAST, "plant.overflow": True})
+    result = tuning.tune(case, starts=2, screening=8)
+    assert result.success and max(c["value"] for c in result.constraints) <= 1e-3
+    numeric = tuning.tune(case, starts=2, screening=8, limits={"max_level": 30.0})
+    assert {c["measure"] for c in numeric.constraints} == {"overflow_volume"}
+
+
+def test_the_weight_of_the_objective_does_not_move_the_answer(gouta):
+    plain, heavy = (quick(gouta, "ngpc", limits={}, objective={"rms_error_total": w}) for w in (1.0, 100.0))
+    assert heavy.method == "trf" and heavy.success
+    np.testing.assert_allclose(heavy.parameters["controller.Tp"]["after"], plain.parameters["controller.Tp"]["after"], rtol=1e-3)
+
+
+def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged(gouta):
+    result = quick(gouta, "ngpc", method="adam", limits={}, iterations=2, screening=2)
+    assert result.status == "not_converged" and not result.success
 
 
 def test_an_interrupt_gives_the_best_point_so_far(gouta):

@@ -6,7 +6,9 @@ be met, 130 interrupted (the best point so far is written and said). Nothing hea
 
 import argparse
 import os
+import signal
 import sys
+import threading
 
 from jaxtank.errors import InputError, NonFiniteError, nearest
 
@@ -120,7 +122,9 @@ def main(argv=None):
         print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("jaxtank: interrupted", file=sys.stderr)
+        print("jaxtank: interrupted", file=sys.stderr, flush=True)
+        if argv is None:
+            os._exit(130)  # an interrupt inside jax leaves threads that cannot be wound up safely
         return 130
     except BrokenPipeError:  # the reader of our output has gone; nothing more to say
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -208,6 +212,8 @@ def _seed(args):
 
 
 def _out(args):
+    if args.out is not None and not args.out.strip():
+        raise InputError("--out '': must name a folder")
     if args.out is not None:
         from jaxtank.files import check_folder
 
@@ -219,7 +225,7 @@ def _range(text):
     try:
         low, high = (float(_plain_number(p)) for p in parts[:2])
     except ValueError:
-        raise InputError(f"--free range {text!r}: must be LOW:HIGH") from None
+        raise InputError(f"--free range {text!r}: must be NAME=LOW:HIGH with two numbers") from None
     if len(parts) > 3 or (len(parts) == 3 and parts[2] not in ("log", "linear")):
         raise InputError(f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
     return (low, high, parts[2] if len(parts) == 3 else "log" if low > 0 else "linear")
@@ -322,7 +328,7 @@ def _tune(args):
         seed=seed,
         screening=_whole("--screening", args.screening, 1, 65536),
         iterations=_whole("--iterations", args.iterations, 1, 100_000),
-        progress=None if args.quiet else Progress(report.objective_unit(objective or case.objective)),
+        progress=Progress(report.objective_unit(objective or case.objective), args.quiet),
     )
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
@@ -335,16 +341,30 @@ def _tune(args):
 
 
 class Progress:
-    """A line per evaluation on a terminal, a line per local search elsewhere."""
+    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations, where nothing is half
+    done: the first ends the search with the best point so far, the second ends the program."""
 
-    def __init__(self, unit):
-        self.unit, self.last, self.terminal = unit, None, sys.stderr.isatty()
+    def __init__(self, unit, quiet):
+        self.unit, self.quiet, self.last, self.stop, self.terminal = unit, quiet, None, False, sys.stderr.isatty()
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self.interrupt)
+
+    def interrupt(self, *_):
+        """The handler of SIGINT."""
+        if self.stop:
+            os.write(2, b"\njaxtank: stopped at once\n")
+            os._exit(130)
+        self.stop = True
+        os.write(2, b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
 
     def __call__(self, event):
-        if not self.terminal and event["start"] == self.last:
+        if self.stop:
+            raise KeyboardInterrupt
+        if self.quiet or (not self.terminal and event["start"] == self.last):
             return
         self.last = event["start"]
-        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}"
+        breaks = " (breaks a limit)" if event["best_violation"] else ""
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}{breaks}"
         line = f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation {event['evaluations']}  best {best}"
         print(f"\r{line:<70}" if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
 

@@ -9,6 +9,7 @@ from jaxtank.presets.base import Free
 from jaxtank.records import CLOCK_UNITS
 from jaxtank.tree import walk
 from tuning import report
+from tuning.objective import LOWER
 
 
 def noisy(case):
@@ -97,7 +98,8 @@ def text(case):
         "* part of the compiled program: --set and rig files reach it, derivatives do not.",
         "controller.model.* is the law's own copy of the plant, with the same names; --set plant.* changes the rig and leaves the law's belief.",
         "",
-        "limits of tune: " + (", ".join(f"{m} at most {v}" for m, v in page["limits"].items()) or "none"),
+        "limits of tune: "
+        + (", ".join(f"{m} at {'least' if m in LOWER else 'most'} {v}" for m, v in page["limits"].items()) or "none"),
         "objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()),
     ]
     if page["published"]:

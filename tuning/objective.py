@@ -24,7 +24,10 @@ EXPLODED = 1e9
 """Size at which a cost, a margin or a slope is no longer a number to search with."""
 
 NOT_A_NUMBER = 1e6
-"""Amount by which a measure that is not a number is taken to break its limit."""
+"""Amount by which an infinite measure (never settled) is taken to break its limit, and one that does not apply to hold it."""
+
+SPILL = 1e-3
+"""Volume over a rim that counts as none [cm^3], where rims are physics."""
 
 
 class Limit(NamedTuple):
@@ -46,9 +49,12 @@ class Limit(NamedTuple):
         return self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}"
 
     def margin(self, measures):
-        """How far the limit is from being met exactly: positive where it holds; minus infinity where the measure is not a number."""
+        """How far the limit is from being met exactly: positive where it holds. A measure that does not apply (the settling time of an
+        output that is never changed) holds by NOT_A_NUMBER, an infinite one breaks by as much."""
         value = float(np.ravel(measures[self.measure])[self.index])
-        return self.sign * (self.value - value) if np.isfinite(value) else -np.inf
+        if np.isnan(value):
+            return NOT_A_NUMBER
+        return float(np.clip(self.sign * (self.value - value), -NOT_A_NUMBER, NOT_A_NUMBER))
 
 
 class Point(NamedTuple):
@@ -74,14 +80,13 @@ def resolve_limits(case, limits=None):
     With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume. Raises InputError for
     an unknown measure or a value that is no number.
     """
-    found = []
+    found, plant = [], case.loop.plant
     for measure, value in check_limits(case.loop, case.limits if limits is None else limits).items():
-        if isinstance(value, str) and case.loop.plant.overflow:
-            measure, value = "overflow_volume", 0.0
-        elif isinstance(value, str):
-            value = np.asarray(case.loop.plant.rim)
-        count = ms.entries(measure, case.loop.plant)
-        found += [Limit(measure, i, float(v)) for i, v in enumerate(np.broadcast_to(np.asarray(value, dtype=float), (count,)))]
+        value = np.asarray(plant.rim) if isinstance(value, str) else value
+        values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
+        for i, v in enumerate(values):
+            held = plant.overflow and measure == "max_level" and v >= plant.rim[i]
+            found.append(Limit("overflow_volume", i, SPILL) if held else Limit(measure, i, float(v)))
     return found
 
 
@@ -139,17 +144,18 @@ class Problem:
     def screen(self, zs, clock):
         """(cost, margins) at many points (points, P), at `clock`, without derivatives."""
         values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
-        measures = _batch(self.loop, clock, self.needed, values, self.key)
+        measures, broken = _batch(self.loop, clock, self.needed, values, self.key)
         self.simulations += len(zs)
         table = [{m: np.asarray(v[i]) for m, v in measures.items()} for i in range(len(zs))]
-        return np.array([self.cost(row) for row in table]), np.array([self.margins(row) for row in table]).reshape(len(zs), -1)
+        costs = np.where(broken, np.nan, [self.cost(row) for row in table])
+        return costs, np.array([self.margins(row) for row in table]).reshape(len(zs), -1)
 
     @np.errstate(over="ignore", invalid="ignore")  # what explodes is told by Point.finite
     def point(self, z):
         """The Point at z: one run at the case's own step, with derivatives."""
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         values = {name: np.float64(v) for name, v in self.values(z).items()}
-        measures, slopes, gauss_newton = self._run(values)
+        measures, slopes, gauss_newton, broken = self._run(values)
         self.simulations, self.gradients = self.simulations + 1, self.gradients + 1
         per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
         measures = {m: np.asarray(v) for m, v in measures.items()}
@@ -157,13 +163,13 @@ class Problem:
         gradient = sum(w * slopes[m].sum(axis=0) for m, w in self.objective.items())
         margins = self.margins(measures)
         margin_slopes = np.array([-limit.sign * slopes[limit.measure][limit.index] for limit in self.limits]).reshape(-1, len(z))
-        margin_slopes[np.isneginf(margins)] = 0.0  # a measure that is no number (never settled) breaks its limit and has no slope
+        margin_slopes[np.abs(margins) >= NOT_A_NUMBER] = 0.0
         found = Point(
             z=z,
-            cost=self.cost(measures),
+            cost=np.nan if broken else self.cost(measures),
             gradient=gradient,
             gauss_newton=np.asarray(gauss_newton) * np.outer(per_z, per_z),
-            margins=np.maximum(margins, -NOT_A_NUMBER),
+            margins=margins,
             margin_slopes=margin_slopes,
             measures=measures,
         )
@@ -172,14 +178,15 @@ class Problem:
 
     def _run(self, values):
         if len(values) <= FORWARD_LIMIT:
-            return lp.sensitivities(self.loop, self.clock, self.needed, values, self.key)[:3]
+            return lp.sensitivities(self.loop, self.clock, self.needed, values, self.key)
         measures, slopes = _reverse(self.loop, self.clock, self.needed, tuple(values), np.array(list(values.values())), self.key)
-        return measures, slopes, np.full((len(values),) * 2, np.nan)
+        broken = not all(np.all(np.isfinite(v)) for v in slopes.values())
+        return measures, slopes, np.full((len(values),) * 2, np.nan), broken
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "names"))
 def _batch(loop, clock, names, values, key):
-    return jax.vmap(lambda v: lp.evaluate(with_values(loop, v), clock, names, key))(values)
+    return jax.vmap(lambda v: lp.evaluate_and_flag(with_values(loop, v), clock, names, key))(values)
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "names", "order"))

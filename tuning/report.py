@@ -10,7 +10,9 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank import rig
+from jaxtank.errors import InputError
 from jaxtank.files import check_folder, write_atomic
+from tuning.objective import LOWER
 
 SHOWN = (
     "rms_error",
@@ -27,7 +29,7 @@ SHOWN = (
 REASONS = {
     "overshoot_percent": "the reference does not change",
     "rise_time": "no change of the setpoint was followed to 90 % of its height",
-    "settling_time": "the reference does not change, or an output never left the band",
+    "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
     "recovery_time": "this case has no disturbance to recover from",
 }
 ABSENT = "the value is not a finite number"
@@ -103,7 +105,7 @@ def json_of(result):
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
         "measures": {"before": measures_json(result.measures["before"]), "after": measures_json(result.measures["after"])},
-        "reasons": reasons({**result.measures["before"], **result.measures["after"]}),
+        "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
         "units": units(),
         "constraints": clean(result.constraints),
         "evaluations": result.evaluations,
@@ -154,7 +156,7 @@ def text(result):
             [
                 c["name"],
                 c["unit"],
-                number(c["limit"], 7),
+                (">= " if c["measure"] in LOWER else "<= ") + number(c["limit"], 7),
                 number(c["value"], 7),
                 number(c["margin"], 3),
                 f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
@@ -167,7 +169,7 @@ def text(result):
                 [
                     "limit",
                     "unit",
-                    "at most" if not any("min_level" in c["measure"] for c in result.constraints) else "limit",
+                    "limit",
                     "value",
                     "margin",
                     "reached at",
@@ -282,7 +284,7 @@ def _landscape(ax, result, unit):
             (result.parameters[b.name]["after"], result.objective["after"]),
             b.scale == "log",
         )
-    first, second = sorted(np.argsort(-_felt(problem, z))[:2])
+    first, second = sorted(np.argsort([-(p["felt_percent"] or 0.0) for p in result.parameters.values()], kind="stable")[:2])
     side = np.linspace(0.0, 1.0, 24)
     a, c = np.meshgrid(side, side)
     points = np.tile(z, (a.size, 1))
@@ -308,14 +310,6 @@ def _landscape(ax, result, unit):
     return ax
 
 
-def _felt(problem, z):
-    """(P,) how strongly the cost curves along each parameter."""
-    if len(z) == 2:
-        return np.ones(2)
-    diagonal = np.diag(problem.point(z).gauss_newton)
-    return np.where(np.isfinite(diagonal), diagonal, 0.0)
-
-
 def save(result, folder):
     """Write result.json, rig.toml, trajectory.csv and PNG pictures to `folder`, each whole or not at all; returns their paths."""
     check_folder(folder)
@@ -327,9 +321,9 @@ def save(result, folder):
         "rig.toml": rig.dump(result.tuned),
         "trajectory.csv": trajectory_csv(runs["after"]),
         "before.csv": trajectory_csv(runs["before"]),
-        **{f"{name}.png": _png(figure) for name, figure in figures(result, runs).items()},
     }
-    return write_files(folder, files)
+    written = write_files(folder, files)  # the numbers first: pictures take seconds
+    return written + write_files(folder, {f"{name}.png": _png(figure) for name, figure in figures(result, runs).items()})
 
 
 def save_run(case, run, payload, folder):
@@ -345,7 +339,10 @@ def save_run(case, run, payload, folder):
 
 def write_files(folder, files):
     """Write {name: text or bytes} to `folder`, made if need be; returns the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        write_atomic(folder / name, data)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            write_atomic(folder / name, data)
+    except OSError as error:
+        raise InputError(f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder that can") from None
     return [folder / name for name in files]

@@ -14,6 +14,9 @@ from jaxtank.errors import InputError
 from jaxtank.loop import Inputs
 from jaxtank.tree import with_values
 
+LARGEST_STATE = 60
+"""Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their cube."""
+
 COARSE = 10
 """How many samples of the case make one of the coarse stage."""
 
@@ -34,7 +37,7 @@ def spectral_radius(problem, zs, clock):
     """(points,) largest modulus of the eigenvalues of one sample of the loop, linearised at the reference's plateaus.
 
     Above 1, the sampled loop is unstable there: it chatters between the limits of the pumps however good its gains would be at a
-    smaller step. Points (points, P); NaN where no plateau has a steady state.
+    smaller step. Points (points, P); NaN where no plateau has a steady state, or a transport delay makes the state too long to ask.
     """
     steady = []
     plateaus = problem.loop.reference.plateaus() if hasattr(problem.loop.reference, "plateaus") else []
@@ -46,6 +49,8 @@ def spectral_radius(problem, zs, clock):
     if not steady:
         return np.full(len(zs), np.nan)
     r, x, u = (jnp.asarray(np.array(column)) for column in zip(*steady))
+    if sum(np.size(v) for v in jax.tree.leaves(jax.eval_shape(lambda: lp.initial(problem.loop, clock)))) > LARGEST_STATE:
+        return np.full(len(zs), np.nan)
     values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(problem.bounds)}
     steps = np.asarray(_one_step_jacobians(problem.loop, clock, values, r, x, u))
     return np.abs(np.linalg.eigvals(steps)).max(axis=(1, 2))
@@ -79,20 +84,22 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 def screen(problem, count, seed):
     """(zs, costs, margins, redone): `count` Sobol points, costs in the order of zs.
 
-    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run again at the true step (`redone` of them).
+    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run again at the true step;
+    `redone` counts the first.
     """
     zs = sobol(count, len(problem.bounds), seed)
     clock = coarse_clock(problem.clock)
     costs, margins = problem.screen(zs, clock)
-    suspect = ~np.isfinite(costs)
+    unstable = np.zeros(count, dtype=bool)
     if clock != problem.clock:
-        suspect |= (spectral_radius(problem, zs, clock) > 1.0) & ~(spectral_radius(problem, zs, problem.clock) > 1.0)
+        unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(spectral_radius(problem, zs, problem.clock) > 1.0)
+        suspect = unstable | ~np.isfinite(costs)
         if suspect.any():
             # always the same number of lanes, so that one compiled program serves every search
             again = np.concatenate([zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)])
             true_costs, true_margins = problem.screen(again, problem.clock)
             costs[suspect], margins[suspect] = true_costs[: suspect.sum()], true_margins[: suspect.sum()]
-    return zs, costs, margins, int(suspect.sum())
+    return zs, costs, margins, int(unstable.sum())
 
 
 def distinct_starts(zs, merits, count, first):

@@ -111,12 +111,12 @@ def tune(
                 f"objective {measure} is not a number at the starting values (it cannot be measured on this run), so it cannot be tuned"
             )
 
-    search, outcomes, interrupted, redone = None, [], False, 0
+    search, outcomes, interrupted, redone, polished = None, [], False, 0, False
     report = _reporter(progress, problem, starts)
     try:
         reference = problem.point(first)
         search = Search(problem, reference, report)
-        search.point(first)
+        search.take(reference)
         zs, costs, margins, redone = screen(problem, screening, seed)
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)
         for i, z in enumerate(distinct_starts(zs, merits, starts, first)):
@@ -125,7 +125,7 @@ def tune(
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
         if method in ("slsqp", "trf") and search.best is not None:
-            slsqp(search, search.best.z, iterations, tolerance=1e-12)
+            polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
     except KeyboardInterrupt:
         interrupted = True
     best = search.best if search and search.best else None
@@ -138,7 +138,7 @@ def tune(
     after = run_measures(tuned.loop, tuned.clock, key)
     checked = _constraints(problem, after, tuned)
     holds = all(c["margin"] >= 0 for c in checked)
-    status = "interrupted" if interrupted else _status(outcomes, holds, best)
+    status = "interrupted" if interrupted else _status(outcomes, holds, search, polished)
     return TuningResult(
         case=case,
         tuned=tuned,
@@ -245,12 +245,14 @@ def _constraints(problem, after, tuned):
     return checked
 
 
-def _status(outcomes, holds, best):
-    if best is None:
+def _status(outcomes, holds, search, polished):
+    """Converged means: the search that gave the answer did, or the last polish of it."""
+    if search.best is None:
         return "not_converged"
     if not holds:
         return "infeasible"
-    return "converged" if any(o["converged"] for o in outcomes) else "not_converged"
+    mine = search.best_start < len(outcomes) and outcomes[search.best_start]["converged"]
+    return "converged" if mine or polished else "not_converged"
 
 
 def _message(status, problem, outcomes, checked, started, z, felt, redone):
@@ -260,7 +262,8 @@ def _message(status, problem, outcomes, checked, started, z, felt, redone):
     if status == "infeasible":
         worst = min(broken, key=lambda c: c["margin"])
         words.append(
-            f"no point meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, limit {worst['limit']:.6g} {worst['unit']}"
+            f"no point was found that meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, "
+            f"limit {worst['limit']:.6g} {worst['unit']}"
         )
     if status == "interrupted":
         words.append("interrupted: this is the best point so far")
@@ -270,10 +273,10 @@ def _message(status, problem, outcomes, checked, started, z, felt, redone):
     if over and status != "infeasible":
         told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over)
         words.append(f"the starting values break a limit ({told}), so their objective is not one to reach")
-    tight = [c for c in checked if 0 <= c["margin"] < 1e-3 * max(abs(c["limit"]), 1.0)]
+    tight = [c for c in checked if 0 <= c["margin"] < 1e-3 * abs(c["limit"])]
     for c in tight:
         when = f" at {c['time_s']:.2f} s" if c["time_s"] is not None else ""
-        words.append(f"tight: {c['name']}{when} ({c['value']:.6g} of {c['limit']:.6g} {c['unit']})")
+        words.append(f"tight: {c['name']}{when} ({c['value']:.7g} of {c['limit']:.7g} {c['unit']})")
     if checked and not tight and not broken:
         words.append("no limit is tight")
     for b, v, f in zip(problem.bounds, z, felt):
@@ -313,6 +316,7 @@ def _reporter(progress, problem, starts):
                     "cost": search.history[-1][1],
                     "violation": search.history[-1][2],
                     "best": None if best is None else best.cost,
+                    "best_violation": None if best is None else search.violation(best),
                     "values": None if best is None else problem.values(best.z),
                 }
             )

@@ -9,6 +9,9 @@ from tuning.objective import EXPLODED
 BACKOFF = 1e-6
 """Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
 
+SETTLED = 0.02
+"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as converged."""
+
 STEEPEST = 10.0
 """Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
 
@@ -20,6 +23,9 @@ class Search:
         self.problem, self.report = problem, report
         self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
         self.room = np.array([max(abs(limit.value), 1.0) for limit in problem.limits])
+        # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
+        self.backoff = BACKOFF * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
+        self.best_start = None
         self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
 
     def point(self, z):
@@ -27,16 +33,19 @@ class Search:
         z = np.clip(z, 0.0, 1.0)
         key = z.tobytes()
         if key not in self.memory:
-            point = self.problem.point(z)
-            self.memory[key] = point
-            broken = self.violation(point) if point.finite else np.inf
-            self.history.append((self.start, float(point.cost), broken, tuple(z)))
-            if point.finite:
-                self.last_finite = point
-                if self.best is None or self.better(point, self.best):
-                    self.best = point
-            self.report(self)
+            self.take(self.problem.point(z))
         return self.memory[key]
+
+    def take(self, point):
+        """Enter a Point into the memory, the history and the race for the best."""
+        self.memory[point.z.tobytes()] = point
+        broken = self.violation(point) if point.finite else np.inf
+        self.history.append((self.start, float(point.cost), broken, tuple(point.z)))
+        if point.finite:
+            self.last_finite = point
+            if self.best is None or self.better(point, self.best):
+                self.best, self.best_start = point, self.start
+        self.report(self)
 
     def violation(self, point):
         """Largest amount by which a limit is broken, in the measure's unit; 0 where all hold."""
@@ -58,7 +67,7 @@ class Search:
         """((limits,) margins as shares of their limits, less the back-off, (limits, P) slopes)."""
         point = self.point(z)
         good = point if point.finite else self.last_finite
-        return good.margins / self.room - BACKOFF, good.margin_slopes / self.room[:, None]
+        return good.margins / self.room - self.backoff, good.margin_slopes / self.room[:, None]
 
 
 def slsqp(search, z, iterations, tolerance=1e-8):
@@ -82,11 +91,13 @@ def slsqp(search, z, iterations, tolerance=1e-8):
 def trf(search, z, iterations, tolerance=1e-10):
     """Bounded Gauss-Newton trust region on the mean squared tracking error, P + 1 residuals that give the same model as all samples."""
 
+    weight = search.problem.objective["rms_error_total"]
+
     def model(z):
         point = search.point(z)
         if not point.finite or not np.all(np.abs(point.gauss_newton) < EXPLODED**2):
             return np.full(len(z) + 1, 1e3), np.eye(len(z) + 1, len(z))
-        normal = 0.5 * point.gauss_newton / search.scale**2
+        normal = 0.5 * weight**2 * point.gauss_newton / search.scale**2
         slope = point.cost * point.gradient / search.scale**2
         root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
         head = np.linalg.solve(root, slope)
@@ -125,7 +136,6 @@ def _rounds(search):
 
 def _augmented(search, z, iterations, optimiser, descend):
     weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, _rounds(search)
-    moved = np.inf
 
     def value(z):
         f, g = search.cost(z)
@@ -153,7 +163,7 @@ def _augmented(search, z, iterations, optimiser, descend):
         if len(weights):
             weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
             stiffness *= 4
-    return moved < 1e-3
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
 def optimality(search, point):

@@ -36,7 +36,7 @@ LAWS = {
 VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
     "-boxqp": "inputs allocated by box QP instead of clipped",
-    "-slow": "ramps of 200 s, with which the 30 cm limit can be met",
+    "-slow": "ramps of 200 s, with which backstepping holds the 30 cm limit",
 }
 
 DEPARTURES = (
