@@ -524,7 +524,7 @@ BAD = [  # arguments, words that the line must have
     (["tune", CASE, "--free", "controller.k=5:1"], "controller.k = 5:1: must be LOW:HIGH"),
     (["tune", CASE, "--free", "controller.k=1:1"], "controller.k = 1:1: must be LOW:HIGH"),
     (["tune", CASE, "--free", "controller.k=0.01:inf"], "controller.k = 0.01:inf: must be LOW:HIGH"),
-    (["tune", CASE, "--free", "controller.k=a:b"], "'a:b': must be LOW:HIGH"),
+    (["tune", CASE, "--free", "controller.k=a:b"], "'a:b': must be NAME=LOW:HIGH"),
     (["tune", CASE, "--free", "controller.k=0.01:1:cubic"], "cubic"),
     (["tune", CASE, "--free", "controller.k"], "controller.k"),
     (["tune", CASE, "--free", "controller.k=-1:1"], "controller.k = -1 1/s: must be above 0 1/s"),

@@ -386,7 +386,17 @@ def _bench(args):
     return 0
 
 
-COMMANDS = {"list": _list, "show": _show, "simulate": _simulate, "tune": _tune, "init": _init, "bench": _bench}
+def _tune_interruptibly(args):
+    """`_tune`, with the handler of SIGINT put back afterwards."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        return _tune(args)
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
+
+
+COMMANDS = {"list": _list, "show": _show, "simulate": _simulate, "tune": _tune_interruptibly, "init": _init, "bench": _bench}
 
 if __name__ == "__main__":
     sys.exit(main())
