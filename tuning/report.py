@@ -240,8 +240,15 @@ def figures(result, runs=None):
     unit = objective_unit(result.objective["terms"])
     tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level"}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
+    told = {"before": "", "after": ""}
+    if result.problem.limits:
+        told = {
+            k: ", breaks a limit" if (result.problem.margins(m) < 0).any() else ", holds all limits"
+            for k, m in result.measures.items()
+        }
     title = (
-        f"{result.tuned.name}: objective {number(result.objective['before'], 4)} -> {number(result.objective['after'], 4)} {unit}   ("
+        f"{result.tuned.name}: objective {number(result.objective['before'], 4)}{told['before']} -> "
+        f"{number(result.objective['after'], 4)} {unit}{told['after']}\n("
         + ", ".join(
             f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}"
             for n, p in list(result.parameters.items())[:4]
