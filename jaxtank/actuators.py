@@ -67,12 +67,18 @@ class PumpBank:
             head=jnp.int32(0),
         )
 
-    def step(self, state, command, metric, dt):
-        """((m) voltages at the plant [V], new state) for a command (m) [V]; metric: (g11, g12, g22) for "boxqp", or None."""
+    def limit(self, command, metric=None):
+        """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for "boxqp", or None."""
         if self.saturation == "boxqp":
-            u = allocate(command, metric, self.low, self.high)
-        else:
-            u = tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+            return allocate(command, metric, self.low, self.high)
+        return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+
+    def step(self, state, command, metric, dt):
+        """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then `deliver`."""
+        return self.deliver(state, self.limit(command, metric), dt)
+
+    def deliver(self, state, u, dt):
+        """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead zone, lag, delay."""
         if self.dead_zone is not None:
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:

@@ -13,7 +13,7 @@ from jaxtank.errors import unknown
 from jaxtank.numerics import at_least, root_of_mean
 
 BAND = 0.05
-"""Half width of the settling band, as a share of the step [-]."""
+"""Half width of the recovery band, as a share of the setpoint [-]."""
 
 
 class Run(NamedTuple):
@@ -31,7 +31,8 @@ class Run(NamedTuple):
 
 
 class Accumulator(NamedTuple):
-    """start(run) -> state; update(run, state, sample, window) -> state, at every sample."""
+    """start(run) -> state; update(run, state, sample, window) -> state, at every sample; window: of the setpoint's changes, or, for
+    `recovery`, the time since the last pour."""
 
     start: Callable
     update: Callable
@@ -46,6 +47,7 @@ class Measure(NamedTuple):
     read: Callable
     doc: str
     windows: bool = False  # needs Ramps.windows: the target and step each sample refers to
+    pours: bool = False  # needs Pours.since: the time since the last pour
 
 
 def _filled(run, count, value):
@@ -95,7 +97,7 @@ def _overshoot(run, sample, window):
     """Level past the target in the direction of the step, as a share of the step [-]; -1 where there is no step yet."""
     return tuple(
         jnp.where(step == 0.0, -1.0, (r + e - target) / jnp.where(step == 0.0, 1.0, step))
-        for (target, step, _), r, e in zip(window, sample.r, sample.e)
+        for (target, step, _, _), r, e in zip(window, sample.r, sample.e)
     )
 
 
@@ -106,10 +108,10 @@ def _start_settling(run):
 def _update_settling(run, state, sample, window):
     """Per output (target now, time since its change ended at the last sample outside the band [s], 1 if still outside, worst so far)."""
     new = []
-    for (old, last, outside, worst), (target, step, since), r, e in zip(state, window, sample.r, sample.e):
+    for (old, last, outside, worst), (target, step, since, band), r, e in zip(state, window, sample.r, sample.e):
         worst = jnp.where((target != old) & (_settled(last, outside) > worst), _settled(last, outside), worst)
         last = jnp.where(target != old, -1e9, last)
-        out = (step != 0.0) & (jnp.abs(r + e - target) > BAND * jnp.abs(step))
+        out = (step != 0.0) & (jnp.abs(r + e - target) > band)
         new.append((target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst))
     return tuple(new)
 
@@ -126,7 +128,7 @@ def _start_rise(run):
 def _update_rise(run, state, sample, window):
     """Per output (target now, time of the first 10 %, time of the first 90 %, longest rise so far)."""
     new = []
-    for (old, t10, t90, longest), (target, step, _), r, e in zip(state, window, sample.r, sample.e):
+    for (old, t10, t90, longest), (target, step, _, _), r, e in zip(state, window, sample.r, sample.e):
         fresh = target != old
         t10, t90 = jnp.where(fresh, -1.0, t10), jnp.where(fresh, -1.0, t90)
         done = jnp.where(step == 0.0, 0.0, 1.0 + (r + e - target) / jnp.where(step == 0.0, 1.0, step))
@@ -136,6 +138,23 @@ def _update_rise(run, state, sample, window):
         longest = jnp.where(reached & (sample.t - t10 > longest), sample.t - t10, longest)
         new.append((target, t10, t90, longest))
     return tuple(new)
+
+
+def _update_recovery(run, state, sample, since):
+    """Per output (time since the pour at the last sample outside the band [s], 1 if that was the last one watched, worst so far)."""
+    new = []
+    for (last, outside, worst), r, e in zip(state, sample.r, sample.e):
+        fresh = since < last
+        done = _settled(last, outside)
+        worst = jnp.where(fresh & (done > worst), done, worst)
+        out, watched = jnp.abs(e) > BAND * jnp.abs(r), since >= 0.0
+        last = jnp.where(watched, jnp.where(out, since, jnp.where(fresh, 0.0, last)), last)
+        new.append((last, jnp.where(watched, jnp.where(out, 1.0, 0.0), outside), worst))
+    return tuple(new)
+
+
+def _recovery(run, acc):
+    return _list([jnp.maximum(worst, _settled(last, outside)) for last, outside, worst in acc["recovery"]])
 
 
 def _update_travel(run, state, sample, window):
@@ -159,6 +178,7 @@ ACCUMULATORS = {
     "overshoot": _extreme(lambda run: run.outputs, _overshoot, lambda a, b: a > b, -1.0),
     "settling": Accumulator(_start_settling, _update_settling),
     "rise": Accumulator(_start_rise, _update_rise),
+    "recovery": Accumulator(lambda run: tuple((run.zero, run.zero, run.zero) for _ in range(run.outputs)), _update_recovery),
     "travel": Accumulator(
         lambda run: (_filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0), _update_travel
     ),
@@ -250,9 +270,17 @@ MEASURES = {
         "output",
         ("settling",),
         _settling,
-        "longest time from the end of a change to its last sample outside +-5 % of it; "
+        "longest time from the end of a change to its last sample outside its band (+-5 % of it); "
         "negative: inside before the change ended; none: never settled",
         windows=True,
+    ),
+    "recovery_time": Measure(
+        "s",
+        "output",
+        ("recovery",),
+        _recovery,
+        "longest time from the start of a pour to the last sample outside +-5 % of the setpoint; none: never recovered",
+        pours=True,
     ),
     "estimation_rms": Measure(
         "cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"
@@ -284,14 +312,25 @@ def wants_windows(names):
     return any(MEASURES[name].windows for name in names)
 
 
+def wants_pours(names):
+    """True if a measure in `names` refers to pours."""
+    return any(MEASURES[name].pours for name in names)
+
+
+def serves(name, loop):
+    """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into."""
+    spec = MEASURES[name]
+    return (not spec.windows or hasattr(loop.reference, "windows")) and (not spec.pours or hasattr(loop.disturbance, "since"))
+
+
 def start(run, names):
     """{accumulator: state} before the first sample."""
     return {a: ACCUMULATORS[a].start(run) for a in needs(names)}
 
 
-def update(run, states, sample, window):
+def update(run, states, sample, window, since=None):
     """{accumulator: state} after `sample`."""
-    return {a: ACCUMULATORS[a].update(run, state, sample, window) for a, state in states.items()}
+    return {a: ACCUMULATORS[a].update(run, state, sample, since if a == "recovery" else window) for a, state in states.items()}
 
 
 def read(run, states, names):

@@ -51,18 +51,21 @@ def check_clock(clock):
 
 
 class Tick(NamedTuple):
-    """What a law is told at sample k besides the estimate: tuples of scalars, one per output."""
+    """What a law and an observer are told at sample k besides measurements: tuples of scalars, one per output."""
 
     t: Any  # time [s]
     r: tuple  # setpoint r [cm]
     dr: tuple  # its rate r' [cm/s]
     ddr: tuple  # its second derivative r'' [cm/s^2]
+    dt: float = 0.0  # sampling period Ts [s]
+    plan: Any = ()  # what the law prepared for this sample before the loop started
 
 
 class Estimate(NamedTuple):
     """What an observer hands to a law: tuples of scalars."""
 
     x: tuple  # level estimate, one per tank [cm]
+    d: tuple = ()  # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
 
 
 class Sample(NamedTuple):
@@ -72,6 +75,7 @@ class Sample(NamedTuple):
     x: tuple  # levels, one per tank [cm]
     y: tuple  # measured levels, one per tank [cm]
     x_hat: tuple  # estimated levels, one per tank [cm]
+    d_hat: tuple  # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
     r: tuple  # setpoint, one per output [cm]
     e: tuple  # tracking error of the true output, x - r, one per output [cm]
     command: tuple  # what the law asked for, one per pump [V]
@@ -86,6 +90,7 @@ class Trajectory(NamedTuple):
     x: Any  # (rows, tanks) [cm]
     y: Any  # (rows, tanks) [cm]
     x_hat: Any  # (rows, tanks) [cm]
+    d_hat: Any  # (rows, tanks) [cm/s]
     r: Any  # (rows, outputs) [cm]
     e: Any  # (rows, outputs) [cm]
     command: Any  # (rows, pumps) [V]

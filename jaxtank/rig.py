@@ -139,7 +139,7 @@ def check_free(loop, name, low, high, scale="log"):
 def check(case):
     """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
     lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
-    if isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
+    if case.reachable and isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
         for values in case.loop.reference.plateaus(case.clock.duration):
             try:
                 equilibrium(case.loop.plant, values)

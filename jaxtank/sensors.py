@@ -17,9 +17,9 @@ class LevelSensor:
     The ADC's slope is that of the line through its staircase (numerics.quantise).
     """
 
-    gain: np.ndarray = leaf("cm/V", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
+    gain: np.ndarray = leaf("cm/volt", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
-    full_scale: np.ndarray = leaf("V", "range of the ADC", low=0.0, strict=True)
+    full_scale: np.ndarray = leaf("volt", "range of the ADC", low=0.0, strict=True)
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
     def draw(self, key, samples):

@@ -38,7 +38,9 @@ class Signal(abc.ABC):
 class Constant(Signal):
     """A signal that does not change."""
 
-    level: np.ndarray = leaf("-", "(channels,) value, in the unit of what it stands for: cm of a setpoint, cm^3/s of a disturbance")
+    level: np.ndarray = leaf(
+        "-", "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance"
+    )
 
     @property
     def channels(self):
@@ -66,6 +68,9 @@ class Ramps(Signal):
     changes: tuple = static(doc="((time [s], channel), ...) in order of time")
     ramp: float = static("s", "duration D of every change", low=0.0, default=60.0)
     shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
+    band: float = static(
+        "-", "half width of the settling band, as a share of the step", low=0.0, high=1.0, strict=True, default=0.05
+    )
 
     @property
     def channels(self):
@@ -84,7 +89,7 @@ class Ramps(Signal):
         return value, rate, second
 
     def windows(self, clock):
-        """Per channel (target, step, time since the change ended), each (samples,): what overshoot and settling refer to.
+        """Per channel (target, step, time since the change ended, settling band), each (samples,): what overshoot and settling refer to.
 
         Before a channel's first change the step is 0. Times in s, levels in cm.
         """
@@ -99,7 +104,7 @@ class Ramps(Signal):
             step[i] = jnp.where(after, self.targets[j] - last[i], step[i])
             since[i] = jnp.where(after, t - (start + self.ramp), since[i])
             last[i] = self.targets[j]
-        return tuple(zip(target, step, since))
+        return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
 
     def plateaus(self, until=math.inf):
         """(plateaus, channels) the values held between changes, as host numbers: those whose changes end before the next and `until` [s]."""
@@ -117,8 +122,117 @@ class Ramps(Signal):
         return np.array(values)
 
 
-def ramps(initial, changes, ramp=60.0, shape="linear"):
-    """A `Ramps` from a list of (time [s], channel, target [cm]). Raises InputError for a bad time, channel or shape."""
+@component
+class Sine(Signal):
+    """A raised sine that lasts a while: the moving part of benchmark 1 of gouta2022 (sec. 5.1).
+
+        s(t) = offset + amplitude sin(2 pi (t - zero) / period)   for start <= t < end, else 0
+
+    One channel of several moves, the others stay at 0. Its rate is that of the sine; jumps at the two ends have no impulse.
+    """
+
+    amplitude: np.ndarray = leaf("cm", "amplitude of the sine")
+    offset: np.ndarray = leaf("cm", "mean of the sine")
+    period: float = static("s", "period", low=0.0, strict=True)
+    zero: float = static("s", "a time at which the sine rises through its mean")
+    start: float = static("s", "when it begins", low=0.0)
+    end: float = static("s", "when it ends", low=0.0)
+    channel: int = static("-", "the channel that moves", low=0, high=100)
+    width: int = static("-", "number of channels", low=1, high=100)
+
+    @property
+    def channels(self):
+        return self.width
+
+    def sample(self, clock):
+        t, omega = sample_times(clock), 2.0 * math.pi / self.period
+        inside, angle = (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt), omega * (t - self.zero)
+        sine, cosine = self.amplitude * jnp.sin(angle), self.amplitude * jnp.cos(angle)
+        moving = [jnp.where(inside, v, 0.0) for v in (self.offset + sine, omega * cosine, -omega * omega * sine)]
+        still = jnp.zeros_like(t)
+        return tuple(tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+
+
+@component
+class Sum(Signal):
+    """Two signals added, channel by channel."""
+
+    first: Signal
+    second: Signal
+
+    @property
+    def channels(self):
+        return self.first.channels
+
+    def sample(self, clock):
+        return tuple(
+            tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
+        )
+
+    def windows(self, clock):
+        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
+        t = sample_times(clock)
+        found = list(self.first.windows(clock))
+        still = t < self.second.start - 1e-7 * clock.dt
+        found[self.second.channel] = tuple(jnp.where(still, a, 0.0) for a in found[self.second.channel])
+        return tuple(found)
+
+
+@component
+class Pours(Signal):
+    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; spec 2). An inflow per tank [cm^3/s].
+
+    What a sample is given is the mean over that sample, so that the whole volume arrives whatever the sampling period.
+    """
+
+    volume: np.ndarray = leaf("cm^3", "(pours,) volume of each pour; negative: taken out")
+    events: tuple = static(doc="((time [s], duration [s], tank), ...) one per pour")
+    width: int = static("-", "number of tanks", low=1, high=100)
+    window: float = static("s", "how long after a pour a tank is watched for its recovery", low=0.0, strict=True, default=60.0)
+
+    @property
+    def channels(self):
+        return self.width
+
+    def sample(self, clock):
+        t = sample_times(clock)
+        flow = [jnp.zeros_like(t) for _ in range(self.width)]
+        for j, (start, duration, tank) in enumerate(self.events):
+            share = (jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)) / (duration * clock.dt)
+            flow[tank] = flow[tank] + self.volume[j] * jnp.maximum(share, 0.0)
+        still = (jnp.zeros_like(t),) * self.width
+        return tuple(flow), still, still
+
+    def since(self, clock):
+        """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
+        t = sample_times(clock)
+        since = -jnp.ones_like(t)
+        for start, _, _ in sorted(self.events):
+            after = t - start
+            since = jnp.where(after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since)
+        return since
+
+
+def pours(tanks, entries):
+    """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0, volume [cm^3]). InputError for a bad one."""
+    for time, duration, tank, _ in entries:
+        if not (time >= 0 and duration > 0 and 0 <= tank < tanks):
+            raise InputError(
+                f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0 s, a duration above 0 s and a tank "
+                f"from 0 to {tanks - 1}"
+            )
+    return Pours(
+        volume=number([volume for *_, volume in entries]),
+        events=tuple((float(time), float(duration), int(tank)) for time, duration, tank, _ in entries),
+        width=tanks,
+    )
+
+
+def ramps(initial, changes, ramp=60.0, shape="linear", band=0.05):
+    """A `Ramps` from a list of (time [s], channel, target [cm]); band: share of each step.
+
+    Raises InputError for a bad time, channel or shape.
+    """
     changes = sorted(changes, key=lambda change: change[0])
     for time, channel, _ in changes:
         if not 0 <= channel < len(initial):
@@ -133,6 +247,7 @@ def ramps(initial, changes, ramp=60.0, shape="linear"):
         changes=tuple((float(time), int(channel)) for time, channel, _ in changes),
         ramp=float(ramp),
         shape=shape,
+        band=float(band),
     )
 
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError, unknown
+from jaxtank.units import DEFAULT, local
 
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 
@@ -54,14 +55,15 @@ def number(value):
     return np.asarray(value, dtype=np.float64)
 
 
-def walk(tree, prefix="", kind="leaf"):
-    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`."""
+def walk(tree, prefix="", kind="leaf", units=DEFAULT):
+    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`, units as the rig counts."""
+    units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
-            yield from walk(value, f"{name}.", kind)
+            yield from walk(value, f"{name}.", kind, units)
         elif field.metadata.get("kind") == kind:
-            yield name, value, field.metadata
+            yield name, value, {**field.metadata, "unit": local(field.metadata["unit"], units)}
 
 
 def parameters(tree):

@@ -461,7 +461,7 @@ def test_continuous_control_by_lsoda_agrees(gouta):
 
 def test_published_numbers_of_the_preset_are_those_of_its_cases(gouta):
     published = load("gouta2015").published
-    assert float(gouta("ngpc").loop.controller.Tp) == published["controller.Tp"][0]
-    assert float(gouta("backstepping").loop.controller.k) == published["controller.k"][0]
-    assert float(gouta("backstepping").loop.controller.k1) == published["controller.k1"][0]
-    assert jnp.all(gouta("ngpc").loop.actuator.high == published["actuator.high"][0])
+    assert float(gouta("ngpc").loop.controller.Tp) == published["controller.Tp"].value
+    assert float(gouta("backstepping").loop.controller.k) == published["controller.k"].value
+    assert float(gouta("backstepping").loop.controller.k1) == published["controller.k1"].value
+    assert jnp.all(gouta("ngpc").loop.actuator.high == published["actuator.high"].value)

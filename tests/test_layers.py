@@ -7,13 +7,15 @@ import jaxtank
 import tuning
 
 LAYERS = [
-    {"errors", "_xla", "files"},
+    {"errors", "_xla", "files", "units"},
     {"tree", "numerics", "invariants"},
     {"records", "signals"},
     {"plants", "sensors", "actuators"},
-    {"analysis"},
+    {"analysis", "linear", "qp"},
     {"observers", "controllers"},
     {"measures"},
+    {"stepping"},
+    {"door", "derivatives"},
     {"loop"},
     {"presets"},
     {"rig", "plotting"},

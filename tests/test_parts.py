@@ -57,10 +57,11 @@ def test_steps_and_overlapping_ramps():
 def test_plateaus_and_windows():
     reference = ramps([3.0, 3.0], [(20.0, 0, 8.0), (20.0, 1, 8.0), (40.0, 1, 14.0)], 5.0)
     np.testing.assert_array_equal(reference.plateaus(), [[3, 3], [8, 8], [8, 14]])
-    target, step, since = (np.asarray(v) for v in reference.windows(Clock(dt=1.0, duration=60.0))[1])
+    target, step, since, band = (np.asarray(v) for v in reference.windows(Clock(dt=1.0, duration=60.0))[1])
     assert (target[10], step[10]) == (3.0, 0.0)
     assert (target[30], step[30], since[30]) == (8.0, 5.0, 5.0)
     assert (target[50], step[50], since[50]) == (14.0, 6.0, 5.0)
+    np.testing.assert_allclose(band[50], 0.3)
 
 
 def test_gradient_of_a_reference_by_its_targets():
@@ -248,13 +249,15 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
             x=(jnp.float64(h),),
             y=(h,),
             x_hat=(h,),
+            d_hat=(0.0,),
             r=(rk,),
             e=(jnp.float64(h - rk),),
             command=(uk if command is None else command[k],),
             u=(jnp.float64(uk),),
             spilled=(0.0,),
         )
-        states = ms.update(run, states, sample, ((jnp.float64(target[k]), jnp.float64(step[k]), jnp.float64(since[k])),))
+        window = ((jnp.float64(target[k]), jnp.float64(step[k]), jnp.float64(since[k]), jnp.float64(0.05 * abs(step[k]))),)
+        states = ms.update(run, states, sample, window)
     return {m: np.asarray(v) for m, v in ms.read(run, states, names).items()}
 
 

@@ -13,12 +13,12 @@ from scipy.integrate import solve_ivp
 import jaxtank
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError
-from jaxtank.loop import _integrate
 from jaxtank.numerics import ROOT_KNEE, floored_root, root
-from jaxtank.plants import TankNetwork, state_coupled_four_tank
+from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.network import network
 from jaxtank.presets.gouta2015 import FAST_AREA
 from jaxtank.records import Clock
+from jaxtank.stepping import integrate
 
 QUIET = settings(deadline=None, max_examples=8, derandomize=True)
 
@@ -29,7 +29,7 @@ def one_tank(area=20.0, drain=0.2, rim=30.0, **more):
 
 def held(plant, x, u, dt, steps, integrator="rk4"):
     """Levels after `steps` steps with the pumps held."""
-    step = jax.jit(lambda x: _integrate(plant, integrator, 0.0, x, u, None, dt))
+    step = jax.jit(lambda x: integrate(plant, integrator, 0.0, x, u, None, dt))
     x = tuple(jnp.asarray(v, dtype=float) for v in x)
     for _ in range(steps):
         x = step(x)
@@ -182,7 +182,7 @@ def test_mass_balance_with_the_liquid_lost_at_the_rim(seed, overflow):
         k3 = plant.derivative(0, x3, u, d)
         x4 = tuple(a + h * b for a, b in zip(x, k3))
         net += h / 6 * sum(w * float(plant.net_inflow(p, u, d)) for w, p in ((1, x), (2, x2), (2, x3), (1, x4)))
-        x, spilled = plant.spill(_integrate(plant, "rk4", 0.0, x, u, d, h))
+        x, spilled = plant.spill(integrate(plant, "rk4", 0.0, x, u, d, h))
         lost += float(sum(spilled))
     stored = float(np.dot(plant.area, np.array(x)))
     np.testing.assert_allclose(stored - before, net - lost, atol=1e-10 * max(1.0, before, stored, abs(net)))
@@ -199,7 +199,7 @@ def test_levels_never_pass_below_zero_and_more_voltage_never_lowers_one(seed):
     more = u + rng.uniform(0, 6, plant.pumps)
     low, high = x, x
     for _ in range(30):
-        low, high = (_integrate(plant, "rk4", 0.0, a, tuple(v), None, 0.05) for a, v in ((low, u), (high, more)))
+        low, high = (integrate(plant, "rk4", 0.0, a, tuple(v), None, 0.05) for a, v in ((low, u), (high, more)))
         assert np.all(np.array(low) > -1e-6)
         assert np.all(np.array(high) >= np.array(low) - 1e-12)
 
@@ -211,14 +211,16 @@ def test_swapped_channels_give_swapped_answers():
     np.testing.assert_allclose(a[[1, 0, 3, 2]], b, rtol=1e-13)
 
 
+def in_metres(cm):
+    """The same rig with lengths in m and flows in m^3/s."""
+    powers = {"area": 2, "drain": 2, "orifice": 2, "pipe": 2, "pump_gain": 3, "gravity": 1, "rim": 1, "knee": 1}
+    return dataclasses.replace(cm, **{name: getattr(cm, name) * 1e-2**power for name, power in powers.items()}, units=("m", "V"))
+
+
 def test_units_rescale():
     """In metres and litres per second the same rig moves the same way."""
     cm = state_coupled_four_tank(FAST_AREA)
-    m = TankNetwork(
-        **{f: getattr(cm, f) for f in ("links", "feeds", "outputs", "overflow", "split")},
-        area=cm.area * 1e-4, drain=cm.drain * 1e-4, orifice=cm.orifice * 1e-4, pump_gain=cm.pump_gain * 1e-6, gravity=cm.gravity * 1e-2,
-        rim=cm.rim * 1e-2, knee=cm.knee * 1e-2,
-    )  # fmt: skip
+    m = in_metres(cm)
     x, u = np.array([8.0, 5.0, 12.0, 20.0]), (3.0, 6.0)
     np.testing.assert_allclose(held(m, tuple(x / 100), u, 0.1, 100) * 100, held(cm, tuple(x), u, 0.1, 100), rtol=1e-11)
 

@@ -63,7 +63,9 @@ def json_of(case):
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
         "limits": report.clean(dict(case.limits)),
         "objective": dict(case.objective),
-        "published": {n: list(v) for n, v in preset.published.items()} if preset else {},
+        "published": {n: [report.clean(p.value), " ".join(filter(None, [p.unit, p.where]))] for n, p in preset.published.items()}
+        if preset
+        else {},
         "departures": list(preset.departures) if preset else [],
     }
 

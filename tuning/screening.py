@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from jaxtank import loop as lp
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import InputError
-from jaxtank.loop import Inputs
+from jaxtank.stepping import Inputs, initial, step
 from jaxtank.tree import with_values
 
 LARGEST_STATE = 60
@@ -49,7 +48,7 @@ def spectral_radius(problem, zs, clock):
     if not steady:
         return np.full(len(zs), np.nan)
     r, x, u = (jnp.asarray(np.array(column)) for column in zip(*steady))
-    if sum(np.size(v) for v in jax.tree.leaves(jax.eval_shape(lambda: lp.initial(problem.loop, clock)))) > LARGEST_STATE:
+    if sum(np.size(v) for v in jax.tree.leaves(jax.eval_shape(lambda: initial(problem.loop, clock)))) > LARGEST_STATE:
         return np.full(len(zs), np.nan)
     values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(problem.bounds)}
     steps = np.asarray(_one_step_jacobians(problem.loop, clock, values, r, x, u))
@@ -62,17 +61,28 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
     def jacobian(values, r, x, u):
         here = with_values(loop, {**values, "x0": x, "actuator.initial": u})
-        state = lp.initial(here, clock)
+        state = initial(here, clock)
         leaves, structure = jax.tree.flatten(state)
         moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
         zero = jnp.zeros_like(r)
         d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
-        now = Inputs(r=tuple(r), dr=tuple(zero), ddr=tuple(zero), d=d, xi=None, window=None)
+        plan = here.controller.prepare(tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None]))
+        now = Inputs(
+            r=tuple(r),
+            dr=tuple(zero),
+            ddr=tuple(zero),
+            d=d,
+            xi=None,
+            window=None,
+            since=None,
+            plan=jax.tree.map(lambda a: a[0], plan),
+            fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),
+        )
 
         def after(flat):
             floats, rest = iter(unravel(flat)), iter([v for v, m in zip(leaves, moves) if not m])
             state = jax.tree.unflatten(structure, [next(floats) if m else next(rest) for m in moves])
-            out = jax.tree.leaves(lp.step(here, clock, state, now)[0])
+            out = jax.tree.leaves(step(here, clock, state, now)[0])
             return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
 
         flat, unravel = jax.flatten_util.ravel_pytree([v for v, m in zip(leaves, moves) if m])

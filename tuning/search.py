@@ -189,7 +189,7 @@ def _method(method, problem):
 
 def run_measures(loop, clock, key):
     """{measure: value} of everything that is reported of a run, and when the highest levels were reached."""
-    names = REPORTED if hasattr(loop.reference, "windows") else tuple(m for m in REPORTED if not ms.MEASURES[m].windows)
+    names = tuple(m for m in REPORTED if ms.serves(m, loop))
     values = lp.evaluate(loop, clock, (*names, "time_of_max_level"), key)
     return {m: np.asarray(v) for m, v in values.items()}
 

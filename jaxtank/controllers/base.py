@@ -6,13 +6,26 @@ import abc
 class Controller(abc.ABC):
     """A sampled law. It holds its own model of the plant: what it believes and what is true are different leaves."""
 
-    def init(self):
-        """State before the first sample."""
+    def prepare(self, r, dr, ddr):
+        """What the law can compute of the reference before the loop starts: any tree of arrays (samples,), given back at each sample
+        as `tick.plan`. r, dr, ddr: tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2]."""
+        return ()
+
+    def init(self, x0, u0):
+        """State before the first sample, for levels x0 (n) [cm] and pumps that ran at u0 (m) [V] until t = 0."""
         return ()
 
     @abc.abstractmethod
     def step(self, state, tick, estimate):
-        """((m) commanded voltages [V], new state) at `tick` for `estimate`; the command is not limited here."""
+        """((m) commanded voltages [V], new state) at `tick` for `estimate`; the command is not limited here.
+
+        Coefficients and gains may be computed here from leaves, with jnp.linalg too: what does not depend on state or estimate is
+        moved in front of the loop.
+        """
+
+    def track(self, state, tick, command, applied):
+        """State after the pumps' limits have made `applied` (m) [V] of `command` (m) [V]: anti-windup of laws with memory."""
+        return state
 
     def input_metric(self, estimate):
         """(g11, g12, g22): how the law's cost weighs a change of its two inputs, for allocation by box QP; None if it has none."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank.errors import InputError
 from jaxtank.numerics import floored_root
-from jaxtank.plants.network import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
+from jaxtank.plants.rigs import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
 from jaxtank.signals import Constant, Ramps
 
 

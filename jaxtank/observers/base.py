@@ -7,15 +7,25 @@ from jaxtank.tree import component
 
 
 class Observer(abc.ABC):
-    """Turns measurements into an estimate. State is handed in and handed back."""
+    """Turns measurements into an estimate: corrected by what is measured, carried on by what is applied. State is handed in and out."""
 
-    def init(self):
-        """State before the first sample."""
+    def init(self, x0):
+        """State before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()
 
     @abc.abstractmethod
     def step(self, state, tick, y):
         """(Estimate, new state) for measured levels y (n) [cm] at `tick`."""
+
+    def predict(self, state, tick, command, applied):
+        """State at the next sample, for the law's command (m) and what the pumps were told after their limits, `applied` (m) [V].
+
+        `applied` is known to the computer; dead zone, lag and delay of the pumps are not in it.
+        """
+        return state
+
+    def check(self, plant):  # noqa: B027  (an observer with nothing to check need not say so)
+        """Raise InputError if the observer does not fit this plant."""
 
 
 @component

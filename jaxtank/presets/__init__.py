@@ -2,14 +2,17 @@
 
 preset = presets.load("gouta2015")
 case = preset.cases["backstepping"]     # .loop .clock .limits
+
+A paper is a module of this folder with a function `preset`; to add one, add its file.
 """
 
 import importlib
+import pkgutil
 
 from jaxtank.errors import InputError, unknown
-from jaxtank.presets.base import Case, Free, Preset
+from jaxtank.presets.base import Case, Claim, Free, Preset, Published
 
-PAPERS = ("gouta2015",)
+PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "base" and not m.name.startswith("_")))
 
 
 def load(paper):
@@ -32,4 +35,4 @@ def find(name):
     raise unknown("case", name, names())
 
 
-__all__ = ["PAPERS", "Case", "Free", "InputError", "Preset", "find", "load", "names"]
+__all__ = ["PAPERS", "Case", "Claim", "Free", "InputError", "Preset", "Published", "find", "load", "names"]

@@ -1,7 +1,7 @@
 """What a preset and a case are made of."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxtank.loop import ClosedLoop
@@ -16,12 +16,34 @@ class Free(NamedTuple):
     scale: str = "log"
 
 
+class Published(NamedTuple):
+    """Something a paper prints: a number (or a tuple of them), or a claim in words.
+
+    tolerance: how far the measured number may be off, as a share of the printed one, and still count as reproduced; None: a number
+    that is only quoted (a gain, a limit), or a claim. reason: why the measured one differs, or why it cannot be measured.
+    """
+
+    value: Any
+    unit: str
+    where: str
+    tolerance: float | None = None
+    reason: str = ""
+
+
+class Claim(NamedTuple):
+    """What was found of a claim: whether it holds ("reproduced", "partly", "not reproduced"), and the numbers that say so."""
+
+    verdict: str
+    text: str
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
     """One rig, one law, one reference, one clock, with the gains its paper prints.
 
     limits: {measure: upper limit (number, or one per entry), or "rim" for the rim of each tank}; free: {parameter: Free}, what
-    `tune` tunes unless told otherwise; objective: {measure: weight}, what it makes small.
+    `tune` tunes unless told otherwise; objective: {measure: weight}, what it makes small; reachable: whether every plateau of the
+    reference must have a steady state within the pumps' direction (False where the paper asks for one that has none).
     """
 
     name: str
@@ -31,6 +53,7 @@ class Case:
     limits: Mapping[str, Any]
     free: Mapping[str, Free]
     objective: Mapping[str, float]
+    reachable: bool = True
 
     def replace(self, **changes):
         """A copy with the named fields changed."""
@@ -41,14 +64,17 @@ class Case:
 class Preset:
     """A paper.
 
-    published: {parameter or quantity: (value as printed, where)}; tunable: {parameter: Free}; uncertain: {parameter: (spread as a
-    fraction, why)}; departures: sentences, what differs from the paper and why.
+    published: {parameter or quantity: Published}; measured: a function of `run` that returns {quantity: number, tuple or Claim} for
+    what can be measured, where run(case name, values={}, save_every=1) gives (Case with `values` set, Trajectory as host arrays);
+    tunable: {parameter: Free}; uncertain: {parameter: (spread as a fraction, why)}; departures: sentences, what differs from the paper
+    and why.
     """
 
     paper: str
     citation: str
     cases: Mapping[str, Case]
-    published: Mapping[str, tuple]
+    published: Mapping[str, Published]
+    measured: Callable
     tunable: Mapping[str, Free]
     uncertain: Mapping[str, tuple]
     departures: tuple

@@ -9,7 +9,7 @@ from jaxtank.loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
-from jaxtank.presets.base import Case, Free, Preset
+from jaxtank.presets.base import Case, Free, Preset, Published
 from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
@@ -54,13 +54,15 @@ DEPARTURES = (
 )
 
 PUBLISHED = {
-    "controller.Tp": (11.0, "s, sec. 5.1"),
-    "controller.k": (0.03, "1/s, sec. 5.1"),
-    "controller.k1": (0.088, "1/s, sec. 5.1"),
-    "clock.dt": (0.01, "s, sec. 5"),
-    "actuator.high": (12.0, "V, eq. (9)"),
-    "plant.rim": (30.0, "cm, sec. 5"),
-    "tracking error": ("'negligible' (NGPC), 'more important' (backstepping); no numbers are printed", "sec. 5.1, 5.3, Table 2"),
+    "controller.Tp": Published(11.0, "s", "sec. 5.1"),
+    "controller.k": Published(0.03, "1/s", "sec. 5.1"),
+    "controller.k1": Published(0.088, "1/s", "sec. 5.1"),
+    "clock.dt": Published(0.01, "s", "sec. 5"),
+    "actuator.high": Published(12.0, "V", "eq. (9)"),
+    "plant.rim": Published(30.0, "cm", "sec. 5"),
+    "tracking error": Published(
+        "'negligible' (NGPC), 'more important' (backstepping)", "", "sec. 5.1, 5.3, Table 2", reason="no numbers are printed"
+    ),
 }
 
 UNCERTAIN = {
@@ -110,6 +112,11 @@ def _steady(area):
     return equilibrium(state_coupled_four_tank(area), START)
 
 
+def measured(run):
+    """What can be measured of PUBLISHED (see presets.base.Preset)."""
+    return {}
+
+
 @functools.cache
 def preset():
     """The Preset of this paper."""
@@ -141,6 +148,7 @@ def preset():
         "doi 10.1016/j.jfranklin.2015.08.004",
         cases=cases,
         published=PUBLISHED,
+        measured=measured,
         tunable=TUNABLE,
         uncertain=UNCERTAIN,
         departures=DEPARTURES,

@@ -1,0 +1,62 @@
+"""Checks at the door: a loop and a clock that cannot be run are told so before anything is compiled."""
+
+import jax
+import numpy as np
+
+from jaxtank.controllers.base import Controller
+from jaxtank.errors import InputError
+from jaxtank.records import check_clock
+from jaxtank.tree import check_leaves
+
+
+def check(loop, clock, key=None):
+    """Raise InputError for a loop or clock that cannot be run: values out of range, wrong shapes, a reference the law cannot serve.
+
+    Only concrete leaves are looked at, so that it costs nothing inside a trace.
+    """
+    check_clock(clock)
+    plant, actuator = loop.plant, loop.actuator
+    if np.shape(loop.x0)[-1:] != (plant.tanks,):
+        raise InputError(f"x0 has shape {np.shape(loop.x0)}: must be ({plant.tanks},), one level per tank")
+    if loop.reference.channels != len(plant.outputs):
+        raise InputError(f"the reference has {loop.reference.channels} channels for {len(plant.outputs)} outputs")
+    if actuator.pumps != plant.pumps:
+        raise InputError(f"the actuator has {actuator.pumps} pumps, the plant {plant.pumps}")
+    if loop.disturbance is not None and loop.disturbance.channels != plant.tanks:
+        raise InputError(
+            f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks: give one inflow per tank"
+        )
+    if actuator.saturation == "boxqp" and (plant.pumps != 2 or type(loop.controller).input_metric is Controller.input_metric):
+        raise InputError("actuator.saturation = 'boxqp': needs two pumps and a law with a cost to allocate by (its input_metric)")
+    samples = actuator.delay / clock.dt
+    if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
+        raise InputError(
+            f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of {clock.dt:g} s, at most {clock.duration:g} s"
+        )
+    check_leaves(loop)
+    _check_order(actuator, "low", "high")
+    if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
+        _check_order(actuator, "stop", "dead_zone", equal=True)
+    if actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse":
+        _check_order(actuator, "dead_zone", "pulse")
+        _check_order(actuator, "pulse", "high", equal=True)
+    if not _traced(loop.controller, loop.reference):
+        loop.controller.check(loop.reference)
+    loop.observer.check(plant)
+    if key is None and not _traced(loop.sensor.noise) and np.any(np.asarray(loop.sensor.noise) > 0):
+        raise InputError(f"sensor.noise = {np.asarray(loop.sensor.noise)} cm: give a key (or --seed), or set it to 0")
+
+
+def _traced(*trees):
+    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(trees))
+
+
+def _check_order(actuator, lower, upper, equal=False):
+    """Raise InputError unless each pump's `lower` is below its `upper` (or equal to it)."""
+    a, b = getattr(actuator, lower), getattr(actuator, upper)
+    if _traced(a, b):
+        return
+    for i, (low, high) in enumerate(zip(np.ravel(a), np.ravel(b))):
+        if not (low <= high if equal else low < high):
+            most = "at most" if equal else "below"
+            raise InputError(f"actuator.{lower}[{i}] = {low:g} V: must be {most} actuator.{upper}[{i}] = {high:g} V")

@@ -1,0 +1,77 @@
+"""The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws know them."""
+
+from jaxtank.errors import InputError
+from jaxtank.plants.hydraulics import disc
+from jaxtank.plants.network import network
+
+STATE_COUPLED_LINKS = ((2, 0), (2, 1), (3, 0), (3, 1))  # tank 3 to 1, 3 to 2, 4 to 1, 4 to 2 in the paper's count from 1
+STATE_COUPLED_FEEDS = ((2, None), (3, None))
+QUADRUPLE_LINKS = ((2, 0), (3, 1))  # tank 3 above 1, 4 above 2
+QUADRUPLE_FEEDS = ((0, 3), (1, 2))  # pump 1 to tanks 1 and 4, pump 2 to tanks 2 and 3
+COUPLED_PIPES = ((0, 1),)
+
+
+def state_coupled_four_tank(area):
+    """The state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1): pumps fill the upper tanks 3 and 4, each of which
+    pours into both lower tanks 1 and 2, whose levels are controlled.
+
+    area: cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2 (plant A, "table1"), with
+    which the paper's own gains fail; 15 sqrt(2) read as an area gives plant B, "fast", which reproduces the text (spec 0).
+    """
+    inner, outer = disc(0.38), disc(0.31)  # d31 = d42, d32 = d41 [cm], Table 1
+    return network(
+        area=[area] * 4,
+        drain=[disc(0.48), disc(0.48), 0.0, 0.0],  # d1 = d2 [cm], Table 1
+        links=STATE_COUPLED_LINKS,
+        orifice=[inner, outer, outer, inner],
+        pump_gain=7.687,  # Kp [cm^3/(s V)], Table 1 (printed cm^3/V)
+        feeds=STATE_COUPLED_FEEDS,
+        rim=30.0,  # "the maximum liquid levels of tanks are 30 cm", sec. 5
+        outputs=(0, 1),
+    )
+
+
+def quadruple_tank(*, area, outlet, pump_gain, split, rim, gravity=981.0):
+    """Johansson's quadruple tank: tank 3 pours into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4, pump 2 tanks 2 and 3 (mirakhorli eq. 2).
+
+    area, outlet: (4,) cross-sections A and outlet areas a [cm^2]; pump_gain: (2,) k [cm^3/(s V)]; split: (2,) share gamma of each
+    pump that goes to the lower tank [-]; rim: [cm].
+    """
+    a1, a2, a3, a4 = outlet
+    return network(
+        area=area,
+        drain=[a1, a2, 0.0, 0.0],
+        links=QUADRUPLE_LINKS,
+        orifice=[a3, a4],
+        pump_gain=pump_gain,
+        split=split,
+        feeds=QUADRUPLE_FEEDS,
+        gravity=gravity,
+        rim=rim,
+        outputs=(0, 1),
+    )
+
+
+def coupled_tanks(*, area, drain, pipe, pump_gain, rim, outputs, feeds, **more):
+    """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none): gouta2022, calofir, khalid.
+
+    area, drain, rim: (2,) or a number; pipe: effective area; feeds: the tank that each pump fills; more: as in `network`.
+    """
+    return network(
+        area=area,
+        drain=drain,
+        pipes=COUPLED_PIPES,
+        pipe=[pipe],
+        pump_gain=pump_gain,
+        feeds=[(tank, None) for tank in feeds],
+        rim=rim,
+        outputs=outputs,
+        **more,
+    )
+
+
+def check_topology(model, like, **wanted):
+    """Raise InputError unless the fields `wanted` of a law's model are those of the rig it inverts; `like`: that rig in words."""
+    for name, value in wanted.items():
+        if getattr(model, name, None) != value:
+            raise InputError(f"controller.model must be {like}: this law inverts it, and its {name} are not {value}")

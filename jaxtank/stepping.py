@@ -1,0 +1,203 @@
+"""One sample of the closed loop, and what it needs: the loop itself, its state, and what is known of every sample beforehand."""
+
+import functools
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.actuators import PumpBank
+from jaxtank.controllers.base import Controller
+from jaxtank.errors import InputError
+from jaxtank.observers.base import Observer
+from jaxtank.plants.base import Plant
+from jaxtank.plants.faults import Faults
+from jaxtank.records import Sample, Tick
+from jaxtank.sensors import LevelSensor
+from jaxtank.signals import Signal
+from jaxtank.tree import component, leaf
+
+
+@component
+class ClosedLoop:
+    """Everything that takes part in a run, and the levels it starts from."""
+
+    plant: Plant
+    sensor: LevelSensor
+    observer: Observer
+    controller: Controller
+    actuator: PumpBank
+    reference: Signal
+    disturbance: Signal | None = None
+    faults: Faults | None = None
+    x0: np.ndarray = leaf("cm", "(n,) levels at t = 0", low=0.0)
+
+    @property
+    def units(self):
+        """(length, pump input) of the rig."""
+        return self.plant.units
+
+
+class State(NamedTuple):
+    """What one sample hands to the next."""
+
+    k: Any  # index of the sample
+    x: tuple  # levels [cm]
+    observer: Any
+    controller: Any
+    actuator: Any
+
+
+class Inputs(NamedTuple):
+    """What is known of every sample before the loop starts: arrays (samples,)."""
+
+    r: tuple
+    dr: tuple
+    ddr: tuple
+    d: tuple | None
+    xi: tuple | None
+    window: tuple | None
+    since: Any  # time since the last pour [s], or None
+    plan: Any  # what the law has prepared
+    fault: tuple | None  # 1 while a fault lasts
+
+
+def inputs(loop, clock, names, key):
+    """The samples of references, disturbances, noise and windows."""
+    r, dr, ddr = loop.reference.sample(clock)
+    d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
+    window = None
+    if ms.wants_windows(names):
+        if not hasattr(loop.reference, "windows"):
+            raise InputError("overshoot, rise and settling need a reference that changes (signals.Ramps)")
+        window = loop.reference.windows(clock)
+    since = None
+    if ms.wants_pours(names):
+        if not hasattr(loop.disturbance, "since"):
+            raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
+        since = loop.disturbance.since(clock)
+    return Inputs(
+        r=r,
+        dr=dr,
+        ddr=ddr,
+        d=d,
+        xi=loop.sensor.draw(key, clock.samples),
+        window=window,
+        since=since,
+        plan=loop.controller.prepare(r, dr, ddr),
+        fault=None if loop.faults is None else loop.faults.sample(clock),
+    )
+
+
+def initial(loop, clock):
+    """The state before the first sample."""
+    zero = zero_of(loop)
+
+    def typed(tree):
+        return jax.tree.map(lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, tree)
+
+    x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks))
+    u0 = tuple(loop.actuator.initial[i] + zero for i in range(loop.plant.pumps))
+    return State(
+        k=jnp.int32(0),
+        x=x0,
+        observer=typed(loop.observer.init(x0)),
+        controller=typed(loop.controller.init(x0, u0)),
+        actuator=typed(loop.actuator.init(clock)),
+    )
+
+
+def step(loop, clock, state, now):
+    """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
+    t = state.k.astype(state.x[0].dtype) * clock.dt
+    tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan)
+    y = loop.sensor.read(state.x, now.xi)
+    estimate, observer = loop.observer.step(state.observer, tick, y)
+    command, controller = loop.controller.step(state.controller, tick, estimate)
+    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    applied = loop.actuator.limit(command, metric)
+    observer = loop.observer.predict(observer, tick, command, applied)
+    controller = loop.controller.track(controller, tick, command, applied)
+    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
+    plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
+    x, spilled = _advance(plant, clock, t, state.x, u, now.d)
+    e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
+    sample = Sample(
+        t=t,
+        x=state.x,
+        y=y,
+        x_hat=estimate.x,
+        d_hat=estimate.d or (jnp.zeros_like(state.x[0]),) * loop.plant.tanks,
+        r=now.r,
+        e=e,
+        command=command,
+        u=u,
+        spilled=spilled,
+    )
+    return State(state.k + 1, x, observer, controller, actuator), sample
+
+
+def _advance(plant, clock, t, x, u, d):
+    """Levels after dt with u and d held, and the volume lost over each rim on the way [cm^3]."""
+    h = clock.dt / clock.substeps
+    spilled = None
+    for j in range(clock.substeps):
+        x, lost = plant.spill(integrate(plant, clock.integrator, t + j * h, x, u, d, h))
+        spilled = lost if spilled is None else tuple(a + b for a, b in zip(spilled, lost))
+    return x, spilled
+
+
+def integrate(plant, integrator, t, x, u, d, h):
+    """Levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d held."""
+
+    def along(k, by):
+        return tuple(a + by * b for a, b in zip(x, k))
+
+    k1 = plant.derivative(t, x, u, d)
+    k2 = plant.derivative(t + 0.5 * h, along(k1, 0.5 * h), u, d)
+    if integrator == "midpoint":
+        return along(k2, h)
+    k3 = plant.derivative(t + 0.5 * h, along(k2, 0.5 * h), u, d)
+    k4 = plant.derivative(t + h, along(k3, h), u, d)
+    # k4 is ready last, so it is added last
+    return tuple((a + (h / 6.0) * (p + 2.0 * (q + r))) + (h / 6.0) * s for a, p, q, r, s in zip(x, k1, k2, k3, k4))
+
+
+def run_of(loop, clock):
+    """Sizes and constants of a run, for its measures."""
+    return ms.Run(
+        tanks=loop.plant.tanks,
+        outputs=len(loop.plant.outputs),
+        pumps=loop.plant.pumps,
+        samples=clock.samples,
+        dt=clock.dt,
+        low=tuple(loop.actuator.low[i] for i in range(loop.plant.pumps)),
+        high=tuple(loop.actuator.high[i] for i in range(loop.plant.pumps)),
+        rim=tuple(loop.plant.rim[i] for i in range(loop.plant.tanks)),
+        zero=zero_of(loop),
+    )
+
+
+def zero_of(loop):
+    """0.0 of the type in which the run is done: what x0 becomes inside jax. float32 is named, for it would be wrong here."""
+    dtype = jnp.result_type(loop.x0, jnp.float32 if jnp.result_type(loop.x0) == jnp.float32 else float)
+    if dtype == jnp.float32:
+        _warn_float32()
+    return jnp.zeros((), dtype)
+
+
+@functools.cache
+def _warn_float32():
+    warnings.warn(
+        "this run is in float32: at dt = 0.01 s a level is then wrong by about 5e-3 cm, because a step changes it by less than float32 "
+        "resolves. Call jax.config.update('jax_enable_x64', True) first for float64.",
+        stacklevel=6,
+    )
+
+
+def is_broken(state):
+    """True if the run left the numbers: a level that is not finite stays so, so the last state tells and the loop need not look."""
+    return ~jnp.isfinite(sum(state.x))
