@@ -59,6 +59,7 @@ class Tick(NamedTuple):
     ddr: tuple  # its second derivative r'' [cm/s^2]
     dt: float = 0.0  # sampling period Ts [s]
     plan: Any = ()  # what the law prepared for this sample before the loop started
+    own: Any = ()  # this sample of the signals that are the law's own (`Controller.inputs`)
 
 
 class Estimate(NamedTuple):

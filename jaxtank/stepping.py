@@ -62,6 +62,7 @@ class Inputs(NamedTuple):
     window: tuple | None
     since: Any  # time since the last pour [s], or None
     plan: Any  # what the law has prepared
+    own: Any  # signals of the law's own
     fault: tuple | None  # 1 while a fault lasts
 
 
@@ -88,6 +89,7 @@ def inputs(loop, clock, names, key):
         window=window,
         since=since,
         plan=loop.controller.prepare(r, dr, ddr),
+        own=loop.controller.inputs(clock),
         fault=None if loop.faults is None else loop.faults.sample(clock),
     )
 
@@ -113,7 +115,7 @@ def initial(loop, clock):
 def step(loop, clock, state, now):
     """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
     t = state.k.astype(state.x[0].dtype) * clock.dt
-    tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan)
+    tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y = loop.sensor.read(state.x, now.xi)
     estimate, observer = loop.observer.step(state.observer, tick, y)
     command, controller = loop.controller.step(state.controller, tick, estimate)

@@ -76,6 +76,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             window=None,
             since=None,
             plan=jax.tree.map(lambda a: a[0], plan),
+            own=jax.tree.map(lambda a: a[0], here.controller.inputs(clock)),
             fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),
         )
 

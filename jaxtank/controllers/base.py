@@ -11,6 +11,11 @@ class Controller(abc.ABC):
         as `tick.plan`. r, dr, ddr: tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2]."""
         return ()
 
+    def inputs(self, clock):
+        """Signals of the law's own, sampled on `clock` before the loop starts: any tree of arrays (samples,), given back at each
+        sample as `tick.own`. For a law that plays something back (`OpenLoop`)."""
+        return ()
+
     def init(self, x0, u0):
         """State before the first sample, for levels x0 (n) [cm] and pumps that ran at u0 (m) [V] until t = 0."""
         return ()
