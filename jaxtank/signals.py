@@ -154,6 +154,35 @@ class Sine(Signal):
 
 
 @component
+class Table(Signal):
+    """Recorded samples, one every `period` from t = 0 on: an input or an inflow that was logged.
+
+    Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them ("linear"); after the last, the last.
+    """
+
+    values: np.ndarray = leaf("-", "(channels, samples) the record, in the unit of what it stands for")
+    period: float = static("s", "time between samples", low=0.0, strict=True)
+    between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
+
+    @property
+    def channels(self):
+        return np.shape(self.values)[0]
+
+    def sample(self, clock):
+        last = np.shape(self.values)[1] - 1
+        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 * 0.1 s sample 3
+        at = np.arange(clock.samples) * (clock.dt / self.period)
+        index = np.minimum(np.floor(at + 5e-7), last).astype(int)
+        after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
+        table, still = jnp.asarray(self.values), jnp.zeros(clock.samples)
+        here = table[:, index]
+        if self.between == "hold":
+            return tuple(here), (still,) * self.channels, (still,) * self.channels
+        slope = table[:, after] - here
+        return tuple(here + slope * past), tuple(slope / self.period), (still,) * self.channels
+
+
+@component
 class Sum(Signal):
     """Two signals added, channel by channel."""
 

@@ -1,0 +1,21 @@
+"""No feedback: inputs played back."""
+
+from jaxtank.controllers.base import Controller
+from jaxtank.signals import Signal
+from jaxtank.tree import component
+
+
+@component
+class OpenLoop(Controller):
+    """u(t_k) = s(t_k): the inputs are those of a signal, whatever the levels do (a recorded experiment, a constant flow).
+
+    signal: one channel per pump, in the unit of the pumps' input; the signal's units are read as the input's.
+    """
+
+    signal: Signal
+
+    def inputs(self, clock):
+        return self.signal.sample(clock)[0]
+
+    def step(self, state, tick, estimate):
+        return tick.own, state

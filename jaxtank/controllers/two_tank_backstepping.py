@@ -1,0 +1,65 @@
+"""Backstepping of two coupled tanks (calofir), in physical units."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.controllers.base import Controller
+from jaxtank.errors import InputError
+from jaxtank.numerics import floored_root
+from jaxtank.plants.base import Plant
+from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
+from jaxtank.tree import component, leaf
+
+
+@component
+class TwoTankBackstepping(Controller):
+    """Backstepping law of calofir, eqs. (16)-(21) with the errata of spec A.9, for a pumped tank that drains through a second one.
+
+    With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r = kappa h1r (spec A.4, where the
+    paper's z0 and Q0 cancel):
+
+        Phi = (b s - K_phi e)/a,   Y = Z - Phi,   a = c1/A, b = c2/A
+        Q = 2 A Z [ a - b s/(2 Z) + ((b/(2 s) - K_phi)/a) (a Z - b s) - a e - K_y Y ]
+
+    Without limits the loop is e' = -K_phi e + a Y, Y' = -a e - K_y Y. It is a feedback linearisation of h3, of which only
+    K_phi + K_y and K_phi K_y + a^2 matter: the two gains may be exchanged. a^2 carries a length, so the same gains are another law
+    where levels count in other units. The output h1 follows h3; there is no integral action. Units in this class are the rig's (m, m^3/s).
+    """
+
+    model: Plant
+    K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
+    K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
+    level_floor: float = leaf("cm", "level h3 below which the law takes the second tank to hold this much", low=0.0, strict=True)
+    difference_floor: float = leaf("cm", "least h1 - h3 that the law reckons with", low=0.0, strict=True)
+
+    def coefficients(self):
+        """(a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3 = a in the paper, whose tanks are equal."""
+        w = jnp.sqrt(2.0 * self.model.gravity)
+        A1, A3 = self.model.area[0], self.model.area[1]
+        return self.model.pipe[0] * w / A1, self.model.pipe[0] * w / A3, self.model.drain[1] * w / A3
+
+    def prepare(self, r, dr, ddr):
+        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (spec A.2) [cm, cm^3/s]."""
+        c1, c2 = self.model.pipe[0], self.model.drain[1]
+        h3r = c1**2 / (c1**2 + c2**2) * r[0]  # kappa h1r
+        return h3r, c1 * jnp.sqrt(2.0 * self.model.gravity) * jnp.sqrt(r[0] - h3r)
+
+    def step(self, state, tick, estimate):
+        a1, a, b = self.coefficients()
+        h1, h3 = estimate.x
+        e = h3 - tick.plan[0]
+        s, Z = floored_root(h3, self.level_floor), floored_root(h1 - h3, self.difference_floor)
+        Y = Z - (b * s - self.K_phi * e) / a
+        inner = ((b / (2.0 * s) - self.K_phi) / a) * (a * Z - b * s) - a * e - self.K_y * Y
+        flow = self.model.area[0] * (2.0 * Z * (0.5 * (a1 + a) + inner) - b * s)
+        return (flow / self.model.pump_gain[0],), state
+
+    def check(self, reference):
+        check_topology(self.model, "two coupled tanks", pipes=COUPLED_PIPES, feeds=((0, None),), links=(), outputs=(0,))
+        if float(self.model.drain[0]) != 0.0:
+            raise InputError(
+                f"controller.model.drain[0] = {float(self.model.drain[0]):g}: this law takes the first tank to drain only into the second"
+            )
+        for field in ("initial", "targets", "level"):
+            if np.any(np.asarray(getattr(reference, field, 1.0), dtype=float) <= 0.0):
+                raise InputError(f"reference.{field}: must be above 0 (the law takes its square root)")

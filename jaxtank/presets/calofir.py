@@ -1,0 +1,171 @@
+"""Calofir and others: two coupled tanks in metres, backstepping. Labels as in the specification's part A."""
+
+import functools
+
+import numpy as np
+
+from jaxtank.actuators import PumpBank
+from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
+from jaxtank.loop import ClosedLoop
+from jaxtank.observers import Direct
+from jaxtank.plants.faults import faults
+from jaxtank.plants.rigs import coupled_tanks
+from jaxtank.presets.base import Case, Claim, Free, Preset, Published
+from jaxtank.records import Clock
+from jaxtank.sensors import LevelSensor
+from jaxtank.signals import ramps
+from jaxtank.tree import number
+
+A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
+Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]
+GRAVITY = 9.81  # not printed; only c = (effective area) sqrt(2 g) matters [m/s^2]
+KAPPA = C1**2 / (C1**2 + C2**2)  # h3/h1 at rest (spec A.2)
+SPEED = (2 * GRAVITY) ** 0.5
+START = 0.05  # h1 at t = 0 [m] (spec A.6)
+
+TUNABLE = {"controller.K_phi": Free(1e-3, 1.0), "controller.K_y": Free(1e-3, 1.0)}
+
+DEPARTURES = (
+    "Equations: the errata of the paper are mended (spec A.9): signs of (12a), (14) and of the first term of f_a in (16); d phi/d z in "
+    "(4); (20) is v, not phi; in (21) a/z0 for z/z0, and the denominators of v_i and v_ii. As printed, the law does not rest at the "
+    "reference.",
+    "The law is computed in physical units (spec A.4): z0 and Q0 cancel exactly, as long as z0 is one number.",
+    "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is below b/(2 sqrt(h3r)) + a/(2 z3r) (spec A.5).",
+    "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05, 0.05 kappa) m (spec A.6).",
+    "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for 900-1050 s; the paper does not say what "
+    "its faults were (spec A.6).",
+    "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it never starts from empty tanks (spec A.10).",
+    "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81 m/s^2.",
+    "Rims are physics: levels stop at 0.6 m and at 0 m.",
+)
+
+PUBLISHED = {
+    "plant.area": Published(A, "m^2", "sec. 3.1"),
+    "c1": Published(C1, "m^2.5/s", "sec. 3.2", 1e-9),
+    "c2": Published(C2, "m^2.5/s", "sec. 3.2", 1e-9),
+    "actuator.high": Published(Q0, "m^3/s", "sec. 3.1"),
+    "plant.rim": Published(H0, "m", "sec. 3.1"),
+    "clock.dt": Published(1.0, "s", "sec. 4"),
+    "setpoints, share of h0": Published((0.8, 0.5), "-", "sec. 4", 1e-9),
+    "steady state follows very accurately": Published("level of the first tank, without perturbation", "", "sec. 4, Fig. 2"),
+    "reacts rapidly to faults": Published("in the direction to counteract them", "", "sec. 4, Fig. 3"),
+    "some steady state errors": Published(
+        "due to unmodelled dynamics", "", "sec. 5", reason="no integral action, and h3 rather than h1 is regulated"
+    ),
+    "same performance in any operating point": Published("whatever the level", "", "sec. 5", reason="the pump's limits"),
+    "globally asymptotically stabilises": Published(
+        "Proposition 2.1", "", "sec. 2", reason="needs h3 > 0, h1 > h3 and a pump without limits"
+    ),
+}
+
+
+def rig():
+    """The paper's tanks T1, T3 in m and m^3/s: T1 is pumped and its level is the output; T3 drains to the basin."""
+    return coupled_tanks(
+        area=A,
+        drain=[0.0, C2 / SPEED],
+        pipe=C1 / SPEED,
+        pump_gain=1.0,
+        rim=H0,
+        outputs=(0,),
+        feeds=(0,),
+        gravity=GRAVITY,
+        overflow=True,
+        bottom=True,
+        units=("m", "m^3/s"),
+        knee=1e-4,
+    )
+
+
+def build(perturbed=False):
+    """The closed loop, with the faults of spec A.6 if `perturbed`."""
+    plant = rig()
+    events = [("drain[1]", 300, 450, 0.75, 0.0), ("drain[0]", 900, 1050, 1.0, 0.2 * C1 / SPEED)]
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(
+            gain=number([0.06, 0.06]), noise=number([0.0, 0.0]), full_scale=number(10.0)
+        ),  # 10 V at 0.6 m; not printed
+        observer=Direct(),
+        controller=TwoTankBackstepping(
+            model=plant, K_phi=number(0.02), K_y=number(0.1), level_floor=number(1e-4), difference_floor=number(1e-4)
+        ),
+        actuator=PumpBank(low=number([0.0]), high=number([Q0]), stop=number([0.0]), pulse=number([Q0]), initial=number([0.0])),
+        reference=ramps([START], [(0.0, 0, 0.8 * H0), (600.0, 0, 0.5 * H0)], ramp=0.0, band=0.02),
+        faults=faults(plant, events) if perturbed else None,
+        x0=number([START, START * KAPPA]),
+    )
+
+
+def measured(run):
+    """What can be measured of PUBLISHED (see presets.base.Preset)."""
+    case, plain = run("backstepping")
+    _, hurt = run("backstepping-perturbed")
+    plant, e = case.loop.plant, plain.e[:, 0]
+    w = float(np.sqrt(2 * plant.gravity))
+    rest = (e[599], e[1199])
+    settled = [int(np.nonzero(np.abs(part) > 0.02 * step)[0][-1]) + 1 for part, step in ((e[:600], 0.43), (e[600:], 0.18))]
+    slow = run("backstepping", {"controller.K_phi": 0.01, "controller.K_y": 0.01})[1].e[:, 0]
+    _, free = run("backstepping", {"actuator.low": -1.0, "actuator.high": 1.0})
+    held = np.mean((plain.command <= 0.0) | (plain.command >= Q0))
+    dry = run("backstepping", {"x0": [0.0, 0.0], "controller.difference_floor": 1e-12})[1]
+    return {
+        "c1": float(plant.pipe[0]) * w,
+        "c2": float(plant.drain[1]) * w,
+        "setpoints, share of h0": (plain.r[0, 0] / H0, plain.r[-1, 0] / H0),
+        "steady state follows very accurately": Claim(
+            "reproduced",
+            f"error {rest[0]:.1e} m at 599 s and {rest[1]:.1e} m at 1199 s; inside 2 % after {settled[0]} and {settled[1]} s",
+        ),
+        "reacts rapidly to faults": Claim(
+            "reproduced",
+            f"with the outlet partly closed the error stays at {hurt.e[449, 0]:.5f} m, with the leak at {hurt.e[1049, 0]:.5f} m "
+            "(a constant flow: -0.0395 and -0.0490 m, spec A.6)",
+        ),
+        "some steady state errors": Claim(
+            "reproduced", f"{hurt.e[1049, 0]:.5f} m at the end of the leak: there is no integral action"
+        ),
+        "same performance in any operating point": Claim(
+            "partly",
+            f"without limits the error decays in the same way everywhere (peak flow {free.command.max():.1e} m^3/s); within them "
+            f"{100 * held:.0f} % of the samples are saturated and the steps settle in {settled[0]} and {settled[1]} s "
+            f"(at K_phi = K_y = 0.01 1/s, unsaturated: RMS {np.sqrt(np.mean(slow**2)):.4f} m)",
+        ),
+        "globally asymptotically stabilises": Claim(
+            "not reproduced",
+            f"from empty tanks the law without a floor under h1 - h3 never starts: h1 stays below {dry.x[:, 0].max():.0e} m",
+        ),
+    }
+
+
+@functools.cache
+def preset():
+    """The Preset of this paper."""
+    words = {"backstepping": "backstepping", "backstepping-perturbed": "backstepping; outlet partly closed, then a leak"}
+    cases = {
+        name: Case(
+            name=f"calofir/{name}",
+            title=f"two coupled tanks, {title}",
+            loop=build(name.endswith("perturbed")),
+            clock=Clock(dt=1.0, duration=1199.0, substeps=4),
+            limits={"max_level": "rim"},
+            free=TUNABLE,
+            objective={"rms_error_total": 1.0},
+        )
+        for name, title in words.items()
+    }
+    return Preset(
+        paper="calofir",
+        citation="V. Calofir, V. Tanasa, I. Fagarasan, I. Stamatescu, N. Arghira, G. Stamatescu, A backstepping control method for a "
+        "nonlinear process - two coupled-tanks",
+        cases=cases,
+        published=PUBLISHED,
+        measured=measured,
+        tunable=TUNABLE,
+        uncertain={
+            "plant.pipe": (0.05, "c1: 'experimentally determined' (sec. 3.2), no interval printed"),
+            "plant.drain": (0.05, "c2: likewise"),
+            "plant.pump_gain": (0.05, "the pump's calibration is not printed"),
+        },
+        departures=DEPARTURES,
+    )
