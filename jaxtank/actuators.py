@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.numerics import clip
+from jaxtank.numerics import at_least, clip
 from jaxtank.tree import component, leaf, static
 
 SATURATIONS = ("clip", "boxqp")
-DEAD_ZONES = ("plain", "hysteresis", "pulse")
+DEAD_ZONES = ("plain", "offset", "hysteresis", "pulse")
 
 
 class ActuatorState(NamedTuple):
@@ -29,7 +29,8 @@ class PumpBank:
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
        best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
-    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "hysteresis": a pump that turns stops
+    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset": the flow grows from zero at the dead
+       zone, as that of u - dead_zone (gouta2022, spec 1.2). "hysteresis": a pump that turns stops
        below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
        volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
     3. Lag, if given: first order with time constant `lag` [s], exact over a sample.  4. Transport delay: `delay` [s], whole samples.
@@ -111,6 +112,8 @@ class PumpBank:
                 owed.append(jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt)))
                 paid.append(v + jax.lax.stop_gradient(pay - v))
             return tuple(paid), state._replace(owed=tuple(owed))
+        if self.dead_zone_kind == "offset":
+            return tuple(at_least(v - self.dead_zone[i], 0.0) for i, v in enumerate(u)), state
         return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
 
 

@@ -80,6 +80,7 @@ class Sample(NamedTuple):
     r: tuple  # setpoint, one per output [cm]
     e: tuple  # tracking error of the true output, x - r, one per output [cm]
     command: tuple  # what the law asked for, one per pump [V]
+    applied: tuple  # the command within the pumps' limits, one per pump [V]
     u: tuple  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
     spilled: tuple  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
 
@@ -95,5 +96,6 @@ class Trajectory(NamedTuple):
     r: Any  # (rows, outputs) [cm]
     e: Any  # (rows, outputs) [cm]
     command: Any  # (rows, pumps) [V]
+    applied: Any  # (rows, pumps) [V]
     u: Any  # (rows, pumps) [V]
     spilled: Any  # (rows, tanks) volume lost over the rim since the start [cm^3]

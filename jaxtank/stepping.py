@@ -136,6 +136,7 @@ def step(loop, clock, state, now):
         r=now.r,
         e=e,
         command=command,
+        applied=applied,
         u=u,
         spilled=spilled,
     )

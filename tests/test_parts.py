@@ -253,6 +253,7 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
             r=(rk,),
             e=(jnp.float64(h - rk),),
             command=(uk if command is None else command[k],),
+            applied=(jnp.float64(uk),),
             u=(jnp.float64(uk),),
             spilled=(0.0,),
         )

@@ -1,5 +1,6 @@
 """Observers: what the law believes the levels are."""
 
 from jaxtank.observers.base import Direct, Observer
+from jaxtank.observers.disturbance import DisturbanceObserver
 
-__all__ = ["Direct", "Observer"]
+__all__ = ["DisturbanceObserver", "Direct", "Observer"]

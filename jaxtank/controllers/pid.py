@@ -1,0 +1,105 @@
+"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (the rivals of gouta2022, Table 4; spec 6)."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.controllers.base import Controller
+from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.errors import InputError
+from jaxtank.plants.base import Plant
+from jaxtank.tree import component, leaf, static
+
+FILTER = 8.0  # the derivative's filter has the time constant Td/8
+LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections
+
+
+class Memory(NamedTuple):
+    """What each loop keeps: tuples with one entry per pump."""
+
+    integral: tuple  # integral action I [V]
+    slow: tuple  # filtered level [cm], empty without derivative action
+    sections: tuple  # states of the fractional filter, a tuple per loop, empty without
+    error: tuple  # r - y of this sample [cm]
+
+
+def oustaloup(g):
+    """(direct gain, poles (2N+1), residues (2N+1)) of s^g on [1e-3, 1e2] rad/s: s^g ~ direct + sum residue/(s + pole).
+
+    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g (Oustaloup 2000; spec 6). g [-].
+    """
+    j = np.arange(2 * SECTIONS + 1)
+    at = lambda shift: LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))
+    zeros, poles, gain = at(-g), at(g), HIGHEST**g
+    apart = jnp.where(np.eye(j.size, dtype=bool), 1.0, poles[None, :] - poles[:, None])
+    return gain, poles, gain * jnp.prod(zeros[None, :] - poles[:, None], axis=1) / jnp.prod(apart, axis=1)
+
+
+@component
+class PID(Controller):
+    """One PI(D) loop per pump, output i to pump i:
+
+        v = base + Kc (r - y) + I - Kc Td y'_f,    I' = Kc/Ti^order D^(1-order) [(r - y) + Ti (u - v)/(Tt Kc)]
+
+    with u what the limits leave of v (back-calculation, tracking time Tt), and the derivative of the measurement behind a lag of Td/8. Without
+    Td there is no derivative; without `order` the integral is an ordinary one, with it s^-order = (1/s) s^(1-order), where the second factor is
+    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the voltage that the model needs on the reference,
+    (r' - f(r))/c2.
+    """
+
+    model: Plant
+    Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc", low=0.0, strict=True)
+    Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
+    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc")
+    order: np.ndarray | None = leaf("-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc")
+    Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
+    bias: np.ndarray = leaf("V", "(m,) voltage added where there is no feed-forward")
+    feed_forward: bool = static("-", "add the model's voltage on the reference", choices=(False, True), default=False)
+
+    def prepare(self, r, dr, ddr):
+        if not self.feed_forward:
+            return ()
+        return tuple((rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model)))
+
+    def init(self, x0, u0):
+        zero, loops = 0.0 * u0[0], range(len(u0))
+        return Memory(
+            integral=(zero,) * len(u0),
+            slow=() if self.Td is None else tuple(x0[i] for i in self.model.outputs),
+            sections=() if self.order is None else tuple((zero,) * (2 * SECTIONS + 1) for _ in loops),
+            error=(zero,) * len(u0),
+        )
+
+    def step(self, state, tick, estimate):
+        base = tick.plan if self.feed_forward else tuple(self.bias[i] for i in range(len(tick.r)))
+        y = tuple(estimate.x[i] for i in self.model.outputs)
+        e = tuple(r - level for r, level in zip(tick.r, y))
+        v = tuple(base[i] + self.Kc[i] * e[i] + state.integral[i] for i in range(len(e)))
+        slow = state.slow
+        if self.Td is not None:
+            # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the sample
+            v = tuple(v[i] - (FILTER * self.Kc[i]) * (y[i] - slow[i]) for i in range(len(v)))
+            slow = tuple(slow[i] + (1.0 - jnp.exp(-tick.dt * FILTER / self.Td[i])) * (y[i] - slow[i]) for i in range(len(v)))
+        return v, state._replace(slow=slow, error=e)
+
+    def track(self, state, tick, command, applied):
+        loops, integral, sections = range(len(command)), [], []
+        for i in loops:
+            w = state.error[i] + (self.Ti[i] / (self.Tt[i] * self.Kc[i])) * (applied[i] - command[i])
+            if self.order is None:
+                integral.append(state.integral[i] + (tick.dt * self.Kc[i] / self.Ti[i]) * w)
+                continue
+            gain, poles, residues = oustaloup(1.0 - self.order[i])
+            keep = jnp.exp(-poles * tick.dt)
+            enter = residues * (1.0 - keep) / poles
+            rate = gain * w + sum(state.sections[i])
+            integral.append(state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -self.order[i] * rate)
+            sections.append(tuple(keep[j] * s + enter[j] * w for j, s in enumerate(state.sections[i])))
+        return state._replace(integral=tuple(integral), sections=tuple(sections))
+
+    def check(self, reference):
+        if len(self.model.outputs) != self.model.pumps:
+            raise InputError(f"PID needs one pump per output: the model has {self.model.pumps} and {len(self.model.outputs)}")
+        if self.feed_forward:
+            check_own_pumps(self.model)

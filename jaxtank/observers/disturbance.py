@@ -1,0 +1,51 @@
+"""The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25)."""
+
+from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.errors import InputError
+from jaxtank.observers.base import Observer
+from jaxtank.plants.base import Plant
+from jaxtank.records import Estimate
+from jaxtank.tree import component, leaf, static
+
+FED = ("applied", "command")
+
+
+@component
+class DisturbanceObserver(Observer):
+    """Estimates what moves each level besides the model, one number per tank:
+
+        d^ = z + l h,   z' = -l z - l (l h + f(h) + c2 u)      (gouta2022 eqs. 23-24), so that d^' = l (d - d^)
+
+    by forward Euler, carried as d^ and the level that the model expects next (the same numbers as with z, and good in float32):
+    d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are measured; x_hat = y.
+
+    u is what the pumps were told after their limits: with `fed` = "command", the unlimited command, the observer winds up while a pump
+    is saturated (spec 3.3). `before_compensation` feeds it the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23)
+    prints it: the loop is then that of a single compensation with 2 l, and d^ reads half the disturbance.
+    """
+
+    model: Plant
+    l: object = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
+    fed: str = static("-", "input that the observer is told", choices=FED, default="applied")
+    before_compensation: bool = static("-", "as printed: told the input before eq. (28)", choices=(False, True), default=False)
+
+    def init(self, x0):
+        return tuple(0.0 * h for h in x0), x0
+
+    def step(self, state, tick, y):
+        held, expected = state
+        d = tuple(held[i] + self.l[i] * (y[i] - expected[i]) for i in range(len(y)))
+        return Estimate(x=y, d=d), (d, y)
+
+    def predict(self, state, tick, command, applied):
+        d, y = state
+        f, c2 = drift(self.model, y), authority(self.model)
+        u = applied if self.fed == "applied" else command
+        rate = tuple(f[i] + c2[i] * u[i] + (d[i] if self.before_compensation else 0.0) for i in range(len(y)))
+        held = tuple((1.0 - self.l[i] * tick.dt) * d[i] for i in range(len(y)))
+        return held, tuple(y[i] + tick.dt * rate[i] for i in range(len(y)))
+
+    def check(self, plant):
+        check_own_pumps(self.model)
+        if self.model.tanks != plant.tanks:
+            raise InputError(f"observer.model has {self.model.tanks} tanks, the plant {plant.tanks}")
