@@ -1,0 +1,43 @@
+"""Generalized predictive control of a linear model (khalid, section III)."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.controllers.incremental import MODES, LinearPredictive
+from jaxtank.errors import InputError
+from jaxtank.plants.network import TankNetwork
+from jaxtank.tree import component, leaf, static
+
+
+@component
+class GPC(LinearPredictive):
+    """The next Nc increments of every pump are free, and later ones are zero.
+
+        Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)   (khalid eqs. 21-22, spec B.5)
+
+    The first of them is applied. Modes and constraints as in `LinearPredictive`; with "constrained" they are imposed on the Nc samples.
+    """
+
+    model: TankNetwork
+    operating_point: np.ndarray = leaf("cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True)
+    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
+    q: np.ndarray = leaf("-", "(outputs,) weight of each output (Qy)", low=0.0)
+    du_limit: np.ndarray = leaf("V", "(m,) largest change of each input in a sample", low=0.0, strict=True)
+    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
+    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
+    Nc: int = static("-", "control horizon (Nc)", low=1, high=100, default=10)
+    Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
+    mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
+
+    @property
+    def ahead(self):
+        return self.Nc
+
+    def basis(self):
+        pumps = self.model.pumps
+        return jnp.eye(self.Np * pumps)[:, : self.Nc * pumps].reshape(self.Np, pumps, self.Nc * pumps)
+
+    def check(self, reference):
+        super().check(reference)
+        if self.Nc > self.Np:
+            raise InputError(f"controller.Nc = {self.Nc}: must be at most controller.Np = {self.Np}")

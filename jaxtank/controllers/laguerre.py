@@ -1,0 +1,71 @@
+"""Linear predictive control whose increments are sums of Laguerre functions (khalid, section IV)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.controllers.incremental import MODES, LinearPredictive
+from jaxtank.errors import InputError
+from jaxtank.plants.network import TankNetwork
+from jaxtank.tree import component, leaf, static
+
+
+def laguerre_functions(a, N, samples):
+    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, spec B.6).
+
+        L(0) = sqrt(1 - a^2) [1, -a, a^2, ...]',   L(k+1) = A_l L(k)
+
+    A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. a: pole, 0 <= a < 1 [-]. With a = 0 they are unit
+    pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a) [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (spec B.13).
+    """
+    beta = 1.0 - a * a
+    power = [jnp.ones_like(a)]  # products, not powers: 0^0 has no slope
+    for _ in range(N):
+        power.append(-a * power[-1])
+    entry = lambda i, j: a if i == j else beta * power[i - j - 1] if i > j else jnp.zeros_like(a)
+    step = jnp.stack([jnp.stack([entry(i, j) for j in range(N)]) for i in range(N)])
+    first = jnp.sqrt(beta) * jnp.stack(power[:N])
+    return jax.lax.scan(lambda now, _: (step @ now, now), first, None, length=samples)[1]
+
+
+@component
+class Laguerre(LinearPredictive):
+    """The increments of pump i over the horizon are N Laguerre functions, du_i(k+m) = L_i(m)' eta_i (khalid eqs. 26-31, spec B.6).
+
+        J = eta' Omega eta + 2 eta' Psi x_e,   eta = -Omega^-1 Psi x_e,   du_i(k) = L_i(0)' eta_i
+
+    N numbers per pump do what takes GPC ten or more. With a = 0 it is GPC with Nc = N. Modes and constraints as in `LinearPredictive`;
+    with "constrained" they are imposed on the next `rows` samples: 5 are enough, 15 those of the spec's tables (B.7).
+    """
+
+    model: TankNetwork
+    operating_point: np.ndarray = leaf("cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True)
+    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
+    a: np.ndarray = leaf("-", "(m,) pole of each pump's Laguerre functions (a)", low=0.0, high=0.999)
+    q: np.ndarray = leaf("-", "(outputs,) weight of each output (Qy)", low=0.0)
+    du_limit: np.ndarray = leaf("V", "(m,) largest change of each input in a sample", low=0.0, strict=True)
+    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
+    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
+    N: int = static("-", "Laguerre functions per pump (N)", low=1, high=30, default=4)
+    Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
+    rows: int = static("-", "samples ahead on which constraints are imposed (Ncon)", low=1, high=1000, default=15)
+    mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
+
+    @property
+    def ahead(self):
+        return self.rows
+
+    def basis(self):
+        pumps = self.model.pumps
+        blocks = []
+        for i in range(pumps):
+            functions = laguerre_functions(self.a[i] + jnp.zeros(()), self.N, self.Np)
+            blocks.append(jnp.zeros((self.Np, pumps, self.N)).at[:, i].set(functions))
+        return jnp.concatenate(blocks, axis=2)
+
+    def check(self, reference):
+        super().check(reference)
+        if np.shape(self.a) != (self.model.pumps,):
+            raise InputError(f"controller.a has shape {np.shape(self.a)}: must be ({self.model.pumps},), one pole per pump")
+        if self.rows > self.Np:
+            raise InputError(f"controller.rows = {self.rows}: must be at most controller.Np = {self.Np}")
