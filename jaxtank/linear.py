@@ -65,8 +65,9 @@ def _riccati_by_sign(A, B, Q, R):
     # the stable subspace [I; P] is the null space of sign + I
     left = jnp.concatenate([S[:n, n:], S[n:, n:] + jnp.eye(n)])
     right = -jnp.concatenate([S[:n, :n] + jnp.eye(n), S[n:, :n]])
-    P = _symmetric(jnp.linalg.lstsq(left, right)[0])
-    K = jnp.linalg.solve(R, B.T @ P)  # one step for accuracy, so that the derivatives are taken at the solution
+    P = _symmetric(jnp.linalg.solve(left.T @ left, left.T @ right))
+    # the normal equations square the condition number, and one Newton step mends it: the derivatives are taken at the solution
+    K = jnp.linalg.solve(R, B.T @ P)
     return _symmetric(lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
 
