@@ -3,9 +3,29 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import linalg
 from scipy.optimize import least_squares
 
 from jaxtank.errors import EquilibriumError, InputError
+from jaxtank.numerics import root
+
+
+def _balance(plant):
+    """(efflux, pumps): A_i h_i' = efflux @ speeds + pumps @ inputs, of a network without pipes; (n, n) [cm^2] and (n, m) [cm^3/(s V)]."""
+    n, m, eye = plant.tanks, plant.pumps, np.eye(plant.tanks)
+    out = plant.drain
+    for k, (source, _) in enumerate(plant.links):
+        out = out + plant.orifice[k] * eye[source]
+    efflux = -jnp.diag(out)
+    for k, (source, sink) in enumerate(plant.links):
+        efflux = efflux + plant.orifice[k] * np.outer(eye[sink], eye[source])
+    pumps = jnp.zeros((n, m))
+    for j, (first, second) in enumerate(plant.feeds):
+        share = 1.0 if second is None else plant.split[j]
+        pumps = pumps + share * plant.pump_gain[j] * np.outer(eye[first], np.eye(m)[j])
+        if second is not None:
+            pumps = pumps + (1.0 - share) * plant.pump_gain[j] * np.outer(eye[second], np.eye(m)[j])
+    return efflux, pumps
 
 
 def steady_flows(plant, y):
@@ -14,33 +34,47 @@ def steady_flows(plant, y):
     plant: TankNetwork without pipes, with as many pumps as outputs; y: (outputs,) levels [cm]. Returns (speeds (n) [cm/s], voltages
     (m) [V]), which may be negative: then no steady state exists. Differentiable in the plant's leaves and in y.
     """
+    return _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * jnp.sqrt(jnp.asarray(y)))
+
+
+def _from_known_speeds(plant, known):
+    """`steady_flows` for the efflux speeds (outputs) [cm/s] of the controlled tanks, in which it is linear."""
     if plant.pipes:
         raise InputError("steady_flows is for networks whose orifices discharge freely; with pipes use equilibrium")
     n, m = plant.tanks, plant.pumps
     if m != len(plant.outputs):
         raise InputError(f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}")
-    w = jnp.sqrt(2.0 * plant.gravity)
-    eye = np.eye(n)
-    out = plant.drain
-    for k, (source, _) in enumerate(plant.links):
-        out = out + plant.orifice[k] * eye[source]
-    balance = -jnp.diag(out)
-    for k, (source, sink) in enumerate(plant.links):
-        balance = balance + plant.orifice[k] * np.outer(eye[sink], eye[source])
-    pumps = jnp.zeros((n, m))
-    for j, (first, second) in enumerate(plant.feeds):
-        share = 1.0 if second is None else plant.split[j]
-        pumps = pumps + share * plant.pump_gain[j] * np.outer(eye[first], np.eye(m)[j])
-        if second is not None:
-            pumps = pumps + (1.0 - share) * plant.pump_gain[j] * np.outer(eye[second], np.eye(m)[j])
+    eye, (efflux, pumps) = np.eye(n), _balance(plant)
     free = [i for i in range(n) if i not in plant.outputs]
-    known = w * jnp.sqrt(jnp.asarray(y))
-    columns = jnp.concatenate([balance[:, np.array(free, dtype=int)], pumps], axis=1)
-    solution = jnp.linalg.solve(columns, -balance[:, np.array(plant.outputs)] @ known)
+    columns = jnp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
+    solution = jnp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
     speeds = jnp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]
     return speeds, solution[len(free) :]
+
+
+def steady_along(plant, r):
+    """The steady state of every sample of a reference: what a law of state feedback prepares before the loop.
+
+    plant: as in `steady_flows`; r: tuple of arrays (samples,), one per output [cm]. Returns (levels, inputs): tuples of arrays
+    (samples,) [cm], [V]. Each is linear in the roots of r, so the balance is solved once per output and not per sample. No check: where
+    no steady state exists, an input or the flow behind a level is negative.
+    """
+    roots = [root(v, plant.knee) for v in r]
+    parts = [_from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * one) for one in np.eye(len(r))]
+    speeds = tuple(sum(part[0][i] * q for part, q in zip(parts, roots)) for i in range(plant.tanks))
+    inputs = tuple(sum(part[1][j] * q for part, q in zip(parts, roots)) for j in range(plant.pumps))
+    return tuple(v * v / (2.0 * plant.gravity) for v in speeds), inputs
+
+
+def steady_levels(plant, u):
+    """Levels (n) [cm] at which a network without pipes stands still while its pumps run at u (m) >= 0 [V]. Differentiable."""
+    if plant.pipes:
+        raise InputError("steady_levels is for networks whose orifices discharge freely")
+    efflux, pumps = _balance(plant)
+    speeds = jnp.linalg.solve(efflux, -pumps @ jnp.asarray(u, dtype=float))
+    return speeds * speeds / (2.0 * plant.gravity)
 
 
 def equilibrium(plant, y):
@@ -120,3 +154,49 @@ def linearise(plant, x, u):
     x, u = jnp.asarray(x, dtype=float), jnp.asarray(u, dtype=float)
     A, B = jax.jacfwd(lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None)), argnums=(0, 1))(x, u)
     return A, B, jnp.eye(plant.tanks)[np.array(plant.outputs)]
+
+
+def steady_gain(A, B, C):
+    """G(0) = -C A^-1 B (p, m) [cm/V], of a linear model without a pole at 0."""
+    return -C @ jnp.linalg.solve(A, B)
+
+
+def relative_gain_array(A, B, C):
+    """Bristol's relative gains of the steady gain, G(0) o (G(0)^-1)' (m, m) [-], of a model with as many outputs as inputs.
+
+    Entry (i, j): gain from input j to output i with the other loops open, over that with the other outputs held. A negative one forbids
+    the pairing. For the quadruple tank the first is gamma1 gamma2 / (gamma1 + gamma2 - 1) (Johansson 2000).
+    """
+    G = steady_gain(A, B, C)
+    return G * jnp.linalg.inv(G).T
+
+
+def transmission_zeros(A, B, C):
+    """Finite transmission zeros [1/s] of a square linear model, by decreasing real part: host array, real where all are real.
+
+    The finite generalised eigenvalues of ([[A, B], [C, 0]], diag(I, 0)), as many outputs as inputs. A zero in the right half plane limits
+    how fast the outputs can be held, whatever the law.
+    """
+    A, B, C = (np.asarray(a, dtype=float) for a in (A, B, C))
+    n, m = B.shape
+    if C.shape[0] != m:
+        raise InputError(f"transmission_zeros needs as many outputs as inputs: this model has {C.shape[0]} and {m}")
+    pencil = np.block([[A, B], [C, np.zeros((m, m))]])
+    mass = np.diag([1.0] * n + [0.0] * m)
+    alpha, beta = linalg.eig(pencil, mass, right=False, homogeneous_eigvals=True)
+    finite = np.abs(beta) > 1e-10 * np.abs(alpha)
+    zeros = alpha[finite] / beta[finite]
+    zeros = zeros[np.argsort(-zeros.real)]
+    return zeros.real if np.all(np.abs(zeros.imag) < 1e-9 * np.abs(zeros).max(initial=1e-300)) else zeros
+
+
+def zero_direction(A, B, C, zero):
+    """Output direction of a transmission zero [1/s]: the unit vector y (p) of y^H G(zero) = 0, its largest entry made positive.
+
+    That combination of the outputs shows the zero; outputs across it need not.
+    """
+    A, B, C = (np.asarray(a) for a in (A, B, C))
+    G = C @ np.linalg.solve(zero * np.eye(len(A)) - A, B)
+    y = np.linalg.svd(G)[0][:, -1]
+    largest = y[np.argmax(np.abs(y))]
+    return y * np.conj(largest) / np.abs(largest)

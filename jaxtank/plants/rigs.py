@@ -52,6 +52,24 @@ def quadruple_tank(*, area, outlet, pump_gain, split, rim, gravity=981.0):
     )
 
 
+JOHANSSON = {  # Johansson, IEEE Trans. CST 8(3), 2000, Table I and sec. II: (k [cm^3/(s V)], gamma, operating voltages [V])
+    "minimum": ((3.33, 3.35), (0.70, 0.60), (3.0, 3.0)),
+    "non-minimum": ((3.14, 3.29), (0.43, 0.34), (3.15, 3.15)),
+}
+
+
+def johansson(phase):
+    """(rig, operating voltages (2) [V]) of Johansson's laboratory process (IEEE Trans. CST 8(3), 2000).
+
+    phase: "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+). Raises InputError for another.
+    """
+    if phase not in JOHANSSON:
+        raise InputError(f"phase = {phase!r}: must be one of {', '.join(JOHANSSON)}")
+    pump_gain, split, voltages = JOHANSSON[phase]
+    area, outlet = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057)
+    return quadruple_tank(area=area, outlet=outlet, pump_gain=pump_gain, split=split, rim=20.0), voltages
+
+
 def coupled_tanks(*, area, drain, pipe, pump_gain, rim, outputs, feeds, **more):
     """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none): gouta2022, calofir, khalid.
 
