@@ -55,6 +55,12 @@ def signed_root(x, knee=ROOT_KNEE):
     return x / jnp.sqrt(jnp.sqrt(x * x + knee * knee))
 
 
+def signed_root_slope(x, knee=ROOT_KNEE):
+    """Slope of `signed_root` (...) [cm^-0.5], smooth: (1 - x^2 / (2 (x^2 + knee^2))) / (x^2 + knee^2)^(1/4), knee^-1/2 at 0."""
+    square = x * x + knee * knee
+    return (1.0 - 0.5 * x * x / square) / jnp.sqrt(jnp.sqrt(square))
+
+
 @jax.custom_jvp
 def floored_root(h, floor):
     """sqrt(max(h, floor)), floor > 0: the root a law takes of a level it multiplies or divides by. Slope 0 below the floor."""

@@ -1,0 +1,135 @@
+"""Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and in a form that can work."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxtank.analysis import steady_along
+from jaxtank.controllers.base import Controller
+from jaxtank.numerics import clip, signed_root, signed_root_slope
+from jaxtank.plants.base import Plant
+from jaxtank.plants.rigs import QUADRUPLE_FEEDS, QUADRUPLE_LINKS, check_topology
+from jaxtank.tree import component, leaf, static
+
+SWITCHES = {"tanh": jnp.tanh, "clip": lambda x: clip(x, -1.0, 1.0), "sign": jnp.sign}
+FORMS = ("corrected", "printed")
+SMALLEST = 1e-3  # least size of the determinant, as a share of its antidiagonal part: at the design -0.83 (spec 4.2)
+
+
+class LowerTanks(NamedTuple):
+    """What the model knows of tanks 1 and 2: pairs, tank 1 first."""
+
+    drift: tuple  # phi_i: rate of the level without the tank's own pump [cm/s]
+    slope: tuple  # D_i: how the drift falls with the level [1/s]
+    cross: tuple  # how it rises with the level of the tank above [1/s]
+    above: tuple  # rate at which the tank above would fall without its pump [cm/s]
+    own: tuple  # gamma_i k_i / A_i: rate that the tank's own pump gives it [cm/(s V)]
+    upper: tuple  # rate that the other pump gives the tank above: (1 - gamma2) k2 / A3, (1 - gamma1) k1 / A4 [cm/(s V)]
+
+
+def lower_tanks(model, x):
+    """`LowerTanks` of a quadruple tank at levels x (4) [cm].
+
+    phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2) less the direct flow. The root is the
+    smooth one (numerics.signed_root): its slope, which the law needs, has no kink at an empty tank.
+    """
+    w, area = jnp.sqrt(2.0 * model.gravity), [model.area[i] for i in range(4)]
+    q = [w * signed_root(h, model.knee) for h in x]
+    dq = [w * signed_root_slope(h, model.knee) for h in x]
+    drain, link = [model.drain[i] for i in range(4)], [model.orifice[k] for k in range(2)]
+    gain, split = model.pump_gain, model.split
+    return LowerTanks(
+        drift=tuple((link[i] * q[i + 2] - drain[i] * q[i]) / area[i] for i in range(2)),
+        slope=tuple(drain[i] * dq[i] / area[i] for i in range(2)),
+        cross=tuple(link[i] * dq[i + 2] / area[i] for i in range(2)),
+        above=tuple((link[i] + drain[i + 2]) * q[i + 2] / area[i + 2] for i in range(2)),
+        own=tuple(split[i] * gain[i] / area[i] for i in range(2)),
+        upper=tuple((1.0 - split[j]) * gain[j] / area[i + 2] for i, j in ((0, 1), (1, 0))),
+    )
+
+
+class Acceleration(NamedTuple):
+    """d/dt of (damping h_i' + ...) as an affine map of the voltages: f + M u [cm/s^2]."""
+
+    f: tuple
+    diagonal: tuple  # M11, M22
+    across: tuple  # M12, M21
+
+
+def acceleration(tanks, damping):
+    """f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i. damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which are
+    right except that gamma_i k_i u_i'/A_i is missing from it (spec E2)."""
+    net = tuple(damping - d for d in tanks.slope)
+    return Acceleration(
+        f=tuple(n * p - c * a for n, p, c, a in zip(net, tanks.drift, tanks.cross, tanks.above)),
+        diagonal=tuple(n * g for n, g in zip(net, tanks.own)),
+        across=tuple(c * g for c, g in zip(tanks.cross, tanks.upper)),
+    )
+
+
+def slide(model, surface, ks, phi, switch, form, x, r, u0, previous) -> tuple[Any, Any]:
+    """(2) voltages [V] of the sliding-mode law, not limited; arguments as the fields of `SlidingMode`.
+
+    x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2) voltages now at the pumps [V],
+    used by the printed form alone.
+    """
+    printed = form == "printed"
+    tanks = lower_tanks(model, x)
+    rate = tuple(p + g * u for p, g, u in zip(tanks.drift, tanks.own, previous if printed else u0))
+    s = tuple(surface * (h - target) + v for h, target, v in zip(x, r, rate))
+    f, (m11, m22), (m12, m21) = acceleration(tanks, 0.0 if printed else surface)
+    v1, v2 = (-f_i - (surface * v if printed else 0.0) - ks * SWITCHES[switch](s_i / phi) for f_i, v, s_i in zip(f, rate, s))
+    least, det = SMALLEST * m12 * m21, m11 * m22 - m12 * m21
+    det = jnp.where(jnp.abs(det) < least, jnp.where(det > 0.0, least, -least), det)
+    return (m22 * v1 - m12 * v2) / det, (m11 * v2 - m21 * v1) / det
+
+
+def check_quadruple(model):
+    """Raise InputError unless `model` is a quadruple tank."""
+    check_topology(
+        model,
+        "a quadruple tank (plants.quadruple_tank)",
+        links=QUADRUPLE_LINKS,
+        feeds=QUADRUPLE_FEEDS,
+        pipes=(),
+        outputs=(0, 1),
+    )
+
+
+@component
+class SlidingMode(Controller):
+    """Sliding-mode law for the quadruple tank: M u = -f - ks sw(s / phi), sw one of tanh, clip to [-1, 1], sign.
+
+    "corrected" (spec 4.3): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i, whose rate f + M u is exact in u and needs no u'.
+    The surface is zero at the steady state of the setpoint. A sliding mode exists and is stable for surfaces between two bounds: 0.0088
+    and 0.088 1/s for the paper's rig at 12 cm (spec 4.2). Setpoints that are held: their rates are not used.
+
+    "printed" (mirakhorli eq. 10): s_i = surface e_i + h_i', f and M without the surface, and surface h_i' subtracted; h_i' from the full
+    model with the voltages applied in the last sample (the paper does not say how h_i' is had: reading (a) of spec 4.1).
+
+    Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and they grow without bound (spec 11.3).
+    With sign, phi has no effect and the other derivatives miss the jumps.
+    """
+
+    model: Plant
+    surface: float = leaf("1/s", "slope lambda of the sliding surface", low=0.0, strict=True)
+    ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
+    phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
+    switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
+    form: str = static("-", "which law", choices=FORMS, default="corrected")
+
+    def prepare(self, r, dr, ddr):
+        return steady_along(self.model, r)[1]
+
+    def init(self, x0, u0):
+        return u0 if self.form == "printed" else ()
+
+    def step(self, state, tick, estimate):
+        law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
+        return slide(*law, estimate.x, tick.r, tick.plan, state), state
+
+    def track(self, state, tick, command, applied):
+        return applied if self.form == "printed" else state
+
+    def check(self, reference):
+        check_quadruple(self.model)
