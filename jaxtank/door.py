@@ -44,7 +44,7 @@ def check(loop, clock, key=None):
         loop.controller.check(loop.reference)
     loop.observer.check(plant)
     if key is None and not _traced(loop.sensor.noise) and np.any(np.asarray(loop.sensor.noise) > 0):
-        raise InputError(f"sensor.noise = {np.asarray(loop.sensor.noise)} cm: give a key (or --seed), or set it to 0")
+        raise InputError(f"sensor.noise = {np.asarray(loop.sensor.noise)} {plant.units[0]}: give a key (or --seed), or set it to 0")
 
 
 def _traced(*trees):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from jaxtank.errors import unknown
 from jaxtank.numerics import at_least, root_of_mean
+from jaxtank.units import DEFAULT, local
 
 BAND = 0.05
 """Half width of the recovery band, as a share of the setpoint [-]."""
@@ -233,7 +234,11 @@ MEASURES = {
     "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
     "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square of the input within the limits"),
     "input_travel": Measure(
-        "V", "pump", ("travel",), lambda run, acc: _list(acc["travel"][1]), "sum of the absolute changes of the input within the limits"
+        "V",
+        "pump",
+        ("travel",),
+        lambda run, acc: _list(acc["travel"][1]),
+        "sum of the absolute changes of the input within the limits",
     ),
     "saturated_fraction": Measure(
         "-",
@@ -294,6 +299,11 @@ def check_names(names):
     for name in names:
         if name not in MEASURES:
             raise unknown("measure", name, MEASURES)
+
+
+def unit(name, units=DEFAULT):
+    """Unit of measure `name` on a rig with these (length, pump input) units."""
+    return local(MEASURES[name].unit, units)
 
 
 def entries(name, plant):

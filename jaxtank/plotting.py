@@ -26,8 +26,8 @@ STYLE = {
 }
 
 
-def level(ax, trajectories, tank, output=None, rim=None, limit=None):
-    """Levels of one tank [cm] over time [s], one line per {name: (Trajectory, colour, style)}; its setpoint, rim and limit."""
+def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
+    """Levels of one tank [unit] over time [s], one line per {name: (Trajectory, colour, style)}; its setpoint, rim and limit."""
     for name, (run, colour, style) in trajectories.items():
         ax.plot(run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=name)
     last = next(iter(trajectories.values()))[0]
@@ -39,30 +39,34 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None):
         if bound is not None and (highest > 0.6 * bound):
             top = max(highest * 1.03, bound * 1.05)
             ax.axhspan(bound, top, color=FORBIDDEN, alpha=0.18, linewidth=0)
-            ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{words} {bound:g} cm")
+            ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{words} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"tank {tank + 1}", ylabel="level [cm]")
+    ax.set(title=f"tank {tank + 1}", ylabel=f"level [{unit}]")
     return ax
 
 
-def voltage(ax, trajectories, pump, low, high):
-    """Voltage of one pump [V] over time [s], what lies outside its limits shaded."""
+def voltage(ax, trajectories, pump, low, high, unit="V"):
+    """Input of one pump [unit], within its limits, over time [s], what lies outside its limits shaded."""
     for name, (run, colour, style) in trajectories.items():
-        ax.plot(run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
+        ax.plot(run.t, run.applied[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
+    ax.set(title=f"pump {pump + 1}", ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
+    lowest, highest = (f([f(run.applied[:, pump]) for run, _, _ in trajectories.values()]) for f in (np.min, np.max))
+    if highest - lowest < 0.1 * (high - low):  # limits far away say nothing
+        return ax
     margin = 0.06 * (high - low)
     ax.axhspan(low - margin, low, color=FORBIDDEN, alpha=0.18, linewidth=0)
     ax.axhspan(high, high + margin, color=FORBIDDEN, alpha=0.18, linewidth=0)
-    ax.set(title=f"pump {pump + 1}", ylabel="voltage [V]", ylim=(low - margin, high + margin))
+    ax.set_ylim(low - margin, high + margin)
     return ax
 
 
-def error(ax, trajectories, output, tank):
-    """Tracking error of one output [cm] over time [s]."""
+def error(ax, trajectories, output, tank, unit="cm"):
+    """Tracking error of one output [unit] over time [s]."""
     for name, (run, colour, style) in trajectories.items():
         ax.plot(run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=name)
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
-    ax.set(title=f"tracking error of tank {tank + 1}", ylabel="h - r [cm]")
+    ax.set(title=f"tracking error of tank {tank + 1}", ylabel=f"h - r [{unit}]")
     return ax
 
 
@@ -76,12 +80,16 @@ def responses(loop, trajectories, title="", limits=None):
     drawn = {name: (run, *style) for (name, run), style in zip(trajectories.items(), styles)}
     outputs = list(loop.plant.outputs)
     others = [i for i in range(loop.plant.tanks) if i not in outputs]
+    length, drive = loop.units
     rows = [
-        [lambda ax, i=i, k=k: level(ax, drawn, i, k, _at(loop.plant.rim, i), _at(limits, i)) for k, i in enumerate(outputs)],
-        [lambda ax, i=i, k=k: error(ax, drawn, k, i) for k, i in enumerate(outputs)],
-        [lambda ax, i=i: level(ax, drawn, i, None, _at(loop.plant.rim, i), _at(limits, i)) for i in others],
         [
-            lambda ax, j=j: voltage(ax, drawn, j, float(loop.actuator.low[j]), float(loop.actuator.high[j]))
+            lambda ax, i=i, k=k: level(ax, drawn, i, k, _at(loop.plant.rim, i), _at(limits, i), length)
+            for k, i in enumerate(outputs)
+        ],
+        [lambda ax, i=i, k=k: error(ax, drawn, k, i, length) for k, i in enumerate(outputs)],
+        [lambda ax, i=i: level(ax, drawn, i, None, _at(loop.plant.rim, i), _at(limits, i), length) for i in others],
+        [
+            lambda ax, j=j: voltage(ax, drawn, j, float(loop.actuator.low[j]), float(loop.actuator.high[j]), drive)
             for j in range(loop.plant.pumps)
         ],
     ]

@@ -35,7 +35,8 @@ from jaxtank import presets
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
-from jaxtank.measures import MEASURES, check_names, entries
+from jaxtank.measures import check_names, entries
+from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Case, Free
 from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.signals import Ramps, ramps
@@ -95,7 +96,7 @@ def check_limits(loop, limits):
     """`limits` as a dict, if every one is a measure with a finite number, one for each of its entries, or "rim" for max_level."""
     check_names(limits)
     for measure, value in limits.items():
-        count, unit = entries(measure, loop.plant), MEASURES[measure].unit
+        count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
         if isinstance(value, str) and value == "rim" and measure == "max_level":
             continue
         good = _is_numeric(value) and np.shape(value) in ((), (count,))
@@ -181,15 +182,15 @@ def dump(case):
         if value is not None and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps)):
             lines.append(_line(name, np.asarray(value).tolist(), meta))
     for name, value, meta in walk(case.loop, kind="static"):
-        if not isinstance(value, tuple) and not name.startswith("reference."):
+        if not isinstance(value, tuple) and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps)):
             lines.append(_line(name, value, meta))
     for name, unit in CLOCK_UNITS.items():
         lines.append(_line(f"clock.{name}", getattr(case.clock, name), {"unit": unit, "doc": ""}))
     reference = case.loop.reference
     if isinstance(reference, Ramps):
-        lines += ["", "[reference]", f"initial = {_toml(np.asarray(reference.initial).tolist())}  # [cm]"]
+        lines += ["", "[reference]", f"initial = {_toml(np.asarray(reference.initial).tolist())}  # [{case.loop.units[0]}]"]
         changes = [[t, i + 1, float(v)] for (t, i), v in zip(reference.changes, np.asarray(reference.targets))]
-        lines += [f"changes = {_toml(changes)}  # time [s], output (from 1), level [cm]"]
+        lines += [f"changes = {_toml(changes)}  # time [s], output (from 1), level [{case.loop.units[0]}]"]
         lines += [f"ramp = {_toml(reference.ramp)}  # [s]", f"shape = {_toml(reference.shape)}"]
     lines += ["", "[limits]"] + [
         f"{m} = {_toml(np.asarray(v).tolist() if not isinstance(v, str) else v)}" for m, v in case.limits.items()
@@ -206,10 +207,6 @@ def save(case, path):
 
 def _origin(case):
     """The preset that a case came from: one with the same components, so that values are all there is to set."""
-    if not isinstance(case.loop.reference, Ramps):
-        raise InputError(
-            f"{case.name}: a reference of the kind {type(case.loop.reference).__name__} cannot be written to a rig file"
-        )
     structure = jax.tree.structure(_plain(case.loop))
     alike = [c for p in presets.PAPERS for c in presets.load(p).cases.values() if jax.tree.structure(_plain(c.loop)) == structure]
     if not alike:
@@ -238,7 +235,9 @@ def _plain(loop):
                 changed[field.name] = None
         return dataclasses.replace(tree, **changed)
 
-    return dataclasses.replace(settle(loop), reference=None)
+    plain = settle(loop)
+    # ramps are written whole, in a table of their own; of another reference only values can be set
+    return dataclasses.replace(plain, reference=None) if isinstance(loop.reference, Ramps) else plain
 
 
 def _reference(table, old):
@@ -250,9 +249,9 @@ def _reference(table, old):
     outputs = np.size(old.initial)
     initial = table.get("initial", np.asarray(old.initial).tolist())
     if not (_is_numeric(initial) and np.shape(initial) == (outputs,) and np.all(np.isfinite(initial))):
-        raise InputError(f"reference.initial = {_short(initial)}: must be a list of {outputs} finite levels [cm]")
+        raise InputError(f"reference.initial = {_short(initial)}: must be a list of {outputs} finite levels")
     changes = table.get("changes", [[t, i + 1, float(v)] for (t, i), v in zip(old.changes, np.asarray(old.targets))])
-    form = f"[time [s], output from 1 to {outputs}, level [cm]]"
+    form = f"[time [s], output from 1 to {outputs}, level]"
     if not isinstance(changes, list):
         raise InputError(f"reference.changes = {_short(changes)}: must be a list of {form}")
     for change in changes:

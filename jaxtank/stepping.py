@@ -15,6 +15,7 @@ from jaxtank.errors import InputError
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
+from jaxtank.plants.integration import integrate
 from jaxtank.records import Sample, Tick
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Signal
@@ -75,11 +76,12 @@ def inputs(loop, clock, names, key):
         if not hasattr(loop.reference, "windows"):
             raise InputError("overshoot, rise and settling need a reference that changes (signals.Ramps)")
         window = loop.reference.windows(clock)
-    since = None
-    if ms.wants_pours(names):
-        if not hasattr(loop.disturbance, "since"):
-            raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
-        since = loop.disturbance.since(clock)
+    since = loop.disturbance.since(clock) if hasattr(loop.disturbance, "since") else None
+    if since is None and ms.wants_pours(names):
+        raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
+    if since is not None and window is not None:
+        # while a tank recovers from a pour, it is not settling on its setpoint
+        window = tuple(tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window)
     return Inputs(
         r=r,
         dr=dr,
@@ -151,22 +153,6 @@ def _advance(plant, clock, t, x, u, d):
         x, lost = plant.spill(integrate(plant, clock.integrator, t + j * h, x, u, d, h))
         spilled = lost if spilled is None else tuple(a + b for a, b in zip(spilled, lost))
     return x, spilled
-
-
-def integrate(plant, integrator, t, x, u, d, h):
-    """Levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d held."""
-
-    def along(k, by):
-        return tuple(a + by * b for a, b in zip(x, k))
-
-    k1 = plant.derivative(t, x, u, d)
-    k2 = plant.derivative(t + 0.5 * h, along(k1, 0.5 * h), u, d)
-    if integrator == "midpoint":
-        return along(k2, h)
-    k3 = plant.derivative(t + 0.5 * h, along(k2, 0.5 * h), u, d)
-    k4 = plant.derivative(t + h, along(k3, h), u, d)
-    # k4 is ready last, so it is added last
-    return tuple((a + (h / 6.0) * (p + 2.0 * (q + r))) + (h / 6.0) * s for a, p, q, r, s in zip(x, k1, k2, k3, k4))
 
 
 def run_of(loop, clock):

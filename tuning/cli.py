@@ -94,6 +94,11 @@ def parser():
     tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
     tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
     commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
+    compare = commands.add_parser(
+        "compare", parents=[common], help="published numbers beside measured ones, and why they differ; PAPER or all"
+    )
+    compare.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
+    compare.add_argument("--markdown", action="store_true", help="as the table of the README")
     bench = commands.add_parser("bench", parents=[common], help="ns per closed-loop step here, beside a C loop")
     bench.add_argument("--rounds", default="7", metavar="N", help="interleaved rounds to take the median of (default 7)")
     return top
@@ -287,7 +292,7 @@ def _simulate(args):
     payload = {
         "case": case.name,
         "measures": report.measures_json(values),
-        "units": report.units(),
+        "units": report.units(case.loop.units),
         "reasons": report.reasons(values),
         "clock": manual.clock(case.clock),
         "parameters": report.clean(loop.parameters(case.loop)),
@@ -299,7 +304,7 @@ def _simulate(args):
     else:
         print(f"{case.name}: {case.title}\n")
         rows = [
-            [m, s.unit, report.numbers(values[m]), s.doc]
+            [m, ms.unit(m, case.loop.units), report.numbers(values[m]), s.doc]
             for m, s in ms.MEASURES.items()
             if m in values and m != "time_of_max_level"
         ]
@@ -328,7 +333,7 @@ def _tune(args):
         seed=seed,
         screening=_whole("--screening", args.screening, 1, 65536),
         iterations=_whole("--iterations", args.iterations, 1, 100_000),
-        progress=Progress(report.objective_unit(objective or case.objective), args.quiet),
+        progress=Progress(report.objective_unit(objective or case.objective, case.loop.units), args.quiet),
     )
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
@@ -386,6 +391,28 @@ def _bench(args):
     return 0
 
 
+def _compare(args):
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxtank import presets
+    from tuning import compare, report
+
+    papers = presets.PAPERS if args.paper == "all" else (args.paper,)
+    for paper in papers:
+        presets.load(paper)  # an unknown one is told before anything runs
+    found = {}
+    for paper in papers:
+        if not args.quiet:
+            print(f"running {paper}", file=sys.stderr, flush=True)
+        found[paper] = compare.measure(paper)
+    if args.json:
+        print(report.dumps(found if args.paper == "all" else found[args.paper]))
+    else:
+        print(compare.markdown(found) if args.markdown else "\n\n".join(compare.text(page) for page in found.values()))
+    return 0
+
+
 def _tune_interruptibly(args):
     """`_tune`, with the handler of SIGINT put back afterwards."""
     before = signal.getsignal(signal.SIGINT)
@@ -396,7 +423,15 @@ def _tune_interruptibly(args):
             signal.signal(signal.SIGINT, before)
 
 
-COMMANDS = {"list": _list, "show": _show, "simulate": _simulate, "tune": _tune_interruptibly, "init": _init, "bench": _bench}
+COMMANDS = {
+    "list": _list,
+    "show": _show,
+    "simulate": _simulate,
+    "tune": _tune_interruptibly,
+    "init": _init,
+    "compare": _compare,
+    "bench": _bench,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

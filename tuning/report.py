@@ -12,6 +12,7 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.errors import InputError
 from jaxtank.files import check_folder, write_atomic
+from jaxtank.units import DEFAULT, local
 from tuning.objective import LOWER
 
 SHOWN = (
@@ -30,9 +31,15 @@ REASONS = {
     "overshoot_percent": "the reference does not change",
     "rise_time": "no change of the setpoint was followed to 90 % of its height",
     "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
-    "recovery_time": "this case has no disturbance to recover from",
+    "recovery_time": "an output was still outside the band when it was watched no longer",
 }
 ABSENT = "the value is not a finite number"
+UNSERVED = {
+    "overshoot_percent": "the reference has no changes that end",
+    "rise_time": "the reference has no changes that end",
+    "settling_time": "the reference has no changes that end",
+    "recovery_time": "this case has no disturbance to recover from",
+}
 
 
 def number(value, digits=5):
@@ -65,14 +72,14 @@ def clean(value):
 
 
 def reasons(measures):
-    """{measure: why} for every measure with an entry that is not a number."""
+    """{measure: why} for every measure that is absent or has an entry that is not a number."""
     found = {m: REASONS.get(m, ABSENT) for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float)))}
-    return {**found, "recovery_time": REASONS["recovery_time"]}
+    return {**found, **{m: why for m, why in UNSERVED.items() if m not in measures}}
 
 
 def measures_json(measures):
-    """Measures as JSON, `recovery_time` among them (null until a case has disturbances)."""
-    return {**clean({m: v for m, v in measures.items() if m != "time_of_max_level"}), "recovery_time": None}
+    """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
+    return {**dict.fromkeys(UNSERVED), **clean({m: v for m, v in measures.items() if m != "time_of_max_level"})}
 
 
 def dumps(table):
@@ -80,9 +87,9 @@ def dumps(table):
     return json.dumps(table, indent=2, allow_nan=False)
 
 
-def units():
-    """{measure: unit} of everything that is reported."""
-    return {**{m: spec.unit for m, spec in ms.MEASURES.items()}, "recovery_time": "s"}
+def units(rig_units):
+    """{measure: unit} of everything that is reported, on a rig with these (length, pump input) units."""
+    return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
 def table(rows, head=None):
@@ -106,7 +113,7 @@ def json_of(result):
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
         "measures": {"before": measures_json(result.measures["before"]), "after": measures_json(result.measures["after"])},
         "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
-        "units": units(),
+        "units": units(result.tuned.loop.units),
         "constraints": clean(result.constraints),
         "evaluations": result.evaluations,
         "starts": clean(result.starts),
@@ -120,7 +127,7 @@ def json_of(result):
 
 def text(result):
     """The result as a page of text."""
-    unit = objective_unit(result.objective["terms"])
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
     head = [
         f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
         f"{result.evaluations['gradients']} of them with gradients, {result.wall_s:.1f} s)",
@@ -145,7 +152,7 @@ def text(result):
             rows.append(
                 [
                     m,
-                    ms.MEASURES[m].unit,
+                    ms.unit(m, result.tuned.loop.units),
                     numbers(result.measures["before"][m], 4),
                     numbers(result.measures["after"][m], 5 if "level" in m else 4),
                 ]
@@ -189,14 +196,14 @@ def _wrap(message):
     return "\n".join(f"- {part}" for part in message.split("; "))
 
 
-def objective_unit(terms):
+def objective_unit(terms, rig_units=DEFAULT):
     """Unit of a weighted sum: that of its only measure, or a plain number."""
-    found = {ms.MEASURES[m].unit for m in terms}
+    found = {ms.unit(m, rig_units) for m in terms}
     return found.pop() if len(found) == 1 else "-"
 
 
-def trajectory_csv(run):
-    """A trajectory as CSV with units in the header."""
+def trajectory_csv(run, rig_units=DEFAULT):
+    """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
     columns = [("t [s]", np.asarray(run.t))]
     for name, field, unit in (
         ("h", "x", "cm"),
@@ -205,8 +212,11 @@ def trajectory_csv(run):
         ("u", "u", "V"),
         ("command", "command", "V"),
         ("spilled", "spilled", "cm^3"),
+        ("d_hat", "d_hat", "cm/s"),
     ):
-        values = np.asarray(getattr(run, field))
+        values, unit = np.asarray(getattr(run, field)), local(unit, rig_units)
+        if field == "d_hat" and not values.any():
+            continue
         columns += [(f"{name}{i + 1} [{unit}]", values[:, i]) for i in range(values.shape[1])]
     out = io.StringIO()
     out.write(",".join(head for head, _ in columns) + "\n")
@@ -237,7 +247,7 @@ def figures(result, runs=None):
 
     key = result.problem.key
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
-    unit = objective_unit(result.objective["terms"])
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
     tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level"}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
     told = {"before": "", "after": ""}
@@ -326,8 +336,8 @@ def save(result, folder):
     files = {
         "result.json": dumps(json_of(result)) + "\n",
         "rig.toml": rig.dump(result.tuned),
-        "trajectory.csv": trajectory_csv(runs["after"]),
-        "before.csv": trajectory_csv(runs["before"]),
+        "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
+        "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
     written = write_files(folder, files)  # the numbers first: pictures take seconds
     return written + write_files(folder, {f"{name}.png": _png(figure) for name, figure in figures(result, runs).items()})
@@ -340,7 +350,12 @@ def save_run(case, run, payload, folder):
     check_folder(folder)
     picture = plotting.responses(case.loop, {case.name: run}, case.title)
     return write_files(
-        Path(folder), {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run), "responses.png": _png(picture)}
+        Path(folder),
+        {
+            "result.json": dumps(payload) + "\n",
+            "trajectory.csv": trajectory_csv(run, case.loop.units),
+            "responses.png": _png(picture),
+        },
     )
 
 

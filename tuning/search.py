@@ -234,7 +234,7 @@ def _constraints(problem, after, tuned):
             {
                 "name": limit.label,
                 "measure": limit.measure,
-                "unit": ms.MEASURES[limit.measure].unit,
+                "unit": ms.unit(limit.measure, tuned.loop.units),
                 "limit": limit.value,
                 "value": value,
                 "margin": limit.margin(after),

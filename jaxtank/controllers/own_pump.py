@@ -17,6 +17,8 @@ def authority(model):
 def check_own_pumps(model, every=True):
     """Raise InputError unless pump j fills the j-th controlled tank alone and, with `every`, every tank is controlled."""
     if tuple(first for first, _ in model.feeds) != model.outputs or any(second is not None for _, second in model.feeds):
-        raise InputError("controller.model must have one pump per controlled tank, in the same order: this law inverts it tank by tank")
+        raise InputError(
+            "controller.model must have one pump per controlled tank, in the same order: this law inverts it tank by tank"
+        )
     if every and model.outputs != tuple(range(model.tanks)):
         raise InputError("controller.model has tanks whose levels are not controlled: this law needs the setpoint of every tank")

@@ -2,5 +2,7 @@
 
 from jaxtank.observers.base import Direct, Observer
 from jaxtank.observers.disturbance import DisturbanceObserver
+from jaxtank.observers.extended_kalman import ExtendedKalman
+from jaxtank.observers.kalman import Kalman
 
-__all__ = ["DisturbanceObserver", "Direct", "Observer"]
+__all__ = ["Direct", "DisturbanceObserver", "Observer"]

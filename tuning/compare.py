@@ -1,0 +1,144 @@
+"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict and the reason for a difference."""
+
+import numbers
+import textwrap
+
+import jax
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import presets, rig
+from jaxtank.presets.base import Claim
+from jaxtank.tree import get_value
+from tuning import report
+from tuning.manual import noisy
+
+QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
+
+
+def runner(paper):
+    """run(case name, values={}, save_every=1) -> (Case with `values` set, Trajectory as host arrays); each run is made once."""
+    preset, known = presets.load(paper), {}
+
+    def run(name, values=None, save_every=1):
+        key = (name, repr(values), save_every)
+        if key not in known:
+            case = rig.set_values(preset.cases[name], values or {})
+            found = lp.simulate(case.loop, case.clock, jax.random.key(0) if noisy(case) else None, save_every)
+            known[key] = case, type(found)(*(np.asarray(a) for a in found))
+        return known[key]
+
+    return run
+
+
+def verdict(published, measured):
+    """(verdict, measured value or text) of one published quantity; measured: number, tuple, Claim or None."""
+    if isinstance(measured, Claim):
+        return measured.verdict, measured.text
+    if measured is None:
+        return UNMEASURED, None
+    if published.tolerance is None:
+        return QUOTED, measured
+    printed, found = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
+    near = printed.shape == found.shape and np.all(np.abs(found - printed) <= published.tolerance * np.abs(printed))
+    return (REPRODUCED if near else DIFFERS), measured
+
+
+def measure(paper):
+    """The comparison of a paper: {"paper", "citation", "rows": [{quantity, unit, where, published, measured, verdict, reason}]}.
+
+    A parameter that the paper prints is compared with the value in the preset's first case that has it. Raises InputError for an unknown
+    paper, and KeyError if the preset measures something that it does not list as published.
+    """
+    preset = presets.load(paper)
+    found = preset.measured(runner(paper))
+    stray = set(found) - set(preset.published)
+    if stray:
+        raise KeyError(f"{paper} measures what is not in its published quantities: {', '.join(sorted(stray))}")
+    rows = []
+    for name, printed in preset.published.items():
+        value = found.get(name)
+        word, value = verdict(printed, _set_in(preset, name) if value is None else value)
+        reason = printed.reason
+        if word == QUOTED and isinstance(printed.value, numbers.Number | tuple) and not _same(printed.value, value):
+            word = DIFFERS
+        if word in (QUOTED, REPRODUCED):
+            reason = ""
+        rows.append(
+            {
+                "quantity": name,
+                "unit": printed.unit,
+                "where": printed.where,
+                "published": report.clean(printed.value),
+                "measured": report.clean(value),
+                "verdict": word,
+                "reason": reason,
+            }
+        )
+    return {"paper": paper, "citation": preset.citation, "rows": rows}
+
+
+def _set_in(preset, name):
+    """The value of parameter `name` in the first case that has it, or None where it is no parameter."""
+    for case in preset.cases.values():
+        if name.startswith("clock."):
+            return getattr(case.clock, name.removeprefix("clock."), None)
+        try:
+            value = np.asarray(get_value(case.loop, name))
+        except ValueError:  # InputError
+            continue
+        return value.item() if value.ndim == 0 else tuple(value.ravel().tolist())
+    return None
+
+
+def _same(printed, found):
+    """True if the preset's value is the printed one (a list of equal entries counts as one number)."""
+    if found is None or isinstance(found, str):
+        return False
+    a, b = np.ravel(printed).astype(float), np.ravel(found).astype(float)
+    return a.size in (1, b.size) and bool(np.all(np.abs(b - a) <= 1e-9 * np.abs(a)))
+
+
+def _cell(value):
+    if value is None:
+        return "-"
+    return (
+        value
+        if isinstance(value, str)
+        else ", ".join(report.number(v, 4) for v in np.unique(np.ravel(value)))
+        if _flat(value)
+        else (", ".join(report.number(v, 4) for v in np.ravel(value)))
+    )
+
+
+def _flat(value):
+    return np.unique(np.ravel(value)).size == 1
+
+
+def text(page):
+    """The page of `jaxtank compare PAPER`."""
+    rows = [[r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]] for r in page["rows"]]
+    wrapped = [[row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]] for row in rows]
+    lines = [page["citation"], "", report.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"])]
+    for row, cells in zip(page["rows"], rows):
+        note = "; ".join(filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]]))
+        if note:
+            lines.append(f"- {row['quantity']} ({row['where']}): {note}")
+    return "\n".join(lines)
+
+
+def markdown(pages):
+    """The README's table: every measured quantity of {paper: page}; parameters that are only quoted are left out."""
+    lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
+    for paper, page in pages.items():
+        for r in page["rows"]:
+            if r["verdict"] in (QUOTED, UNMEASURED):
+                continue
+            unit = f" {r['unit']}" if r["unit"] else ""
+            mine = _cell(r["measured"]) + ("" if isinstance(r["measured"], str) else unit)
+            theirs = _cell(r["published"]) + ("" if isinstance(r["published"], str) else unit)
+            why = f": {r['reason']}" if r["reason"] and r["verdict"] != REPRODUCED else ""
+            lines.append(
+                "| " + " | ".join(c.replace("|", "\\|") for c in (paper, r["quantity"], theirs, mine, r["verdict"] + why)) + " |"
+            )
+    return "\n".join(lines)
