@@ -5,4 +5,4 @@ from jaxtank.observers.disturbance import DisturbanceObserver
 from jaxtank.observers.extended_kalman import ExtendedKalman
 from jaxtank.observers.kalman import Kalman
 
-__all__ = ["Direct", "DisturbanceObserver", "Observer"]
+__all__ = ["Direct", "DisturbanceObserver", "ExtendedKalman", "Kalman", "Observer"]

@@ -1,0 +1,79 @@
+"""Steady-state Kalman filter about an operating point."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.analysis import linearise
+from jaxtank.errors import InputError
+from jaxtank.linear import discrete_riccati, zero_order_hold
+from jaxtank.observers.base import Observer
+from jaxtank.plants.base import Plant
+from jaxtank.records import Estimate
+from jaxtank.tree import component, leaf, static
+
+
+@component
+class Kalman(Observer):
+    """Linear Kalman filter in current form, with the gain it settles at, on the model linearised at (levels, inputs).
+
+        x_hat = x_prior + L (y - C x_prior),      L = P C' (C P C' + R)^-1
+        x_prior(k+1) = xo + Ad (x_hat - xo) + Bd (u - uo) + drift,   (Ad, Bd) sampled with the input held
+
+    P is the prior covariance of the steady filter (Kalman 1960; discrete Riccati equation), Q = process * dt, R = measurement. The drift is
+    the model's rate at (xo, uo), 0 where it rests there. u is the input after the pumps' limits. Levels that are not in `measured` are
+    estimated from the rest.
+    """
+
+    model: Plant
+    levels: np.ndarray = leaf("cm", "(n,) operating levels xo", low=0.0)
+    inputs: np.ndarray = leaf("V", "(m,) operating inputs uo")
+    process: np.ndarray = leaf("cm^2/s", "(n,) variance that each level's own disturbance gains per second", low=0.0, strict=True)
+    measurement: np.ndarray = leaf(
+        "cm^2", "(n,) variance of each sensor's noise; of unmeasured tanks not used", low=0.0, strict=True
+    )
+    measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
+
+    def design(self, dt):
+        """(Ad (n, n), Bd (n, m), drift (n,) [cm], L (n, measured)) for sampling every dt [s]."""
+        A, B, _ = linearise(self.model, self.levels, self.inputs)
+        rest = jnp.stack(self.model.derivative(0.0, tuple(jnp.asarray(self.levels)), tuple(jnp.asarray(self.inputs)), None))
+        Ad, held = zero_order_hold(A, jnp.concatenate([B, rest[:, None]], axis=1), dt)
+        C = jnp.eye(self.model.tanks)[np.array(self.measured)]
+        R = jnp.diag(jnp.asarray(self.measurement)[np.array(self.measured)])
+        P = discrete_riccati(Ad.T, C.T, jnp.diag(jnp.asarray(self.process) * dt), R)
+        return Ad, held[:, :-1], held[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
+
+    def init(self, x0):
+        return x0
+
+    def step(self, state, tick, y):
+        L = self.design(tick.dt)[3]
+        innovation = [y[i] - state[i] for i in self.measured]
+        x = tuple(state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(len(state)))
+        return Estimate(x=x), x
+
+    def predict(self, state, tick, command, applied):
+        Ad, Bd, drift, _ = self.design(tick.dt)
+        n, m = range(len(state)), range(len(applied))
+        away, more = [state[i] - self.levels[i] for i in n], [applied[j] - self.inputs[j] for j in m]
+        return tuple(self.levels[i] + drift[i] + sum(Ad[i, j] * away[j] for j in n) + sum(Bd[i, j] * more[j] for j in m) for i in n)
+
+    def check(self, plant):
+        check_measured(self, plant)
+        if np.shape(self.inputs) != (plant.pumps,):
+            raise InputError(f"observer.inputs has shape {np.shape(self.inputs)}: must be ({plant.pumps},), one per pump")
+
+
+def check_measured(observer, plant):
+    """Raise InputError unless the observer's model and leaves fit the plant and `measured` names its tanks, each once."""
+    n = plant.tanks
+    if observer.model.tanks != n or observer.model.pumps != plant.pumps:
+        raise InputError(
+            f"observer.model has {observer.model.tanks} tanks and {observer.model.pumps} pumps, the plant {n} and {plant.pumps}"
+        )
+    for name in ("levels", "process", "measurement"):
+        if hasattr(observer, name) and np.shape(getattr(observer, name)) != (n,):
+            raise InputError(f"observer.{name} has shape {np.shape(getattr(observer, name))}: must be ({n},), one per tank")
+    tanks = observer.measured
+    if not tanks or len(set(tanks)) != len(tanks) or not all(0 <= i < n for i in tanks):
+        raise InputError(f"observer.measured = {tanks}: must name at least one of the {n} tanks, counted from 0, each once")
