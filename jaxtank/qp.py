@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 MU_MIN = 1e-12
-"""Complementarity at which iterates stop, in the scaled problem. Gradients are then right to 1e-5 .. 4e-4 where rows bind: 1e-10
-biases small components by percents, 1e-13 loses digits in the normal matrix (khalid spec C.3)."""
+"""Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a closed loop by percents, 1e-13 loses
+digits in the normal matrix (khalid spec C.3)."""
 
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
 BACK = 0.99  # share of the way to the nearest bound that a step may go
@@ -30,7 +30,7 @@ class Point(NamedTuple):
     ll: jax.Array
 
 
-def solve(H, f, G, l, u, iterations=15):  # noqa: E741  (l and u are the names of the field)
+def solve(H, f, G, l, u, iterations=15):
     """x (n,) that minimises 1/2 x'Hx + f'x within l <= G x <= u.
 
     H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u; iterations: 12 to 15 are enough for the
@@ -42,14 +42,18 @@ def solve(H, f, G, l, u, iterations=15):  # noqa: E741  (l and u are the names o
     fixed = jax.lax.stop_gradient((H, f, G, l, u))
     point = jax.lax.stop_gradient(interior_point(*fixed, iterations))
     x, su, sl, lu, ll = point
-    normal = _normal(fixed[0], fixed[2], point)
-    # The conditions with the multipliers eliminated: their rows l*(u - Gx)/su carry the slopes of G, l and u. Values cancel in
-    # r - stop_gradient(r), so that only derivatives are left of the step.
-    r = H @ x + f + G.T @ (lu - ll) - fixed[2].T @ (lu * (u - G @ x) / su - ll * (G @ x - l) / sl)
-    return x - cholesky_solve(normal, r - jax.lax.stop_gradient(r))
+    # Newton's equations of x and w = lu - ll with the slacks eliminated; each row is scaled so that every entry of the matrix is of the
+    # order of 1 (`_normal` would lose H in the shadow of binding rows). The point is stopped, so that only derivatives are left of r.
+    up, low = lu / su, ll / sl
+    both = up + low
+    row = jnp.sqrt(jnp.minimum(both, 1.0))
+    held_H, held_G = fixed[0], row[:, None] * fixed[2]
+    matrix = jnp.block([[held_H, held_G.T], [held_G, -jnp.diag(jnp.minimum(1.0, 1.0 / both))]])
+    r = jnp.concatenate([H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)])
+    return x - jnp.linalg.solve(matrix, r - jax.lax.stop_gradient(r))[: x.shape[0]]
 
 
-def interior_point(H, f, G, l, u, iterations):  # noqa: E741
+def interior_point(H, f, G, l, u, iterations):
     """The last iterate, a `Point`, of `iterations` predictor-corrector steps; arguments as in `solve`. Not for differentiation."""
     rows = G.shape[0]
     x = jnp.zeros_like(f)
@@ -94,11 +98,6 @@ def _reach(p, step, back):
     """The largest share, at most 1, of `step` that keeps slacks and multipliers positive, short of the bound by `back`."""
     shares = [jnp.min(jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0)) for v, d in zip(p[1:], step[1:])]
     return jnp.minimum(1.0, jnp.min(jnp.stack(shares)))
-
-
-def cholesky_solve(A, b):
-    """A^-1 b for A (n, n) symmetric positive definite and b (n,)."""
-    return _substitute(_factor(A), b)
 
 
 def _factor(A):
