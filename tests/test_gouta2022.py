@@ -340,14 +340,6 @@ def test_gradient_of_the_default_cost(name):
             assert error < 1e-5 * max(abs(found[1]), flat), (entry, slopes[n][index], found)
 
 
-@pytest.mark.parametrize("name", list(CASES))
-def test_every_case_compiles_to_one_function(name):
-    from jaxtank.loop import _evaluate
-
-    compiled = _evaluate.lower(CASES[name].loop, CASES[name].clock, ("rms_error_total", "max_level"), None, False).compile()
-    assert compiled.as_text().count('xla_cpu_small_call="true"') >= 1
-
-
 def test_laws_refuse_what_they_cannot_invert(gouta):
     four = gouta("ngpc").loop.plant
     loop = CASES["chadpc"].loop

@@ -20,7 +20,7 @@ LAYERS = [
     {"presets"},
     {"rig", "plotting"},
 ]
-ABOVE = [{"bounds"}, {"objective"}, {"screening", "solvers"}, {"search"}, {"report"}, {"manual", "bench", "compare"}, {"cli"}]
+ABOVE = [{"bounds"}, {"objective"}, {"screening", "solvers"}, {"search"}, {"report"}, {"manual"}, {"bench", "compare"}, {"cli"}]
 RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer}
 RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for room in layer}
 

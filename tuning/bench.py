@@ -1,6 +1,7 @@
 """`jaxtank bench`: what a closed-loop step costs here, beside a C loop of the same arithmetic."""
 
 import ctypes
+import re
 import shutil
 import statistics
 import subprocess
@@ -15,6 +16,7 @@ from jaxtank import loop as lp
 from jaxtank import presets
 from jaxtank.tree import with_values
 from tuning import report
+from tuning.manual import noisy
 from tuning.search import provenance
 
 MEASURES = ("rms_error_total", "max_level")
@@ -154,3 +156,52 @@ def text(found):
             f"the two agree to {found['difference_to_c_cm']:.1e} cm",
         ]
     return "\n".join([*lines, *found["notes"]])
+
+
+def is_one_function(program, samples):
+    """True if the time loop (the loop of `samples` turns) of a compiled program's text is one that XLA runs as one function."""
+    small = set(re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program))
+    inside = None
+    for line in program.splitlines():
+        if line.startswith(("%", "ENTRY")):
+            inside = line.split()[0]
+        elif " while(" in line and f'"known_trip_count":{{"n":"{samples}"}}' in line and inside in small:
+            return True
+    return False
+
+
+def measure_cases(cases, rounds=3):
+    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s"}} of {name: Case}: a run with two measures, median of `rounds`."""
+    found = {}
+    for name, case in cases.items():
+        key = jax.random.key(0) if noisy(case) else None
+        program = lp._evaluate.lower(case.loop, case.clock, MEASURES, key, False)
+        began = time.perf_counter()
+        text_of_program = program.compile().as_text()
+        first = time.perf_counter() - began
+        seconds, _ = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
+        median = statistics.median(seconds[name])
+        found[name] = {
+            "ns_per_step": 1e9 * median / case.clock.samples,
+            "ms": 1e3 * median,
+            "samples": case.clock.samples,
+            "one_function": is_one_function(text_of_program, case.clock.samples),
+            "first_call_s": first,
+        }
+    return found
+
+
+def text_of_cases(found):
+    """The page of `jaxtank bench CASE ...`."""
+    rows = [
+        [
+            name,
+            f"{r['ns_per_step']:.0f}",
+            r["samples"],
+            f"{r['ms']:.2f}",
+            "yes" if r["one_function"] else "no",
+            f"{r['first_call_s']:.1f}",
+        ]
+        for name, r in found.items()
+    ]
+    return report.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"])

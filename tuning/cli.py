@@ -100,6 +100,7 @@ def parser():
     compare.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
     compare.add_argument("--markdown", action="store_true", help="as the table of the README")
     bench = commands.add_parser("bench", parents=[common], help="ns per closed-loop step here, beside a C loop")
+    bench.add_argument("cases", nargs="*", metavar="CASE", help='cases to time instead, or "all"')
     bench.add_argument("--rounds", default="7", metavar="N", help="interleaved rounds to take the median of (default 7)")
     return top
 
@@ -386,6 +387,13 @@ def _bench(args):
     jax.config.update("jax_enable_x64", True)
     from tuning import bench, report
 
+    if args.cases:
+        from jaxtank import presets, rig
+
+        names = presets.names() if args.cases == ["all"] else args.cases
+        result = bench.measure_cases({name: rig.open_case(name) for name in names}, rounds)
+        print(report.dumps(result) if args.json else bench.text_of_cases(result))
+        return 0
     result = bench.measure(rounds)
     print(report.dumps(result) if args.json else bench.text(result))
     return 0

@@ -1,0 +1,25 @@
+"""Writes the README's table of papers: python tests/benchmarks/readme_table.py (about half a minute)."""
+
+import re
+from pathlib import Path
+
+import jaxtank  # noqa: F401  (before jax starts)
+
+README = Path(__file__).parents[2] / "README.md"
+BEGIN, END = "<!-- jaxtank compare all --markdown -->", "<!-- end -->"
+
+
+def table():
+    """The table that belongs between the marks."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxtank import presets
+    from tuning import compare
+
+    return compare.markdown({paper: compare.measure(paper) for paper in presets.PAPERS})
+
+
+if __name__ == "__main__":
+    text = README.read_text()
+    README.write_text(re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", text, flags=re.DOTALL))
