@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from scipy.optimize import fsolve
 
 import jaxtank
 from jaxtank import presets, rig
@@ -92,7 +93,7 @@ def test_the_law_is_a_feedback_linearisation_and_the_papers_form(point):
 
 @pytest.mark.parametrize("K_phi, K_y", [(0.02, 0.1), (0.02, 0.02), (0.05, 0.4)])
 def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
-    """e' = -K_phi e + a Y, Y' = -a e - K_y Y (spec A.3), the plant integrated by scipy at 1e-13 with exact roots."""
+    """e' = -K_phi e + a Y, Y' = -a e - K_y Y (spec A.3), the plant integrated by scipy at 1e-13 with a knee of 1e-12 m."""
     plant = rig.set_values(CASES["backstepping"], {"plant.knee": 1e-12}).loop.plant
     law = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
     r, h3r = 0.30, calofir.KAPPA * 0.30
@@ -121,7 +122,8 @@ TABLE = [  # spec A.6: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, saturate
 
 @pytest.mark.parametrize("name, K, rmse, over, under, up, down, rms_q, saturated, travel", TABLE)
 def test_acceptance_table(name, K, rmse, over, under, up, down, rms_q, saturated, travel):
-    """Tolerances of spec A.6: RMSE 1e-4 m, overshoots 0.1 points, times 2 s, saturation 0.003; flows to the digits printed."""
+    """Tolerances of spec A.6: RMSE 1e-4 m, overshoots 0.1 points, times 2 s, saturation 0.003; RMS and travel of the flow, for which
+    it states none, to half a unit of the last digit printed (1.03e-4 has three digits, the others four)."""
     case, t = run(name, gains(*K))
     e, u = t.e[:, 0], t.u[:, 0]
     values = jaxtank.evaluate(
@@ -135,10 +137,10 @@ def test_acceptance_table(name, K, rmse, over, under, up, down, rms_q, saturated
         times = [np.nonzero(np.abs(part) > 0.02 * step)[0][-1] + 1 for part, step in ((e[:600], 0.43), (e[600:], 0.18))]
         np.testing.assert_allclose(times, (up, down), atol=2)
         assert abs(float(values["settling_time"][0]) - max(up, down)) <= 3  # that of the last sample outside
-    assert abs(float(values["rms_input"][0]) - rms_q) <= 1e-8
+    assert abs(float(values["rms_input"][0]) - rms_q) <= 0.51e-8
     assert abs(np.mean((u <= 0) | (u >= 1e-4)) - saturated) <= 0.003
     if travel is not None:
-        np.testing.assert_allclose(float(values["input_travel"][0]), travel, rtol=5e-3)
+        assert abs(float(values["input_travel"][0]) - travel) <= (0.51e-6 if travel == 1.03e-4 else 0.51e-7)
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_the_constant_flow(name, rmse, errors):
     case = CASES[name]
     t = jax.tree.map(np.asarray, jaxtank.simulate(open_loop(case.loop), case.clock))
     assert abs(np.sqrt(np.mean(t.e**2)) - rmse) <= 1e-4
-    assert abs(np.sqrt(np.mean(t.u**2)) - 5.470e-5) <= 1e-8
+    assert abs(np.sqrt(np.mean(t.u**2)) - 5.470e-5) <= 0.51e-8
     if errors:
         np.testing.assert_allclose(t.e[[449, 1049], 0], errors, atol=5.1e-5)
 
@@ -163,19 +165,19 @@ FAULTS = {
     "c1*0.75": ("plant.pipe[0]", 0.75),
     "leak": None,
 }
-OFFSETS = [  # spec A.7: fault, h1r, offset at (.01,.01), (.02,.02), (.02,.1), (.05,.05), (.1,.1)
-    ("c2*0.75", 0.48, (-0.331, -0.012, -0.001, -0.065, -0.107)),
-    ("c2*0.75", 0.30, (-0.300, -0.015, 0.025, -0.028, -0.059)),
-    ("c2*1.25", 0.48, (0.120, 0.027, -0.010, 0.055, 0.111)),
-    ("c1*0.75", 0.48, (0.120, 0.088, -0.003, 0.082, 0.120)),
-    ("leak", 0.48, (-0.137, -0.044, -0.010, -0.008, -0.002)),
+OFFSETS = [  # spec A.7: fault, h1r, offset at (.01,.01), (.02,.02), (.02,.1), (.05,.05), (.1,.1), with u_s alone
+    ("c2*0.75", 0.48, (-0.331, -0.012, -0.001, -0.065, -0.107, 0.096)),
+    ("c2*0.75", 0.30, (-0.300, -0.015, 0.025, -0.028, -0.059, 0.060)),
+    ("c2*1.25", 0.48, (0.120, 0.027, -0.010, 0.055, 0.111, -0.045)),
+    ("c1*0.75", 0.48, (0.120, 0.088, -0.00248, 0.0815, 0.120, 0.277)),  # printed -0.003 and 0.082: see below
+    ("leak", 0.48, (-0.137, -0.044, -0.010, -0.008, -0.002, -0.164)),
 ]
 OFFSET_GAINS = [(0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.05, 0.05), (0.1, 0.1)]
 
 
 @pytest.mark.parametrize("fault, r, offsets", OFFSETS)
 def test_permanent_faults(fault, r, offsets):
-    """h1 - h1r after 6000 s (spec A.7), to the digit printed."""
+    """h1 - h1r after 6000 s (spec A.7), to half a unit of the last digit; the constant flow without a rim, as the spec has it."""
     case = rig.set_values(CASES["backstepping"], {"clock.duration": 6000.0})
     plant = case.loop.plant
     values = {"plant.drain[0]": 0.2 * plant.pipe[0]} if FAULTS[fault] is None else {}
@@ -184,14 +186,52 @@ def test_permanent_faults(fault, r, offsets):
         values[name] = jaxtank.parameters(case.loop)[name[:-3]][int(name[-2])] * factor
     loop = dataclasses.replace(with_values(case.loop, values), reference=ramps([r], [], ramp=0.0))
     found = [float(jaxtank.simulate(with_values(loop, gains(*K)), case.clock, save_every=6000).e[-1, 0]) for K in OFFSET_GAINS]
-    np.testing.assert_allclose(found, offsets, atol=1.1e-3)
+    steady = OpenLoop(signal=ramps([calofir.C1 * np.sqrt(r * (1 - calofir.KAPPA))], [], ramp=0.0))
+    no_rim = dataclasses.replace(loop, controller=steady, plant=dataclasses.replace(loop.plant, overflow=False))
+    found.append(float(jaxtank.simulate(no_rim, case.clock, save_every=6000).e[-1, 0]))
+    np.testing.assert_allclose(found, offsets, atol=0.5e-3)
+
+
+@pytest.mark.parametrize("K, printed, rest, near", [((0.02, 0.1), -0.003, -0.0024795, [0.478, 0.08]),
+                                                    ((0.05, 0.05), 0.082, 0.0814987, [0.56, 0.09])])  # fmt: skip
+def test_offsets_of_a_narrowed_pipe(K, printed, rest, near):
+    """The two numbers of A.7 whose last digit is not ours: the balance at rest (scipy, exact roots, the law as in A.4) gives others.
+
+    They round to -0.002 and 0.081. The spec's own smoothed plant, at 1e-4 m and 1e-6 m, rests within 1e-7 m of the same.
+    """
+    h3r = calofir.KAPPA * 0.48
+
+    def balance(x):
+        s, Z, e = np.sqrt(x[1]), np.sqrt(x[0] - x[1]), x[1] - h3r
+        w = A * Z - B * s  # as the law sees it, with c1 as it was
+        Q = 2 * calofir.A * Z * (A - B * s / (2 * Z) + ((B / (2 * s) - sum(K)) * w - (K[0] * K[1] + A * A) * e) / A)
+        return [1e2 * (Q / calofir.A - 0.75 * A * Z), 1e2 * (0.75 * A * Z - B * s)]
+
+    x, _, solved, _ = fsolve(balance, near, full_output=True, xtol=1e-13)
+    assert solved == 1
+    assert abs(x[0] - 0.48 - rest) < 1e-7
+    assert 0.5e-3 < abs(x[0] - 0.48 - printed) < 0.55e-3
 
 
 def test_slopes_of_the_mean_square_error():
-    """Spec A.8, RMSE^2 by the logarithms of the gains; the spec's plant has another root below 1e-4 m."""
+    """Spec A.8, RMSE^2 by the logarithms of the gains.
+
+    The spec smooths both roots over 1e-4 m; our outlet's is exact above it. Measured: with both smoothed the slopes are 4.2e-6 and
+    4.5e-6 (relative) from ours; ours are within 1e-6 of the digits printed.
+    """
     case = CASES["backstepping"]
     f = lambda z: jaxtank.evaluate(with_values(case.loop, gains(*jnp.exp(z))), case.clock, "rms_error")["rms_error"][0] ** 2
-    np.testing.assert_allclose(jax.jacfwd(f)(np.log([0.02, 0.1])), (-1.714143e-4, -1.20920e-5), rtol=2e-4)
+    np.testing.assert_allclose(jax.jacfwd(f)(np.log([0.02, 0.1])), (-1.714143e-4, -1.20920e-5), rtol=1e-5)
+
+
+def test_the_landscape_is_symmetric():
+    """Spec A.8: J(K_phi, K_y) = J(K_y, K_phi) over a grid of gains, and it is not flat."""
+    case = CASES["backstepping"]
+    grid = jnp.logspace(-2, 0, 5)
+    f = lambda K_phi, K_y: jaxtank.evaluate(with_values(case.loop, gains(K_phi, K_y)), case.clock, "rms_error")["rms_error"][0]
+    found = np.asarray(jax.jit(jax.vmap(jax.vmap(f, (None, 0)), (0, None)))(grid, grid))
+    np.testing.assert_allclose(found, found.T, atol=1e-10)
+    assert np.ptp(found) > 0.02 and found.min() > 0.07705  # the spec's bound of every gain (A.6)
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -213,7 +253,7 @@ def test_exchanging_the_gains_changes_nothing():
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.floats(0.0, 0.6), st.floats(0.0, 1.0), st.lists(st.floats(0.0, 1e-4), min_size=5, max_size=5), st.floats(0.0, 1.0))
 def test_the_first_tank_is_never_below_the_second(h1, share, flows, leak):
-    """Spec A.2: for every flow, and with a leak up to c2. Within a Runge-Kutta step of 0.25 s, to the knee's 1e-4 m."""
+    """Spec A.2, by trial: five flows of 10 s each and a leak up to c2; h1 - h3 above -1e-6 m after every step of 0.25 s."""
     plant = with_values(calofir.rig(), {"drain[0]": leak * calofir.C2 / calofir.SPEED})
     x = (jnp.float64(h1), jnp.float64(h1 * share))
     for q in flows:
@@ -226,7 +266,7 @@ INTEGRATE = jax.jit(lambda plant, x, q: integrate(plant, "rk4", 0.0, x, (q,), No
 
 
 def test_empty_tanks_fill_with_floors_and_never_without():
-    """Spec A.10."""
+    """Spec A.10: RMS error 0.0890 m and 147 s with the floors; without the one under h1 - h3 no flow at all, 0.400 m."""
     _, t = run("backstepping", {"x0": [0.0, 0.0]})
     assert abs(np.sqrt(np.mean(t.e**2)) - 0.0890) <= 1e-4
     assert abs(np.nonzero(np.abs(t.e[:600, 0]) > 0.02 * 0.48)[0][-1] + 1 - 147) <= 2
@@ -286,14 +326,35 @@ def test_the_tanks_in_the_other_order():
         law.check(CASES["backstepping"].loop.reference)
 
 
+def verdicts(always=None, instead=None):
+    """Verdicts of the preset's claims, with the values `always` set in every run and the case names changed by `instead`."""
+    changed = lambda name, values={}, save_every=1: run((instead or {}).get(name, name), {**values, **(always or {})}, save_every)
+    found = presets.load("calofir").measured(changed)
+    return {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
+
+
 def test_what_is_measured():
-    found = presets.load("calofir").measured(run)
     preset = presets.load("calofir")
+    found = preset.measured(run)
     assert set(found) <= set(preset.published)
     for name in found:
         wanted = preset.published[name]
         if wanted.tolerance is not None:
             np.testing.assert_allclose(found[name], wanted.value, rtol=wanted.tolerance)
-    verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
-    assert verdicts["steady state follows very accurately"] == verdicts["reacts rapidly to faults"] == "reproduced"
-    assert verdicts["globally asymptotically stabilises"] == "not reproduced"
+    assert [v[0] for v in found.values() if hasattr(v, "verdict")] == [*["reproduced"] * 3, "partly", "not reproduced"]
+    assert "-0.0395 and -0.0490 m" in found["some steady state errors"].text  # the constant flow of spec A.6, measured
+
+
+@pytest.mark.parametrize("always, instead, changed", [
+    (gains(0.1, 0.1), None, {"reacts": "not reproduced"}),  # spec A.7: the offset by a closed outlet grows to -0.107 m
+    (gains(0.004, 0.004), None, {"steady state": "not reproduced", "reacts": "not reproduced", "same performance": "reproduced"}),
+    ({"controller.model.drain": [0.0, 0.9 * calofir.C2 / calofir.SPEED]}, None,
+     {"steady state": "not reproduced", "same performance": "not reproduced"}),
+    ({"controller.difference_floor": 1e-4}, None, {"globally": "reproduced"}),
+    (None, {"backstepping-perturbed": "backstepping"}, {"reacts": "not reproduced", "some steady state errors": "not reproduced"}),
+])  # fmt: skip
+def test_verdicts_follow_the_numbers(always, instead, changed):
+    found = verdicts(always, instead)
+    for words, verdict in changed.items():
+        (name,) = [n for n in found if n.startswith(words)]
+        assert found[name] == verdict, name
