@@ -80,7 +80,7 @@ class PumpBank:
 
     def deliver(self, state, u, dt):
         """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead zone, lag, delay."""
-        if self.dead_zone is not None:
+        if self.dead_zone is not None and self.dead_zone_kind != "offset":
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
             # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
@@ -95,6 +95,12 @@ class PumpBank:
             state = state._replace(line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1))
             u = out
         return u, state
+
+    def driving(self, u):
+        """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead zone, else u itself."""
+        if self.dead_zone is None or self.dead_zone_kind != "offset":
+            return u
+        return tuple(at_least(v - self.dead_zone[i], 0.0) for i, v in enumerate(u))
 
     def _dead_zone(self, state, u, dt):
         if self.dead_zone_kind == "hysteresis":
@@ -112,8 +118,6 @@ class PumpBank:
                 owed.append(jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt)))
                 paid.append(v + jax.lax.stop_gradient(pay - v))
             return tuple(paid), state._replace(owed=tuple(owed))
-        if self.dead_zone_kind == "offset":
-            return tuple(at_least(v - self.dead_zone[i], 0.0) for i, v in enumerate(u)), state
         return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
 
 

@@ -160,14 +160,14 @@ def _recovery(run, acc):
 
 def _update_travel(run, state, sample, window):
     previous, total, first = state
-    step = tuple(jnp.abs(v - p) for v, p in zip(sample.applied, previous))
-    return sample.applied, tuple(s + jnp.where(first, 0.0, d) for s, d in zip(total, step)), jnp.zeros_like(first)
+    step = tuple(jnp.abs(v - p) for v, p in zip(sample.u, previous))
+    return sample.u, tuple(s + jnp.where(first, 0.0, d) for s, d in zip(total, step)), jnp.zeros_like(first)
 
 
 ACCUMULATORS = {
     "e2": _sum(lambda run: run.outputs, lambda run, s: tuple(e * e for e in s.e)),
     "abs_e": _sum(lambda run: run.outputs, lambda run, s: tuple(jnp.abs(e) for e in s.e)),
-    "u2": _sum(lambda run: run.pumps, lambda run, s: tuple(u * u for u in s.applied)),
+    "u2": _sum(lambda run: run.pumps, lambda run, s: tuple(u * u for u in s.u)),
     "estimate2": _sum(lambda run: run.tanks, lambda run, s: tuple((a - b) * (a - b) for a, b in zip(s.x_hat, s.x))),
     "outside": _sum(lambda run: run.pumps, _outside),
     "saturation_excess": _sum(lambda run: run.pumps, _saturation_excess),
@@ -232,13 +232,13 @@ MEASURES = {
     "ise": Measure("cm^2 s", "output", ("e2",), _per_run("e2", lambda run: run.dt), "integral of the squared error"),
     "iae": Measure("cm s", "output", ("abs_e",), _per_run("abs_e", lambda run: run.dt), "integral of the absolute error"),
     "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
-    "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square of the input within the limits"),
+    "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square voltage"),
     "input_travel": Measure(
         "V",
         "pump",
         ("travel",),
         lambda run, acc: _list(acc["travel"][1]),
-        "sum of the absolute changes of the input within the limits",
+        "sum of the absolute changes of voltage",
     ),
     "saturated_fraction": Measure(
         "-",

@@ -49,9 +49,9 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
 def voltage(ax, trajectories, pump, low, high, unit="V"):
     """Input of one pump [unit], within its limits, over time [s], what lies outside its limits shaded."""
     for name, (run, colour, style) in trajectories.items():
-        ax.plot(run.t, run.applied[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
+        ax.plot(run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
     ax.set(title=f"pump {pump + 1}", ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
-    lowest, highest = (f([f(run.applied[:, pump]) for run, _, _ in trajectories.values()]) for f in (np.min, np.max))
+    lowest, highest = (f([f(run.u[:, pump]) for run, _, _ in trajectories.values()]) for f in (np.min, np.max))
     if highest - lowest < 0.1 * (high - low):  # limits far away say nothing
         return ax
     margin = 0.06 * (high - low)

@@ -127,7 +127,7 @@ def step(loop, clock, state, now):
     controller = loop.controller.track(controller, tick, command, applied)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, spilled = _advance(plant, clock, t, state.x, u, now.d)
+    x, spilled = _advance(plant, clock, t, state.x, loop.actuator.driving(u), now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
         t=t,
