@@ -386,13 +386,13 @@ def smooth(rig_):
     return SmoothRoots(**{f.name: getattr(rig_, f.name) for f in dataclasses.fields(rig_)})
 
 
-OPEN = [  # start [cm], time [s], levels [cm]; from empty tanks the first decimals depend on the root near 0: 3e-4 at 10 s, 2e-5 at 300 s
-    (0.0, 10, (2.1923, 1.5769, 1.2742, 1.8564), 4e-4),
-    (0.0, 50, (7.1137, 5.8463, 2.4665, 4.0582), 2e-4),
-    (0.0, 100, (9.2235, 7.9497, 2.6192, 4.5146), 2e-4),
-    (0.0, 300, (10.0751, 8.8728, 2.6331, 4.5953), 7e-5),
-    (15.0, 10, (16.9139, 15.9541, 11.7550, 12.5037), 6e-5),
-    (15.0, 100, (13.3104, 11.6515, 2.8384, 4.9823), 6e-5),
+OPEN = [  # start [cm], time [s], levels [cm]; the table is of the exact root, and that of the spec's code is 3e-4 off on the way from empty
+    (0.0, 10, (2.1923, 1.5769, 1.2742, 1.8564)),
+    (0.0, 50, (7.1137, 5.8463, 2.4665, 4.0582)),
+    (0.0, 100, (9.2235, 7.9497, 2.6192, 4.5146)),
+    (0.0, 300, (10.0751, 8.8728, 2.6331, 4.5953)),
+    (15.0, 10, (16.9139, 15.9541, 11.7550, 12.5037)),
+    (15.0, 100, (13.3104, 11.6515, 2.8384, 4.9823)),
 ]
 
 
@@ -404,10 +404,10 @@ def open_loop(start, dt, seconds, spec_root=False):
     return np.array(jax.jit(lambda x: jax.lax.fori_loop(0, round(seconds / dt), step, x))(zero))
 
 
-@pytest.mark.parametrize("start, t, levels, atol", OPEN)
-def test_open_loop(start, t, levels, atol):
-    np.testing.assert_allclose(open_loop(start, 0.1, t), levels, atol=atol)
-    np.testing.assert_allclose(open_loop(start, 0.1, t, True), levels, atol=4e-4 if t == 10 else 7e-5)
+@pytest.mark.parametrize("start, t, levels", OPEN)
+def test_open_loop(start, t, levels):
+    np.testing.assert_allclose(open_loop(start, 0.1, t), levels, atol=7e-5)
+    np.testing.assert_allclose(open_loop(start, 0.1, t, True), levels, atol=3e-4)
 
 
 def exact(start, seconds):
@@ -421,7 +421,7 @@ def test_error_of_the_integrator():
     end = exact(0.0, 100.0)
     for dt, error in ((0.1, 3.3e-7), (0.5, 4.2e-5), (1.0, 1.5e-4), (2.0, 4.6e-4), (5.0, 2.2e-3)):
         found = np.abs(open_loop(0.0, dt, 100.0, True) - end).max()
-        np.testing.assert_allclose(found, error, rtol=0.03)
+        np.testing.assert_allclose(found, error, rtol=0.04)  # two digits: half a unit of the last
         assert np.abs(open_loop(0.0, dt, 100.0) - end).max() < max(1.6 * error, 3e-4)  # our root, which differs by 2e-4 itself
     np.testing.assert_allclose(np.abs(open_loop(15.0, 1.0, 100.0, True) - exact(15.0, 100.0)).max(), 2.9e-8, rtol=0.05)
 
@@ -504,7 +504,8 @@ def test_cost_and_its_slopes(kind, spec_root):
     found, forward = jax.jit(lambda p: (cost(p), jax.jacfwd(cost)(p)))(point)
     if spec_root:
         np.testing.assert_allclose(found, expected, atol=1e-4)
-        np.testing.assert_allclose(forward, list(slopes.values()), rtol=3e-4, atol=6e-5)
+        for slope, printed in zip(forward, slopes.values()):
+            assert abs(slope - printed) <= 0.51 * 10.0 ** -len(str(printed).split(".")[1])  # half a unit of its last digit
     else:
         np.testing.assert_allclose(found, expected, rtol=2e-3)
         np.testing.assert_allclose(forward, list(slopes.values()), rtol=0.17)
@@ -515,7 +516,7 @@ def test_cost_and_its_slopes(kind, spec_root):
 
 def test_the_printed_law_never_arrives():
     _, trajectory = run("smc-printed")
-    np.testing.assert_allclose(trajectory.x[-1, :2], (7.53, 6.42), atol=0.01)
+    np.testing.assert_allclose(trajectory.x[2000:, :2].max(axis=0), (7.53, 6.42), atol=0.01)
     np.testing.assert_allclose([response(trajectory, i)["overshoot"] for i in range(2)], (-37.2, -46.5), atol=0.1)
     assert response(trajectory)["arrival"] is None
     np.testing.assert_allclose(response(trajectory)["mean_square"], 0.199, atol=1e-3)
@@ -616,7 +617,7 @@ def test_voltages_that_each_reading_would_need(reading, u):
     changed = with_values(case.loop, READINGS[reading]).plant
     np.testing.assert_allclose(steady_flows(changed, SETPOINT)[1], u, atol=5e-3)
     if u[1] < 0:
-        with pytest.raises(EquilibriumError, match="pump 2"):
+        with pytest.raises(EquilibriumError, match="tank 3"):
             equilibrium(changed, SETPOINT)
 
 
@@ -694,7 +695,7 @@ def test_limit_cycles_of_the_relay(reading, high, rms):
 def test_integral_action_from_empty_tanks():
     _, trajectory = run("lqi")
     np.testing.assert_allclose([response(trajectory, i)["overshoot"] for i in range(2)], (7.85, 3.86), atol=0.05)
-    assert np.abs(trajectory.e[-1]).max() < 2e-3
+    assert np.abs(trajectory.e[-1]).max() < 0.01
 
 
 def test_the_integrator_stands_while_a_pump_is_at_its_limit():
@@ -708,7 +709,6 @@ def test_the_integrator_stands_while_a_pump_is_at_its_limit():
 
 
 CASES = ("sfc", "smc", "hybrid", "smc-printed", "lqi")
-BUMPED = 1e-6  # step of a central difference, as a share of the value
 
 
 def cost_of(case):
@@ -760,8 +760,9 @@ def test_the_printed_law_has_no_useful_slopes():
 
 @pytest.mark.parametrize("name", CASES)
 def test_each_case_compiles_to_one_loop(name):
-    from jaxtank.loop import _evaluate
     from test_compiled_loop import loops_in
+
+    from jaxtank.loop import _evaluate
 
     case = load("mirakhorli").cases[name]
     compiled = _evaluate.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()
@@ -818,16 +819,14 @@ def test_the_rig_in_metres_runs_as_in_centimetres(name):
     np.testing.assert_allclose(a.command, b.command, rtol=1e-7, atol=1e-8)
 
 
-def test_batches_and_forward_equal_reverse():
-    case = load("mirakhorli").cases["lqi-warm"]
-    cost = lambda q: jaxtank.evaluate(with_values(case.loop, {"controller.Q[4]": q}), case.clock, "rms_error_total")[
-        "rms_error_total"
-    ]
+@pytest.mark.slow
+def test_batches_and_reverse_through_the_design_of_a_gain():
+    case, rms = load("mirakhorli").cases["lqi-warm"], "rms_error_total"
+    cost = lambda q, evaluate=jaxtank.evaluate: evaluate(with_values(case.loop, {"controller.Q[4]": q}), case.clock, rms)[rms]
     batch = jax.jit(jax.vmap(cost))(np.array([3e-4, 1e-3]))
     np.testing.assert_allclose(batch, [cost(3e-4), cost(1e-3)], rtol=1e-12)
-    reverse = jax.jit(jax.grad(lambda q: jaxtank.loop.evaluate_for_reverse(
-        with_values(case.loop, {"controller.Q[4]": q}), case.clock, "rms_error_total")["rms_error_total"]))(1e-3)  # fmt: skip
-    np.testing.assert_allclose(reverse, jax.jacfwd(cost)(1e-3), rtol=1e-9)
+    reverse = jax.jit(jax.grad(lambda q: cost(q, jaxtank.loop.evaluate_for_reverse)))(1e-3)
+    np.testing.assert_allclose(reverse, jax.jit(jax.jacfwd(cost))(1e-3), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
