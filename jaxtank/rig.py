@@ -43,7 +43,7 @@ from jaxtank.signals import Ramps, ramps
 from jaxtank.tree import _short, check_value, describe, get_value, is_component, walk, with_values
 
 TABLES = ("case", "name", "values", "reference", "limits", "free", "objective")
-REFERENCE_KEYS = ("initial", "changes", "ramp", "shape")
+REFERENCE_KEYS = ("initial", "changes", "ramp", "shape", "band")
 
 
 def open_case(name):
@@ -192,6 +192,7 @@ def dump(case):
         changes = [[t, i + 1, float(v)] for (t, i), v in zip(reference.changes, np.asarray(reference.targets))]
         lines += [f"changes = {_toml(changes)}  # time [s], output (from 1), level [{case.loop.units[0]}]"]
         lines += [f"ramp = {_toml(reference.ramp)}  # [s]", f"shape = {_toml(reference.shape)}"]
+        lines += [f"band = {_toml(reference.band)}  # settling band, as a share of the step"]
     lines += ["", "[limits]"] + [
         f"{m} = {_toml(np.asarray(v).tolist() if not isinstance(v, str) else v)}" for m, v in case.limits.items()
     ]
@@ -260,7 +261,9 @@ def _reference(table, old):
             raise InputError(f"reference.changes has {_short(change)}: must be {form}, finite numbers")
     ramp = _number("reference.ramp", table.get("ramp", old.ramp))
     check_value("reference.ramp", ramp, describe_field(Ramps, "ramp"))
-    return ramps(initial, [(float(t), i - 1, float(v)) for t, i, v in changes], ramp, table.get("shape", old.shape))
+    band = _number("reference.band", table.get("band", old.band))
+    check_value("reference.band", band, describe_field(Ramps, "band"))
+    return ramps(initial, [(float(t), i - 1, float(v)) for t, i, v in changes], ramp, table.get("shape", old.shape), band)
 
 
 def describe_field(cls, name):

@@ -87,6 +87,7 @@ def test_a_case_is_shown(name, capsys):
     assert "departures from the paper" in said and "controller." in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in NEW if n not in NOT_ONE_FUNCTION])
 def test_a_case_is_one_function(name):
     case = presets.find(name)

@@ -46,7 +46,6 @@ def summary(kind, *setting, **more):
     """What the tables print of a run, one entry per output or pump."""
     loop, run = closed(kind, *setting, **more)
     edge = khalid.edges(loop.reference, run)
-    u = np.concatenate([np.asarray(loop.actuator.initial)[None], run.u])
     held = (run.u < 3e-6) | (run.u > 3.0 - 3e-6)
     return {
         "rmse": np.sqrt(np.mean(run.e**2, axis=0)),
@@ -54,7 +53,7 @@ def summary(kind, *setting, **more):
         "under": [pair["overshoot"][1] for pair in edge],
         "settling": edge[0]["settling"],
         "rms_u": np.sqrt(np.mean(run.u**2, axis=0)),
-        "travel": np.abs(np.diff(u, axis=0)).sum(axis=0),
+        "travel": np.abs(np.diff(run.u, axis=0)).sum(axis=0),  # the change at t = 0 is not in it
         "held": held.mean(axis=0),
         "top": run.x[:, 0].max(),
     }
@@ -120,14 +119,16 @@ def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
 def test_incremental_model_predicts_the_plain_one():
     rng = np.random.default_rng(0)
     A, B, C = (np.asarray(m) for m in incremental_model(khalid.tanks(2), jnp.array(khalid.MIDDLE[2]), DT))
-    plain, u = rng.normal(size=2), rng.normal(size=2)
-    x = np.concatenate([np.zeros(2), plain])
-    settled = u  # u(k-1): with dx = 0 the plain model must have been at rest, so what it is driven by is u - u(k-1)
+    Am, Bm = A[:2, :2], B[:2]
+    now, u = rng.normal(size=2), rng.normal(size=2)
+    after = Am @ now + Bm @ u
+    x = np.concatenate([after - now, after])
     for _ in range(30):
-        u = u + rng.normal(size=2)
-        x = A @ x + B @ (u - settled)
-        plain, before, settled = plain + A[:2, :2] @ x[:2] * 0 + x[:2], plain, u
-        np.testing.assert_allclose(C @ x, plain, atol=1e-13)
+        before, u, now = u, rng.normal(size=2), after
+        after = Am @ now + Bm @ u
+        x = A @ x + B @ (u - before)
+        np.testing.assert_allclose(C @ x, after, atol=1e-12)
+        np.testing.assert_allclose(x[:2], after - now, atol=1e-12)
 
 
 # B.5, B.6: Laguerre functions and the cost
@@ -280,7 +281,7 @@ ONE_PUMP = [  # scenario, law, mode, du, RMSE, OS, US, ts up, down, RMS u, TV, s
     ("S1", "laguerre", QP, 0.1, 0.04396, 3.76, 0, 84, 94, 0.9507, 10.31, 0.09, 0.651),
     ("S1", "laguerre", CLIP, 0.1, 0.04386, 8.89, 0, None, None, 0.9708, 12.71, 0.09, 0.702),
 ]
-QUICK = {("laguerre", UNC), ("laguerre", QP), ("gpc", UNC)}  # compiled in the default run; a compilation takes 5 to 10 s
+QUICK = {("laguerre", UNC), ("laguerre", QP)}  # compiled in the default run; a compilation takes 5 to 10 s
 
 
 def rows(table, quick):
@@ -288,7 +289,7 @@ def rows(table, quick):
         yield pytest.param(row, marks=() if (row[1], row[2]) in quick else LATER, id="-".join(map(str, row[:4])))
 
 
-@pytest.mark.parametrize("row", rows(ONE_PUMP, QUICK))
+@pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):
     where, kind, mode, du, rmse, over, under, up, down, rms_u, travel, held, top = row
     got = summary(kind, where, mode, du=du)
@@ -321,8 +322,9 @@ def test_spot_values_constrained():
 
 
 def test_four_variables_come_within_five_percent_of_the_ten_of_gpc():
-    few, many = summary("laguerre"), summary("gpc")
-    np.testing.assert_allclose(few["rmse"], many["rmse"], rtol=0.05)
+    clock = dataclasses.replace(khalid.CLOCK, substeps=2)
+    few, many = (jaxtank.evaluate(khalid.build(kind), clock, "rms_error")["rms_error"] for kind in ("laguerre", "gpc"))
+    np.testing.assert_allclose(few, many, rtol=0.05)
     assert law("laguerre").design(DT)[0].shape == (4, 4) and law("gpc").design(DT)[0].shape == (10, 10)
 
 
@@ -344,7 +346,7 @@ TWO_PUMPS = [  # scenario, law, mode, r_w, RMSE, OS, US, TV; None: not printed
 
 @pytest.mark.parametrize(
     "row",
-    [pytest.param(row, marks=() if row[0] != "M3" and row[1:3] == ("laguerre-mimo", QP) else LATER) for row in TWO_PUMPS],
+    [pytest.param(row, marks=() if row[1:3] == ("laguerre-mimo", UNC) else LATER) for row in TWO_PUMPS],
     ids=lambda row: "-".join(map(str, row[:4])),
 )
 def test_rows_with_two_pumps(row):
@@ -409,9 +411,12 @@ def own_loop(kind, where, samples, limited, du=0.5):
         if limited:
             least = np.concatenate([np.full(ahead * pumps, -du), np.tile(-u, ahead)])
             most = np.concatenate([np.full(ahead * pumps, du), np.tile(3.0 - u, ahead)])
-            bounds = [{"type": "ineq", "fun": lambda z: np.concatenate([most - rows @ z, rows @ z - least]),
+            bounds = [{"type": "ineq", "fun": lambda z, most=most, least=least: np.concatenate([most - rows @ z, rows @ z - least]),
                        "jac": lambda z: np.concatenate([-rows, rows])}]  # fmt: skip
-            cost, slope = (lambda z: z @ Omega @ z + 2 * z @ Psi @ error), (lambda z: 2 * (Omega @ z + Psi @ error))
+            cost, slope = (
+                (lambda z, pull=Psi @ error: z @ Omega @ z + 2 * z @ pull),
+                (lambda z, pull=Psi @ error: 2 * (Omega @ z + pull)),
+            )
             found = minimize(
                 cost, np.zeros(len(eta)), jac=slope, method="SLSQP", constraints=bounds, options={"ftol": 1e-16, "maxiter": 300}
             )
@@ -473,17 +478,10 @@ def test_numbers_of_the_independent_check_where_references_are_out_of_reach():
 # what needs no reference run
 
 
-@functools.cache
-def coarse(kind, mode, **changes):
-    """A run of 200 samples with Runge-Kutta steps of 1 s, which compiles faster."""
-    loop = with_values(khalid.build(kind, mode=mode), dict(changes.get("values", ())))
-    return jax.tree.map(np.asarray, jaxtank.simulate(loop, COARSE))
-
-
 COARSE = dataclasses.replace(khalid.CLOCK, substeps=2, duration=398.0)
 
 
-@pytest.mark.parametrize("kind", ["laguerre", "gpc"])
+@pytest.mark.parametrize("kind", ["laguerre", pytest.param("gpc", marks=LATER)])
 def test_a_programme_whose_limits_are_far_is_the_linear_law(kind):
     loop = khalid.build(kind, mode=QP)
     far = {
@@ -511,7 +509,7 @@ def in_centimetres(loop):
         reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100))  # fmt: skip
 
 
-@pytest.mark.parametrize("kind, mode", [("laguerre", UNC), ("laguerre", QP)])
+@pytest.mark.parametrize("kind, mode", [("laguerre", UNC), pytest.param("laguerre", QP, marks=LATER)])
 def test_centimetres_change_nothing(kind, mode):
     loop = khalid.build(kind, mode=mode)
     metres, centimetres = jaxtank.simulate(loop, COARSE), jaxtank.simulate(in_centimetres(loop), COARSE)
@@ -519,7 +517,7 @@ def test_centimetres_change_nothing(kind, mode):
     np.testing.assert_allclose(centimetres.u, metres.u, atol=1e-6 if mode == QP else 1e-9)
 
 
-@pytest.mark.parametrize("kind, mode", [("laguerre-mimo", UNC), ("gpc-mimo", QP)])
+@pytest.mark.parametrize("kind, mode", [("laguerre-mimo", UNC), pytest.param("gpc-mimo", QP, marks=LATER)])
 def test_exchanged_tanks_give_exchanged_answers(kind, mode):
     """Tanks made unlike, then exchanged with all that belongs to them; the pipe joins the same two."""
     drain = np.array([78.5e-6, 60e-6])
@@ -546,19 +544,15 @@ def test_exchanged_tanks_give_exchanged_answers(kind, mode):
 
 
 def test_a_steady_state_stays():
-    for kind in ("laguerre", "gpc-mimo"):
+    for kind, x0 in (("laguerre", np.array([0.5, 0.1])), ("laguerre-mimo", np.array([0.1, 0.12]))):
         loop = khalid.build(kind)
-        x0 = np.array([0.5, 0.1]) if loop.plant.pumps == 1 else np.array([0.1, 0.12])
-        targets = np.full(np.shape(loop.reference.targets), 0.1) if loop.plant.pumps == 1 else None
-        ref = loop.reference
-        level = x0[1:] if loop.plant.pumps == 1 else x0
+        ref, pumps = loop.reference, loop.plant.pumps
+        level = x0 if pumps == 2 else x0[1:]
         targets = np.array([level[i] for _, i in ref.changes])
         loop = dataclasses.replace(loop, x0=x0, reference=dataclasses.replace(ref, initial=level, targets=targets))
-        loop = with_values(loop, {"actuator.initial": khalid.steady_input(loop.plant.pumps, x0)})
-        run = jaxtank.simulate(loop, COARSE)
-        np.testing.assert_allclose(
-            run.x, np.broadcast_to(x0, run.x.shape), atol=1e-8
-        )  # spec B.2; the knee's share of the roots is left
+        run = jaxtank.simulate(with_values(loop, {"actuator.initial": khalid.steady_input(pumps, x0)}), COARSE)
+        # the steady input is that of exact roots; those of the plant are short of them by (knee / x)^2 / 4
+        np.testing.assert_allclose(run.x, np.broadcast_to(x0, run.x.shape), atol=1e-7)
 
 
 def test_inputs_before_the_start_are_those_of_the_spec():
@@ -588,15 +582,15 @@ SLOPES = [  # case, {name: scale of the step}: every tunable leaf that the case 
 SLOPES += [(f"{name}-constrained", [*names, "du_limit", "u_high"]) for name, names in SLOPES]
 
 
-@pytest.mark.parametrize(
-    "name, names", [pytest.param(*row, marks=() if row[0] in ("laguerre", "laguerre-constrained") else LATER) for row in SLOPES]
-)
+@pytest.mark.parametrize("name, names", [pytest.param(*row, marks=() if row[0] == "laguerre" else LATER) for row in SLOPES])
 def test_slopes_of_the_default_cost(name, names):
     """Forward slopes of the cost that `tune` makes small against central differences, in the logarithms of the leaves.
 
     1e-5 of the largest. Runge-Kutta steps of 1 s, for the sake of compiling; 200 samples, an up and a down.
     """
     case = PRESET.cases[name]
+    if case.loop.controller.mode == QP:  # else u_high, moved up, would be felt no more: the pumps' own limit is at the same place
+        case = case.replace(loop=with_values(case.loop, {"actuator.low": -10.0, "actuator.high": 10.0}))
     names = [f"controller.{n}" for n in names]
     start, build = jax.flatten_util.ravel_pytree([jnp.log(jnp.asarray(jaxtank.parameters(case.loop)[n])) for n in names])
 
@@ -669,8 +663,10 @@ def test_the_loop_compiles_to_one_function(name):
 
 
 def test_every_case_passes_the_door():
-    for case in PRESET.cases.values():
-        rig.check(case)
+    for name, case in PRESET.cases.items():
+        jaxtank.loop.check(case.loop, case.clock, None)
+        if name in ("gpc", "gpc-mimo"):  # every plateau has a steady state
+            rig.check(case)
         assert set(case.free) <= set(jaxtank.parameters(case.loop)) | {"controller.operating_point[1]", "controller.q[1]"}
     assert PRESET.cases["gpc"].clock.samples == 600
 

@@ -130,11 +130,10 @@ def test_nearly_collinear_rows_of_laguerre_functions():
     assert np.linalg.svd(G[10:15])[1][0] / np.linalg.svd(G[10:15])[1][-1] > 1e3
     H = np.diag([0.28, 0.24, 0.2, 0.17]) * 2
     l, u = np.concatenate([np.full(15, -0.1), np.full(15, -0.6)]), np.concatenate([np.full(15, 0.1), np.full(15, 0.25)])
+    rows = [{"type": "ineq", "fun": lambda x: np.concatenate([u - G @ x, G @ x - l]), "jac": lambda x: np.concatenate([-G, G])}]
     for pull in (0.02, 0.1, 0.5):
         f = -pull * np.array([1.0, 0.6, 0.3, 0.1])
-        l, u = np.concatenate([np.full(15, -0.1), np.full(15, -0.6)]), np.concatenate([np.full(15, 0.1), np.full(15, 0.25)])
         x = np.asarray(solve(H, f, G, l, u))
-        rows = [{"type": "ineq", "fun": lambda x: np.concatenate([u - G @ x, G @ x - l]), "jac": lambda x: np.concatenate([-G, G])}]
         cost, slope = (lambda x, f=f: 0.5 * x @ H @ x + f @ x), (lambda x, f=f: H @ x + f)
         found = minimize(cost, np.zeros(4), jac=slope, method="SLSQP", constraints=rows, options={"ftol": 1e-15, "maxiter": 500})
         np.testing.assert_allclose(x, found.x, atol=1e-7)
