@@ -778,7 +778,13 @@ def leaves_of(case):
     return {n: v for n, v in jaxtank.parameters(case.loop).items() if n in tunable}
 
 
-@pytest.mark.parametrize("name", [n + suffix for n in CASES if n != "smc-printed" for suffix in ("", "-warm")])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("sfc", "smc-warm", "hybrid", "lqi"),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("sfc-warm", "smc", "hybrid-warm", "lqi-warm")),
+    ],
+)
 def test_slopes_of_the_default_cost_against_differences(name):
     """Along every tunable leaf, in every entry: forward equals central differences to 1e-5 of the largest slope of the leaf."""
     case = load("mirakhorli").cases[name]
@@ -850,7 +856,7 @@ def test_tanks_in_another_order_give_the_same_run(name):
 POWERS = {"surface": 0, "ks": 1, "phi": 1, "b": 1, "w": 1, "K": -1, "operating_point": 1}
 
 
-@pytest.mark.parametrize("name", ["sfc", "smc", "hybrid", "smc-printed", "lqi"])
+@pytest.mark.parametrize("name", [pytest.param("sfc", marks=pytest.mark.slow), "smc", "hybrid", "smc-printed", "lqi"])
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
     from test_physics import in_metres
 
