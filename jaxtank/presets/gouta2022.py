@@ -102,7 +102,9 @@ PUBLISHED = {
     "RMS voltage of ENMPC": Published(
         (8.29, 9.39), "V", "Table 3", 0.1, "discharge coefficients of 1: more flow per volt is needed"
     ),
-    "RMS voltage of ENMPC, paper-like rig": Published((8.29, 9.39), "V", "Table 3", 0.1, "rig fitted to the paper, one draw of its noise"),
+    "RMS voltage of ENMPC, paper-like rig": Published(
+        (8.29, 9.39), "V", "Table 3", 0.1, "rig fitted to the paper, one draw of its noise"
+    ),
     "settling time of ENMPC": Published((25.0, 41.0), "s", "Table 3", 0.2, "pump of the ideal rig is stronger (spec 5.3)"),
     "settling time of ENMPC, paper-like rig": Published(
         (25.0, 41.0), "s", "Table 3", 0.2, "rig fitted to the paper, one draw of its noise"

@@ -195,7 +195,7 @@ def edges(reference, run, dt=2.0):
 def measured(run):
     """What can be measured of PUBLISHED (see presets.base.Preset): the claims at the reference point, r_w = 0.01 in S2 and M2.
 
-    Runge-Kutta steps of 1 s instead of 0.25 s, which compile faster and change no figure here by its last digit (RMS by 2e-7 m).
+    Runge-Kutta steps of 1 s instead of 0.25 s, which compile faster and move no RMS error here by more than 2e-7 m.
     """
     error, over, values = {}, {}, {}
     for kind in LAWS:
@@ -264,8 +264,8 @@ def preset():
                 clock=CLOCK,
                 limits={"max_level": "rim"},
                 free={name: TUNABLE[name.replace("q[1]", "q")] for name in free},
-                # travel costs a tenth of the error: RMS alone is flat once the pumps saturate (spec D)
-                objective={"rms_error_total": 1.0, "input_travel": 1e-4},
+                # RMS alone is flat once the pumps saturate (spec D); at 1e-4 per U0 r_w still runs to its lower bound without limits
+                objective={"rms_error_total": 1.0, "input_travel": 3e-4},
             )
     return Preset(
         paper="khalid",
