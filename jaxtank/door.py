@@ -3,7 +3,6 @@
 import jax
 import numpy as np
 
-from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.records import check_clock
 from jaxtank.tree import check_leaves
@@ -26,7 +25,7 @@ def check(loop, clock, key=None):
         raise InputError(
             f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks: give one inflow per tank"
         )
-    if actuator.saturation == "boxqp" and (plant.pumps != 2 or type(loop.controller).input_metric is Controller.input_metric):
+    if actuator.saturation == "boxqp" and (plant.pumps != 2 or not loop.controller.allocates):
         raise InputError("actuator.saturation = 'boxqp': needs two pumps and a law with a cost to allocate by (its input_metric)")
     samples = actuator.delay / clock.dt
     if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):

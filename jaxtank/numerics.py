@@ -89,6 +89,12 @@ def clip(x, low, high):
     return jnp.where(x < low, low, jnp.where(x > high, high, x))
 
 
+def portion(x, low, high):
+    """How much of [low, high] lies below `x`: 0, x - low, or high - low. Slope 1 inside, 0 outside and 1/2 at the two ends, where a
+    central difference finds the same: of pieces that meet at a knot, the mean of both slopes and not their sum."""
+    return jnp.minimum(jnp.maximum(x, low), high) - low
+
+
 def quantise(x, step):
     """`x` rounded to a multiple of `step` (> 0), as an ADC does. The slope is 1: the mean of a staircase, whose true slope
     is 0 almost everywhere and says nothing of a change larger than one step."""

@@ -56,14 +56,19 @@ def number(value):
 
 
 def walk(tree, prefix="", kind="leaf", units=DEFAULT):
-    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`, units as the rig counts."""
+    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`, units as the rig counts.
+
+    A component whose fields mean what another one's do (the gains in `controllers.Scheduled`) has a method `metadata_of(field)` that returns
+    what to change of the class's metadata; "rows" in it is the metadata of each row of an array.
+    """
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
             yield from walk(value, f"{name}.", kind, units)
         elif field.metadata.get("kind") == kind:
-            yield name, value, {**field.metadata, "unit": local(field.metadata["unit"], units)}
+            own = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
+            yield name, value, _localised({**field.metadata, **own}, units)
 
 
 def parameters(tree):
@@ -77,7 +82,8 @@ def describe(tree, name):
     for kind in ("leaf", "static"):
         for other, _, meta in walk(tree, kind=kind):
             if other == base:
-                return meta
+                index = split_index(name)[1] if meta.get("rows") else ()
+                return meta["rows"][index[0]] if index and index[0] < len(meta["rows"]) else meta
     raise unknown("parameter", name, _all_names(tree))
 
 
@@ -156,6 +162,11 @@ def _short(value):
     except (ValueError, RecursionError):  # an int of thousands of digits, or a list in a list in a list ...
         return f"a {type(value).__name__} too large to print"
     return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _localised(meta, units):
+    rows = {"rows": tuple(_localised(row, units) for row in meta["rows"])} if "rows" in meta else {}
+    return {**meta, "unit": local(meta["unit"], units), **rows}
 
 
 def _all_names(tree):

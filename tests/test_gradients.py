@@ -55,7 +55,7 @@ def agree(case, names, measure="rms_error_total", rtol=1e-5, atol=1e-9, step=STE
         ("backstepping-ff", ["controller.k", "controller.k1"]),
     ],
 )
-@pytest.mark.parametrize("ramp", [60.0, 30.0])
+@pytest.mark.parametrize("ramp", [60.0, pytest.param(30.0, marks=pytest.mark.slow)])
 def test_published_gains_in_plant_b(gouta, name, names, ramp):
     agree(gouta(name, {"reference.ramp": ramp}), names)
 
@@ -116,7 +116,7 @@ def test_equal_levels(gouta):
     agree(case, ["controller.k", "controller.k1"])
 
 
-@pytest.mark.parametrize("ramp", [30.0, 20.0])
+@pytest.mark.parametrize("ramp", [30.0, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_through_the_box_qp(gouta, ramp):
     agree(gouta("ngpc-boxqp", {"reference.ramp": ramp, "clock.dt": 0.05}), ["controller.Tp"])
 

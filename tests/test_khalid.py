@@ -468,6 +468,7 @@ def test_against_a_loop_with_slsqp():
     np.testing.assert_allclose(run.u[:60], inputs, atol=2e-5)
 
 
+@LATER
 def test_against_a_loop_with_slsqp_and_two_pumps():
     _, run = closed("laguerre-mimo", "M2", QP)
     levels, inputs = own_loop("laguerre-mimo", "M2", 25, limited=True)
@@ -626,6 +627,7 @@ def test_slopes_of_the_default_cost(name, names):
     np.testing.assert_allclose(forward, central, atol=1e-5 * np.abs(central).max(), rtol=1e-4)
 
 
+@LATER
 @pytest.mark.parametrize("samples", [150])
 def test_slopes_of_the_prototype_through_150_programmes(samples):
     """Spec C.2, one pump: J = 1e4 mean(e^2) + 0.1 mean(du^2), S2, du 0.5, by (log r_w, logit a): (.1438265, -.0759848).

@@ -128,7 +128,7 @@ def test_the_extended_filter_beats_noise_and_open_loop_prediction(gouta):
     assert np.sum(ekf**2) < 0.5 * np.sum(blind**2)
 
 
-@pytest.mark.parametrize("make", [kalman, extended])
+@pytest.mark.parametrize("make", [kalman, pytest.param(extended, marks=pytest.mark.slow)])
 def test_gradients_by_the_variances(gouta, make):
     loop, clock = noisy(gouta, make())
     names = [f"observer.{n}[{i}]" for n in ("process", "measurement") for i in (0, 1)]

@@ -15,6 +15,7 @@ from tuning.objective import Limit, Point, Problem
 from tuning.screening import coarse_clock, distinct_starts, screen, sobol, spectral_radius
 from tuning.solvers import METHODS, Search, optimality
 
+LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 
 
@@ -31,6 +32,7 @@ def test_ngpc_on_tracking_error_alone(gouta):
     assert len(result.starts) == 8 and all(s["cost"] < 0.0405 for s in result.starts)
 
 
+@pytest.mark.slow
 def test_backstepping_on_tracking_error_alone(gouta):
     """RMS 0.506 -> at most 0.048 cm."""
     result = tuning.tune(gouta("backstepping"), limits={})
@@ -115,7 +117,7 @@ def test_the_true_step_decides_on_gains_that_only_the_coarse_step_makes_unstable
 PENALISED = {"rms_error_total": 1.0, "rms_over_rim": 1.0, "saturation_excess": 0.5}
 
 
-@pytest.mark.parametrize("Tp", [3.0, 46.0])
+@pytest.mark.parametrize("Tp", [pytest.param(3.0, marks=pytest.mark.slow), 46.0])
 def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     """D = 30 s, penalised cost of spec 10: minima at 7.33 s (1.796) and 46 s (2.257), a ridge near 24 s between."""
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
@@ -139,7 +141,7 @@ def quick(gouta, name="backstepping", values=None, **options):
     return tuning.tune(gouta(name, {**FAST, **(values or {})}), **{"starts": 2, "screening": 8, **options})
 
 
-@pytest.mark.parametrize("method", ["slsqp", "lbfgs", "adam"])
+@pytest.mark.parametrize("method", [LBFGS, "adam"])
 def test_every_method_improves_and_holds_the_limits(gouta, method):
     result = quick(gouta, method=method, limits={"max_level": 29.5}, iterations=40, starts=1)
     assert all(c["margin"] >= 0 for c in result.constraints)
@@ -147,7 +149,7 @@ def test_every_method_improves_and_holds_the_limits(gouta, method):
     assert result.objective["after"] < 1.02 * best.objective["after"]
 
 
-@pytest.mark.parametrize("method", ["trf", "slsqp", "lbfgs", "adam"])
+@pytest.mark.parametrize("method", ["trf", "slsqp", LBFGS, "adam"])
 def test_every_method_finds_the_unlimited_optimum(gouta, method):
     result = quick(gouta, "ngpc", method=method, limits={})
     best = quick(gouta, "ngpc", method="trf", limits={})

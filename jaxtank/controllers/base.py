@@ -36,5 +36,10 @@ class Controller(abc.ABC):
         """(g11, g12, g22): how the law's cost weighs a change of its two inputs, for allocation by box QP; None if it has none."""
         return None
 
+    @property
+    def allocates(self):
+        """True if the law has an `input_metric`, so that its inputs can be allocated by box QP."""
+        return type(self).input_metric is not Controller.input_metric
+
     def check(self, reference):  # noqa: B027  (a law with nothing to check need not say so)
         """Raise InputError if the law cannot serve this reference, or its model is not of the kind it inverts."""
