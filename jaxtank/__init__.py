@@ -53,6 +53,7 @@ _ROOMS = (
     "presets",
     "records",
     "rig",
+    "scheduling",
     "sensors",
     "signals",
     "tree",

@@ -12,6 +12,11 @@ initial = [3.0, 3.0]
 changes = [[20.0, 1, 8.0]]   # time [s], output (from 1), level
 ramp = 60.0
 
+[schedule]                   # gains that follow a setpoint (r1, r2 ..) or a level (h1, h2 ..); their values are "controller.values"
+gains = ["controller.k", "controller.k1"]
+variable = "r1"
+knots = [5.0, 10.0, 15.0]
+
 [limits]                     # hard limits of `tune`
 max_level = "rim"
 
@@ -31,7 +36,7 @@ import jax
 import numpy as np
 
 from jaxtank import loop as lp
-from jaxtank import presets
+from jaxtank import presets, scheduling
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
@@ -42,7 +47,7 @@ from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.signals import Ramps, ramps
 from jaxtank.tree import _short, check_value, describe, get_value, is_component, walk, with_values
 
-TABLES = ("case", "name", "values", "reference", "limits", "free", "objective")
+TABLES = ("case", "name", "values", "reference", "schedule", "limits", "free", "objective")
 REFERENCE_KEYS = ("initial", "changes", "ramp", "shape", "band")
 
 
@@ -82,7 +87,7 @@ def from_table(table):
     case = case.replace(name=table.get("name", case.name))
     if "reference" in table:
         case = case.replace(loop=dataclasses.replace(case.loop, reference=_reference(table["reference"], case.loop.reference)))
-    case = set_values(case, table.get("values", {}))
+    case = set_and_schedule(case, table.get("values", {}), table.get("schedule", {}))
     if "limits" in table:
         case = case.replace(limits=check_limits(case.loop, table["limits"]))
     if "objective" in table:
@@ -126,12 +131,14 @@ def check_free(loop, name, low, high, scale="log"):
         meta = describe(loop, name)
     if meta["kind"] == "static":
         raise InputError(f"free {name}: cannot be tuned, it is part of the compiled program and not a number with a derivative")
+    scheduling.check_not_scheduled(loop, name)
     get_value(loop, name)
     unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise InputError(f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
     for end in (low, high):
-        check_value(f"free {name}", end, meta)
+        for row in meta.get("rows") or (meta,):  # an array whose rows are different things
+            check_value(f"free {name}", end, row)
     if scale not in ("log", "linear"):
         raise InputError(f"free {name}: scale {scale!r} must be log or linear")
     return Free(float(low), float(high), scale if low > 0 else "linear")
@@ -169,20 +176,42 @@ def set_values(case, values):
             continue
         if not _is_numeric(value):
             raise InputError(f"{name} = {_short(value)}: must be a number or a list of numbers{_unit(meta)}")
+        scheduling.check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         check_value(name, get_value(loop, name), meta)
         case = case.replace(loop=loop)
     return case
 
 
+def set_and_schedule(case, values, table):
+    """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What the case has by name is set before the
+    schedule is made, which starts from it; what only the scheduled case has, as controller.values, after."""
+    if table:
+        before, values = scheduling.known(case.loop, values)
+        case = scheduling.from_table(set_values(case, before), table)
+    return set_values(case, values)
+
+
 def dump(case):
     """The complete rig file of `case` as text: every leaf, every static field that a file may set, reference, limits, free, objective."""
-    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", "", "[values]"]
+    table = scheduling.table_of(case.loop)
+    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", ""]
+    lines += ["[schedule]", *(f"{key} = {_toml(value)}" for key, value in table.items()), ""] if table else []
+    lines += ["[values]"]
+    whole = ("controller.knots", "controller.variable") if table else ()
     for name, value, meta in walk(case.loop):
-        if value is not None and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps)):
+        if (
+            value is not None
+            and name not in whole
+            and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps))
+        ):
             lines.append(_line(name, np.asarray(value).tolist(), meta))
     for name, value, meta in walk(case.loop, kind="static"):
-        if not isinstance(value, tuple) and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps)):
+        if (
+            not isinstance(value, tuple)
+            and name not in whole
+            and not (name.startswith("reference.") and isinstance(case.loop.reference, Ramps))
+        ):
             lines.append(_line(name, value, meta))
     for name, unit in CLOCK_UNITS.items():
         lines.append(_line(f"clock.{name}", getattr(case.clock, name), {"unit": unit, "doc": ""}))
@@ -208,11 +237,12 @@ def save(case, path):
 
 def _origin(case):
     """The preset that a case came from: one with the same components, so that values are all there is to set."""
-    structure = jax.tree.structure(_plain(case.loop))
+    loop = scheduling.unscheduled(case.loop)
+    structure = jax.tree.structure(_plain(loop))
     alike = [c for p in presets.PAPERS for c in presets.load(p).cases.values() if jax.tree.structure(_plain(c.loop)) == structure]
     if not alike:
         raise InputError(f"{case.name}: no preset has these components, so the case cannot be written as a rig file")
-    mine = _statics(case.loop)
+    mine = _statics(loop)
     # its own preset, or the one with the most in common: its title is the one the file will show
     return max(alike, key=lambda c: (c.name == case.name, sum(a == b for a, b in zip(mine, _statics(c.loop))))).name
 
@@ -306,6 +336,10 @@ def _set_static(tree, name, path, value, meta):
                 f"{name} = {value!r}: must be one of {', '.join(str(c).lower() if isinstance(c, bool) else c for c in meta['choices'])}"
             )
         return dataclasses.replace(tree, **{path[0]: value})
+    if isinstance(old, str):  # a text of which the component itself knows what it may be
+        if not isinstance(value, str):
+            raise InputError(f"{name} = {_short(value)}: must be a text")
+        return dataclasses.replace(tree, **{path[0]: value})
     value = _number(name, value)
     check_value(name, value, meta)
     if isinstance(old, int) and not value.is_integer():
@@ -353,4 +387,4 @@ def _toml(value):
     return repr(value)
 
 
-__all__ = ["Case", "check", "dump", "from_table", "load", "open_case", "save", "set_values"]
+__all__ = ["Case", "check", "dump", "from_table", "load", "open_case", "save", "set_and_schedule", "set_values"]

@@ -8,7 +8,7 @@ import tuning
 
 LAYERS = [
     {"errors", "_xla", "files", "units"},
-    {"tree", "numerics", "invariants"},
+    {"tree", "numerics", "invariants", "dependence"},
     {"records", "signals"},
     {"plants", "sensors", "actuators"},
     {"analysis", "linear", "qp"},
@@ -18,6 +18,7 @@ LAYERS = [
     {"door", "derivatives"},
     {"loop"},
     {"presets"},
+    {"scheduling"},
     {"rig", "plotting"},
 ]
 ABOVE = [{"bounds"}, {"objective"}, {"screening", "solvers"}, {"search"}, {"report"}, {"manual"}, {"bench", "compare"}, {"cli"}]

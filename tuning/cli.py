@@ -58,6 +58,13 @@ def parser():
         dest="values",
         help="set a parameter by its dotted name; repeatable",
     )
+    case.add_argument(
+        "--schedule",
+        action="append",
+        default=[],
+        metavar="NAME=VARIABLE:K1,K2,...",
+        help="a gain that follows a setpoint (r1, ..) or a level (h1, ..), linear between knots; repeatable, same variable and knots",
+    )
     case.add_argument("--dt", type=str, metavar="S", help="sampling period [s], short for --set clock.dt=S")
 
     run = argparse.ArgumentParser(add_help=False)
@@ -163,7 +170,20 @@ def _open(args):
     values = dict(_pair("--set", text, parse_value) for text in args.values)
     if args.dt is not None:
         values["clock.dt"] = _number("--dt", args.dt)
-    return rig.check(rig.set_values(case, values)) if values else rig.check(case)
+    return rig.check(rig.set_and_schedule(case, values, _schedule(args.schedule)))
+
+
+def _schedule(texts):
+    """The table of a rig file's [schedule] for the options --schedule."""
+    found = [_pair("--schedule", text, lambda v: v) for text in texts]
+    if len({rule for _, rule in found}) > 1:
+        raise InputError(f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains")
+    for name, rule in found:
+        variable, colon, knots = rule.partition(":")
+        if not colon:
+            raise InputError(f"--schedule {name}={rule!r}: must be NAME=VARIABLE:K1,K2,...")
+        return {"gains": [n for n, _ in found], "variable": variable.strip(), "knots": parse_value(f"[{knots}]")}
+    return {}
 
 
 def _pair(option, text, read):

@@ -57,7 +57,7 @@ def json_of(case):
         "title": case.title,
         "citation": preset.citation if preset else None,
         "plant": type(case.loop.plant).__name__,
-        "law": type(case.loop.controller).__name__,
+        "law": _law(case.loop.controller),
         "observer": type(case.loop.observer).__name__,
         "parameters": parameters,
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
@@ -75,7 +75,7 @@ def text(case):
     page = json_of(case)
     rows = []
     for name, p in page["parameters"].items():
-        if name.startswith("controller.model."):
+        if name.startswith(("controller.model.", "controller.law.model.")):
             continue
         value = p["value"]
         shown = _shown(value, p["static"])
@@ -110,6 +110,11 @@ def text(case):
     if page["departures"]:
         parts += ["", "departures from the paper", *(f"- {d}" for d in page["departures"])]
     return "\n".join(parts)
+
+
+def _law(law):
+    inner = getattr(law, "law", None)
+    return type(law).__name__ + (f"({type(inner).__name__})" if inner is not None else "")
 
 
 def _shown(value, is_static):

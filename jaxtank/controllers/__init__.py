@@ -9,6 +9,7 @@ from jaxtank.controllers.laguerre import Laguerre
 from jaxtank.controllers.ngpc import NGPC
 from jaxtank.controllers.open_loop import OpenLoop
 from jaxtank.controllers.pid import PID
+from jaxtank.controllers.scheduled import Scheduled
 from jaxtank.controllers.sliding_mode import SlidingMode
 from jaxtank.controllers.state_feedback import LQI, StateFeedback
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
@@ -24,6 +25,7 @@ __all__ = [
     "FuzzyBlend",
     "Laguerre",
     "OpenLoop",
+    "Scheduled",
     "SlidingMode",
     "StateFeedback",
     "TwoTankBackstepping",
