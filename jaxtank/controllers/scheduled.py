@@ -24,7 +24,8 @@ def interpolate(at, knots, values):
         g(s) = v_1 + sum_j (v_{j+1} - v_j)/(p_{j+1} - p_j) (min(max(s, p_j), p_{j+1}) - p_j)
 
     at: scalar [cm]; knots: (K,) increasing [cm]; values: (gains, K); returns a tuple of scalars, one per gain. Exactly v where all
-    values of a gain are equal. On a knot the slopes are the means of those of both sides.
+    values of a gain are equal. On a knot the slopes are the means of those of both sides; a level that rests on a knot within rounding
+    has those of the side it is on.
     """
     count, pieces = np.shape(values)[0], np.shape(knots)[0] - 1
     parts = [portion(at, knots[j], knots[j + 1]) for j in range(pieces)]
@@ -43,7 +44,7 @@ class Scheduled(Controller):
     A gain of which the law makes anything before the loop (`prepare`, `inputs`, `init`), or from which it designs matrices or runs a
     loop in `step` (weights of a Riccati equation or of a predictive law, the order of a fractional integral), is refused by `check`:
     the first would be left unscheduled, the second done anew at every sample. Inside a trace, where nothing is checked, the former
-    ends in NaN: before the loop the law is given NaN for its scheduled gains.
+    ends in a run that is not finite: before the loop the law is given NaN for its scheduled gains.
     """
 
     law: Controller
