@@ -113,6 +113,22 @@ def test_steady_offsets_of_the_four_compensations(values, offset):
     np.testing.assert_allclose(r.e[paper.quiet(r.t)].mean(axis=0), offset, atol=2e-4)
 
 
+@pytest.mark.parametrize(
+    ("values", "offset"),
+    [
+        ({"plant.pump_gain": 0.8 * 34.717}, (0.0120, 0.0095)),
+        ({"plant.drain": 1.2 * 0.7854}, (0.0087, 0.0085)),
+        ({"plant.pipe": 1.2 * 0.9143}, (0.0009, 0.0009)),
+        ({"plant.drain": 0.62 * 0.7854, "plant.pipe": 0.62 * 0.9143}, (0.0182, 0.0145)),
+    ],
+)
+def test_offsets_of_a_plant_that_is_not_the_model(values, offset):
+    """|mean e| of E to the digits printed, and none of S (spec 5.1, last line)."""
+    e, s = (run(name, {**NO_DEAD_ZONE, **values}) for name in ("enmpc", "chadpc"))
+    np.testing.assert_allclose(np.abs(e.e[paper.quiet(e.t)].mean(axis=0)), offset, atol=6e-5)
+    np.testing.assert_allclose(s.e[paper.quiet(s.t)].mean(axis=0), 0.0, atol=1e-5)
+
+
 def test_steady_voltages():
     """Spec 1.1, V1: and (14, 8) cm has no steady state."""
     for h, u in (((8, 10), (1.185, 4.819)), ((10, 10), (3.169, 3.169)), ((12, 10), (5.121, 1.519)), ((14, 14), (3.749, 3.749))):
@@ -185,7 +201,7 @@ def test_chadpc_is_a_pi_on_the_linearised_plant():
     assert np.ptp(constant, axis=0).max() < 1e-10
     f = np.array(paper_drift(r.x))
     pi = -((k + l) * r.e + k * l * dt * past + constant[0])
-    np.testing.assert_allclose(0.154297778 * r.command + f, pi, atol=1e-8)  # c2 to its printed digits
+    np.testing.assert_allclose(34.717 / 225 * r.command + f, pi, atol=1e-10)
     assert np.abs(r.e).max() > 0.04
 
 
@@ -196,11 +212,12 @@ def paper_drift(x):
 
 
 def test_literal_double_compensation_is_a_single_one_with_twice_the_gain():
-    """To 1e-14 relative to the levels, everywhere; the estimate reads half (spec 3.3)."""
+    """To 1e-14 cm, everywhere; the estimate reads half (spec 3.3, which measured 7e-15 cm, and 2e-13 cm/s between 60 and 499 s)."""
     double = {"controller.compensation": "double", "observer.before_compensation": True}
     b, s = run("chadpc", double), run("chadpc", {"observer.l": 20.0})
-    np.testing.assert_allclose(b.x, s.x, rtol=1e-14, atol=1e-13)
-    np.testing.assert_allclose(2 * b.d_hat, s.d_hat, atol=5e-12)
+    np.testing.assert_allclose(b.x, s.x, rtol=0, atol=1e-14)
+    between = (s.t >= 60) & (s.t < 499)
+    np.testing.assert_allclose(2 * b.d_hat[between], s.d_hat[between], rtol=0, atol=3e-13)
 
 
 def test_k_and_l_are_interchangeable_in_the_loop():
@@ -281,14 +298,28 @@ def test_predictive_laws_beside_the_baselines():
     np.testing.assert_allclose(found["settling"], (4.9, 16.3), atol=0.06)
 
 
+J_OF_NOISE = [  # spec 6: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
+    ("pi", {}, 0.6830, 1e-3), ("pi-ff", {}, 0.6635, 1e-3), ("pid", {}, 0.8057, 1e-3), ("pid-ff", {}, 0.7861, 1e-3),
+    ("fopi", {}, 0.6568, 1e-3), ("chadpc", STEADY, 0.5791, 1e-3),
+    ("enmpc", {}, 0.7417, 0.02), ("chadpc", {}, 0.8128, 0.02),  # limit cycles: the 2 % of spec 5.1
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "values", "cost", "share"), J_OF_NOISE)
+def test_cost_with_noise(name, values, cost, share):
+    """One draw of 90,000 samples for another: the spread of the noise's mean square is 0.3 % of a part that is 2 to 25 % of J."""
+    r = run(name, {**values, "actuator.delay": 0.5, "sensor.noise": 0.02})
+    found = (r.e**2).sum(axis=1).mean() + 0.04 * (np.diff(r.applied, axis=0) ** 2).sum(axis=1).mean()
+    np.testing.assert_allclose(found, cost, rtol=share)
+
+
 def test_oustaloup_filter():
     """s^g within 0.007 dB and 1.1 degrees on 0.01 .. 10 rad/s for lambda = 0.8 (spec 6); a fractional PI of order 1 is a PI."""
     gain, poles, residues = (np.asarray(v) for v in oustaloup(0.2))
     w = np.geomspace(0.01, 10, 200)
     ratio = (gain + (residues / (1j * w[:, None] + poles)).sum(axis=1)) / (1j * w) ** 0.2
-    # the fit at the middle of the band; at its ends the finite band shows, in the phase first
-    assert np.abs(20 * np.log10(np.abs(ratio))).max() < 0.06
-    assert np.abs(np.degrees(np.angle(ratio))).max() < 1.2
+    assert np.abs(20 * np.log10(np.abs(ratio))).max() <= 0.007
+    assert np.abs(np.degrees(np.angle(ratio))).max() <= 1.1
     a, b = run("pi", duration=60.0), run("fopi", {"controller.order": 1.0}, duration=60.0)
     np.testing.assert_allclose(a.x, b.x, rtol=1e-9)
 
@@ -335,10 +366,13 @@ SLOW = {"enmpc-printed", "chadpc-printed", "pi", "pid", "fopi"}  # the same laws
 )
 def test_gradient_of_the_default_cost(name):
     case = rig.set_values(CASES[name], {"clock.duration": 120.0})
-    free = {n: np.asarray(jaxtank.parameters(case.loop)[n]) for n in case.free}
+    held = jaxtank.parameters(case.loop)
+    free = {n: np.asarray(held[n]) for n in paper.TUNABLE if n in held}  # every tunable leaf of the case, freed by default or not
+    assert set(case.free) <= set(free)
 
     def cost(values):
-        return jaxtank.evaluate(jaxtank.with_values(case.loop, values), case.clock, ["rms_error_total"])["rms_error_total"]
+        found = jaxtank.evaluate(jaxtank.with_values(case.loop, values), case.clock, tuple(case.objective))
+        return sum(weight * jax.numpy.sum(found[measure]) for measure, weight in case.objective.items())
 
     slopes = jax.jit(jax.jacfwd(cost))(free)
     for n, value in free.items():
@@ -368,3 +402,61 @@ def test_published_parameters_are_those_of_the_cases():
     assert float(loop.controller.Tp) == published["controller.Tp"].value
     assert tuple(loop.observer.l) == published["observer.l"].value
     assert float(loop.plant.pump_gain[0]) == pytest.approx(10 * published["plant.pump_gain"].value)
+
+
+@pytest.mark.parametrize("name", ["chadpc", "pid-ff", "fopi"])
+def test_the_rig_in_metres_runs_as_in_centimetres(name):
+    from test_physics import in_metres
+
+    loop = CASES[name].loop
+    law, watch, level = loop.controller, loop.observer, quietly(loop)
+    m = in_metres(loop.plant)
+    small = lambda part: dataclasses.replace(part, model=m) if hasattr(part, "model") else part
+    if hasattr(law, "Kc"):
+        law = dataclasses.replace(law, Kc=law.Kc * 100)
+    volume = jaxtank.with_values(level.disturbance, {"volume": level.disturbance.volume * 1e-6})
+    reference = jaxtank.with_values(level.reference, {"level": level.reference.level / 100})
+    metres = dataclasses.replace(
+        level,
+        plant=m,
+        controller=small(law),
+        observer=small(watch),
+        reference=reference,
+        disturbance=volume,
+        x0=np.array([0.11, 0.09]),
+    )
+    clock = Clock(dt=0.01, duration=20.0)
+    a, b = (jaxtank.simulate(one, clock) for one in (metres, dataclasses.replace(level, x0=np.array([11.0, 9.0]))))
+    np.testing.assert_allclose(100 * np.asarray(a.x), b.x, rtol=1e-9)
+    np.testing.assert_allclose(a.command, b.command, rtol=1e-7, atol=1e-8)
+
+
+def test_verdicts_follow_the_numbers():
+    """Each claim measured as it stands, then with runs in which it does hold."""
+    known_run = lambda name, values=None, save_every=1: (
+        CASES[name],
+        run(name, {k: tuple(v) if isinstance(v, list) else v for k, v in (values or {}).items()}),
+    )
+    claims = [
+        "pump constant as printed",
+        "a delay makes d^ negative",
+        "eq. (12) tracks without offset",
+        "the observer spares the pumps",
+    ]
+    found = paper.measured(known_run)
+    assert set(found) <= set(paper.PUBLISHED)
+    assert [found[c].verdict for c in claims] == ["not reproduced"] * 4
+    assert found["rise of tank 2 and 1 by a pour"].verdict == "partly"
+    swap = {"enmpc-printed": "enmpc", "chadpc": "enmpc", "enmpc": "chadpc"}
+
+    def mended(name, values=None, save_every=1):
+        values = {k: v for k, v in (values or {}).items() if "pump_gain" not in k}
+        if values.get("actuator.delay") == 0.2:  # the dead zone left on: d^ is negative then
+            return known_run(name, {k: v for k, v in values.items() if k != "actuator.dead_zone"})
+        return known_run(swap[name], values)
+
+    found = paper.measured(mended)
+    for claim in ("pump constant as printed", "a delay makes d^ negative", "the observer spares the pumps"):
+        assert found[claim].verdict == "reproduced", found[claim]
+    # without a dead zone ENMPC with the derived sign has no offset
+    assert found["eq. (12) tracks without offset"].verdict == "reproduced", found["eq. (12) tracks without offset"]

@@ -84,6 +84,8 @@ UNCERTAIN = {
     "actuator.dead_zone": (0.1, "inferred from the reported mean of d^"),
 }
 
+# measured: with the dead zone before the lag this rig needs 7.96, 8.70 V and settles in 25, 34 s, as the spec has it
+_FITTED = "fitted with the dead zone before the lag (spec 1.3); an offset one follows the lag here, so more voltage is asked for"
 _RIG = "other runs, or another Tp: start-up is saturated at 12 V for both laws, and mean voltage is fixed by the mass balance (spec 5.3)"
 PUBLISHED = {
     "controller.Tp": Published(0.13, "s", "sec. 5.1"),
@@ -96,19 +98,13 @@ PUBLISHED = {
         0.2,
         "the ideal rig starts faster: no delay, lag or noise (spec 5.3)",
     ),
-    "RMS error of ENMPC, paper-like rig": Published(
-        (0.7688, 1.2919), "cm", "Table 4", 0.2, "rig fitted to the paper, one draw of its noise"
-    ),
+    "RMS error of ENMPC, paper-like rig": Published((0.7688, 1.2919), "cm", "Table 4", 0.2, _FITTED),
     "RMS voltage of ENMPC": Published(
         (8.29, 9.39), "V", "Table 3", 0.1, "discharge coefficients of 1: more flow per volt is needed"
     ),
-    "RMS voltage of ENMPC, paper-like rig": Published(
-        (8.29, 9.39), "V", "Table 3", 0.1, "rig fitted to the paper, one draw of its noise"
-    ),
+    "RMS voltage of ENMPC, paper-like rig": Published((8.29, 9.39), "V", "Table 3", 0.1, _FITTED),
     "settling time of ENMPC": Published((25.0, 41.0), "s", "Table 3", 0.2, "pump of the ideal rig is stronger (spec 5.3)"),
-    "settling time of ENMPC, paper-like rig": Published(
-        (25.0, 41.0), "s", "Table 3", 0.2, "rig fitted to the paper, one draw of its noise"
-    ),
+    "settling time of ENMPC, paper-like rig": Published((25.0, 41.0), "s", "Table 3", 0.2, _FITTED),
     "recovery time of ENMPC": Published((8.0, 6.0), "s", "Table 3", 0.2, "no delay in the ideal rig (spec 5.3)"),
     "RMS error of CHADPC": Published((0.6208, 0.9821), "cm", "Table 4", 0.2, "as of ENMPC"),
     "RMS voltage of CHADPC": Published((7.90, 8.91), "V", "Table 3", 0.1, "as of ENMPC"),
@@ -116,9 +112,16 @@ PUBLISHED = {
     "recovery time of CHADPC": Published((4.5, 3.5), "s", "Table 3", 0.2, "as of ENMPC"),
     "RMS error, CHADPC against ENMPC": Published((-19.3, -24.0), "%", "Table 4", 0.2, _RIG),
     "RMS voltage, CHADPC against ENMPC": Published((-4.7, -5.1), "%", "Table 3", 0.2, _RIG),
+    "RMS error, CHADPC against ENMPC, paper-like rig": Published((-19.3, -24.0), "%", "Table 4", 0.2, _RIG),
+    "RMS voltage, CHADPC against ENMPC, paper-like rig": Published((-4.7, -5.1), "%", "Table 3", 0.2, _RIG),
     "mean of d^": Published((-0.4249, -0.6673), "cm/s", "sec. 5.2", 0.01),
     "peak of d^ after a pour": Published(2.0, "cm/s", "sec. 5.2, Fig. 9", 0.1),
-    "rise of tank 2 and 1 by a pour": Published((22.0, 17.0), "%", "sec. 5.2 (printed the other way round)", 0.03),
+    "rise of tank 2 and 1 by a pour": Published(
+        (22.0, 17.0),
+        "%",
+        "sec. 5.2 (printed the other way round)",
+        reason="volume over area, which is what a pour at once would do; this one lasts 1.1 s and the pumps give way",
+    ),
     "pump constant as printed": Published(
         "Kp = 3.4717 holds the benchmark", "", "Table 1", reason="12 V cannot lift the levels; a misprint (spec 1.1)"
     ),
@@ -238,6 +241,24 @@ def figures(run):
     }
 
 
+def _verdict(holds):
+    return "reproduced" if holds else "not reproduced"
+
+
+def _rises(run):
+    """What a pour does to tank 2 at 500 s and to tank 1 at 700 s: volume over area, and the rise of the simulated level [% of it]."""
+    by_volume, by_level = [], []
+    for tank, begin in ((1, 500.0), (0, 700.0)):
+        before = run.x[run.t < begin][-1, tank]
+        by_volume.append(100 * 500 / 225 / before)
+        by_level.append(100 * (run.x[(run.t >= begin) & (run.t < begin + 10), tank].max() / before - 1))
+    agree = [np.allclose(v, PUBLISHED["rise of tank 2 and 1 by a pour"].value, rtol=0.03) for v in (by_volume, by_level)]
+    return Claim(
+        "reproduced" if all(agree) else "partly" if any(agree) else "not reproduced",
+        "volume over area {:.1f}, {:.1f} %; simulated levels {:.1f}, {:.1f} %".format(*by_volume, *by_level),
+    )
+
+
 def measured(run):
     """What can be measured of PUBLISHED (see presets.base.Preset)."""
     gain = {f"{owner}.pump_gain": PRINTED_GAIN for owner in ("plant", "controller.model", "observer.model")}
@@ -253,28 +274,36 @@ def measured(run):
         ):
             if f"{name} of {words}" in PUBLISHED:
                 found[f"{name} of {words}"] = numbers[key]
-    ours, theirs = figures(s), figures(e)
-    for name, key in (("RMS error", "error"), ("RMS voltage", "voltage")):
-        found[f"{name}, CHADPC against ENMPC"] = tuple(100 * (a / b - 1) for a, b in zip(ours[key], theirs[key]))
+    q = run("chadpc", PAPER_LIKE)[1]
+    ours = figures(s)
+    for rig_words, one, other in (("", s, e), (", paper-like rig", q, p)):
+        for name, key in (("RMS error", "error"), ("RMS voltage", "voltage")):
+            pairs = zip(figures(one)[key], figures(other)[key])
+            found[f"{name}, CHADPC against ENMPC{rig_words}"] = tuple(100 * (a / b - 1) for a, b in pairs)
     found["mean of d^"] = ours["d"]
     found["peak of d^ after a pour"] = float(s.d_hat[(s.t > 499) & (s.t < 530), 1].max())
-    found["rise of tank 2 and 1 by a pour"] = (100 * 500 / 225 / 10.0, 100 * 500 / 225 / float(s.r[s.t >= 700][0, 0]))
+    found["rise of tank 2 and 1 by a pour"] = _rises(s)
     low = run("enmpc", {**gain, "actuator.dead_zone": 0.0})[1]
+    off, full = figures(low)["error"], np.mean(low.applied[low.t > 60] > 11.9, axis=0)
     found["pump constant as printed"] = Claim(
-        "not reproduced", "RMS error {:.2f}, {:.2f} cm with both pumps at their limit".format(*figures(low)["error"])
+        _verdict(max(off) < 1.0),
+        "RMS error {:.2f}, {:.2f} cm with the pumps at 12 V for {:.0f}, {:.0f} % of the time".format(*off, *(100 * full)),
     )
     late = run("chadpc", {"controller.Tp": 1.7, "observer.l": 0.1, "actuator.delay": 0.2, "actuator.dead_zone": 0.0})[1]
+    bias = figures(late)["d"]
     found["a delay makes d^ negative"] = Claim(
-        "not reproduced", "mean d^ {:.4f}, {:.4f} cm/s with a delay of 0.2 s and no dead zone".format(*figures(late)["d"])
+        _verdict(max(bias) < -0.1), "mean d^ {:.4f}, {:.4f} cm/s with a delay of 0.2 s and no dead zone".format(*bias)
     )
     wrong = run("enmpc-printed", {"actuator.dead_zone": 0.0})[1]
+    left = wrong.e[quiet(wrong.t)].mean(axis=0)
     found["eq. (12) tracks without offset"] = Claim(
-        "not reproduced", "mean error {:.3f}, {:.3f} cm".format(*wrong.e[quiet(wrong.t)].mean(axis=0))
+        _verdict(np.abs(left).max() < 0.01), "mean error {:.3f}, {:.3f} cm (counts if below 0.01 cm)".format(*left)
     )
     noisy = [run(name, {"sensor.noise": 0.005})[1] for name in ("enmpc", "chadpc")]
     spread = [float(np.diff(r.command[(r.t > 200) & (r.t < 490), 1]).std()) for r in noisy]
     found["the observer spares the pumps"] = Claim(
-        "not reproduced", f"sample-to-sample voltage noise {spread[0]:.2f} -> {spread[1]:.2f} V rms with 0.005 cm of sensor noise"
+        _verdict(spread[1] < spread[0]),
+        f"sample-to-sample voltage noise {spread[0]:.2f} -> {spread[1]:.2f} V rms with 0.005 cm of sensor noise",
     )
     return found
 
