@@ -7,15 +7,17 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxtank import measures as ms
+from jaxtank.dependence import reached
 from jaxtank.invariants import scan
 from jaxtank.stepping import initial, inputs, is_broken, run_of, step
 from jaxtank.tree import with_values
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "order"))  # a dict would come back from jit with its keys sorted
-def _sensitivities(loop, clock, names, order, values, key):
+@functools.partial(jax.jit, static_argnames=("clock", "names", "order", "squares"))  # a dict would come back with its keys sorted
+def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),)):
     """What `loop.sensitivities` returns, unchecked."""
     flat, unflatten = ravel_pytree(values)
+    kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
 
     def at(theta):
         return with_values(loop, dict(zip(order, unflatten(theta))))
@@ -26,7 +28,7 @@ def _sensitivities(loop, clock, names, order, values, key):
         """(f(point), tangents of f with the P directions as the last axis)."""
         return jax.vmap(lambda *t: jax.jvp(f, point, t, has_aux=True), in_axes=-1, out_axes=(None, -1, None))(*tangents)
 
-    carried, structure = jax.tree.flatten(jax.eval_shape(lambda: (initial(loop, clock), ms.start(run_of(loop, clock), names))))
+    carried, structure = jax.tree.flatten(jax.eval_shape(lambda: (initial(loop, clock), ms.start(run_of(loop, clock), kept))))
     moves = tuple(jnp.issubdtype(v.dtype, jnp.floating) for v in carried)  # only floats have derivatives
 
     def split(tree):
@@ -37,40 +39,48 @@ def _sensitivities(loop, clock, names, order, values, key):
         floats, rest = iter(floats), iter(rest)
         return jax.tree.unflatten(structure, [next(floats) if m else next(rest) for m in moves])
 
+    def known(theta):
+        """The samples of references, plans and noise, as a list of arrays (samples,)."""
+        return jax.tree.leaves(inputs(at(theta), clock, kept, key))
+
+    scanned = jax.tree.structure(jax.eval_shape(lambda theta: inputs(at(theta), clock, kept, key), flat))
+    feels = reached(known, flat)  # which of them depend on the parameters: only theirs are tangents to be carried
+
     def begin(theta):
         here = at(theta)
-        floats, rest = split((initial(here, clock), ms.start(run_of(here, clock), names)))
-        return (floats, inputs(here, clock, names, key)), rest
+        floats, rest = split((initial(here, clock), ms.start(run_of(here, clock), kept)))
+        xs = known(theta)
+        return (floats, [x for x, f in zip(xs, feels) if f]), (rest, [x for x, f in zip(xs, feels) if not f])
 
-    (floats, xs), (dfloats, dxs), rest = pushed(begin, (flat,), basis)
-    if not any(name.startswith(("reference.", "disturbance.")) for name in order):
-        dxs = None  # the inputs do not depend on the parameters: their tangents need not be carried
+    (floats, felt), (dfloats, dfelt), (rest, fixed) = pushed(begin, (flat,), basis)
 
-    def body(carry, scanned):
+    def body(carry, sampled):
         floats, dfloats, rest, gauss_newton = carry
-        now, dnow = scanned
+        felt, dfelt, fixed = sampled
 
-        def advance(floats, theta, now=now):
+        def advance(floats, theta, felt):
             here = at(theta)
+            mine, others = iter(felt), iter(fixed)
+            now = jax.tree.unflatten(scanned, [next(mine) if f else next(others) for f in feels])
             state, acc = join(floats, rest)
             state, sample = step(here, clock, state, now)
-            floats, others = split((state, ms.update(run_of(here, clock), acc, sample, now.window, now.since)))
-            return (floats, sample.e), others
+            run = run_of(here, clock)
+            errors = ms.residuals(acc, sample, now.window, now.rest, squares)
+            floats, others = split((state, ms.update(run, acc, sample, now.window, now.since, now.rest)))
+            return (floats, errors), others
 
-        if dnow is None:
-            (floats, _), (dfloats, de), rest = pushed(advance, (floats, flat), dfloats, basis)
-        else:
-            (floats, _), (dfloats, de), rest = pushed(advance, (floats, flat, now), dfloats, basis, dnow)
-        for slope in de:
-            gauss_newton = gauss_newton + slope[:, None] * slope[None, :]
+        (floats, _), (dfloats, derrors), rest = pushed(advance, (floats, flat, felt), dfloats, basis, dfelt)
+        for slope, weight in zip(derrors, weights):
+            gauss_newton = gauss_newton + weight * slope[:, None] * slope[None, :]
         return (floats, dfloats, rest, gauss_newton), None
 
+    weights = ms.residual_weights(run_of(loop, clock), squares)
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    (floats, dfloats, rest, gauss_newton), _ = scan(body, carry, (xs, dxs), length=clock.samples)
+    (floats, dfloats, rest, gauss_newton), _ = scan(body, carry, (felt, dfelt, fixed), length=clock.samples)
 
     def finish(floats, theta):
         _, acc = join(floats, rest)
         return ms.read(run_of(at(theta), clock), acc, names), None
 
     results, slopes, _ = pushed(finish, (floats, flat), dfloats, basis)
-    return results, slopes, gauss_newton * (2.0 / clock.samples), is_broken(join(floats, rest)[0])
+    return results, slopes, 2.0 * gauss_newton, is_broken(join(floats, rest)[0])

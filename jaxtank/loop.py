@@ -65,18 +65,25 @@ def evaluate_for_reverse(loop, clock, measures, key=None):
     return _evaluate(loop, clock, names, key, True)[0]
 
 
-def sensitivities(loop, clock, measures, values, key=None):
-    """Measures, their exact derivatives, and the Gauss-Newton matrix of the tracking error, in one run.
+def sensitivities(loop, clock, measures, values, key=None, squares=None):
+    """Measures, their exact derivatives, and a Gauss-Newton matrix, in one run.
 
     values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth
-    it to about ten). Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix
-    2/N sum_k sum_i grad(e_i) grad(e_i)' [cm^2 per unit^2], True if the run stopped being finite), P in the order of `values`.
-    key as in `evaluate`. Raises InputError at the door; a run that is not finite is told by the flag.
+    it to about ten). squares: {measure: weight} of measures that are sums of squares, sum_k w_k v_k^2: the matrix is
+    2 sum_k w_k grad(v_k) grad(v_k)', the second derivative of their weighted sum but for the residuals' own curvature; None: the mean
+    square tracking error of all outputs. Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix, True if
+    the run stopped being finite), P in the order of `values`. key as in `evaluate`. Raises InputError at the door; a run that is not
+    finite is told by the flag.
     """
     if not values:
         raise InputError("sensitivities needs at least one parameter: values is empty")
     check(with_values(loop, values), clock, key)
-    return _sensitivities(loop, clock, _names(measures), tuple(values), tuple(values.values()), key)
+    squares = {"mean_square_error": 1.0} if squares is None else squares
+    for name in _names(squares):
+        if not ms.MEASURES[name].residual:
+            raise InputError(f"squares: {name} is not a sum of squares; those are {', '.join(ms.SQUARES)}")
+    chosen = tuple((m, float(w)) for m, w in squares.items())
+    return _sensitivities(loop, clock, _names(measures), tuple(values), tuple(values.values()), key, chosen)
 
 
 def _names(measures):
@@ -92,7 +99,7 @@ def _evaluate(loop, clock, names, key, checkpoint):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.window, now.since)), None
+        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), None
 
     carry = (initial(loop, clock), ms.start(run, names))
     state, acc = (_checkpointed_scan if checkpoint else _plain_scan)(body, carry, inputs(loop, clock, names, key), clock.samples)

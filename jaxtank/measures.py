@@ -49,6 +49,9 @@ class Measure(NamedTuple):
     doc: str
     windows: bool = False  # needs Ramps.windows: the target and step each sample refers to
     pours: bool = False  # needs Pours.since: the time since the last pour
+    rests: bool = False  # needs the inputs that hold the setpoint of each sample
+    residual: str = ""  # the residual of RESIDUALS whose squares it sums, if it is such a sum
+    scale: Callable | None = None  # run -> factor of that sum
 
 
 def _filled(run, count, value):
@@ -158,6 +161,40 @@ def _recovery(run, acc):
     return _list([jnp.maximum(worst, _settled(last, outside)) for last, outside, worst in acc["recovery"]])
 
 
+def _deviation(run, sample, rest):
+    return tuple(u - held for u, held in zip(sample.u, rest))
+
+
+def _past(sample, window):
+    """Level past the target in the direction of the step [cm], one per output; 0 before the first step."""
+    return tuple(
+        at_least(jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0)
+        for (target, step, _, _), r, e in zip(window, sample.r, sample.e)
+    )
+
+
+def _update_past(run, state, sample, window):
+    return tuple(s + v * v for s, v in zip(state, _past(sample, window)))
+
+
+def _update_deviation(run, state, sample, rest):
+    return tuple(s + d * d for s, d in zip(state, _deviation(run, sample, rest)))
+
+
+def _changes(state, sample):
+    """Changes of the inputs since the last sample; 0 at the first."""
+    previous, _, first = state
+    return tuple(jnp.where(first, 0.0, v - p) for v, p in zip(sample.u, previous))
+
+
+def _update_changes(run, state, sample, window):
+    return sample.u, tuple(s + d * d for s, d in zip(state[1], _changes(state, sample))), jnp.zeros_like(state[2])
+
+
+def _start_travel(run):
+    return _filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0
+
+
 def _update_travel(run, state, sample, window):
     previous, total, first = state
     step = tuple(jnp.abs(v - p) for v, p in zip(sample.u, previous))
@@ -180,10 +217,19 @@ ACCUMULATORS = {
     "settling": Accumulator(_start_settling, _update_settling),
     "rise": Accumulator(_start_rise, _update_rise),
     "recovery": Accumulator(lambda run: tuple((run.zero, run.zero, run.zero) for _ in range(run.outputs)), _update_recovery),
-    "travel": Accumulator(
-        lambda run: (_filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0), _update_travel
-    ),
+    "past2": Accumulator(lambda run: _filled(run, run.outputs, 0.0), _update_past),
+    "deviation2": Accumulator(lambda run: _filled(run, run.pumps, 0.0), _update_deviation),
+    "travel": Accumulator(_start_travel, _update_travel),
+    "changes2": Accumulator(_start_travel, _update_changes),
 }
+
+RESIDUALS = {
+    "e2": lambda state, sample, window, rest: sample.e,
+    "past2": lambda state, sample, window, rest: _past(sample, window),
+    "deviation2": lambda state, sample, window, rest: _deviation(None, sample, rest),
+    "changes2": lambda state, sample, window, rest: _changes(state, sample),
+}
+"""{accumulator: (its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
 
 
 def _mean(run, values):
@@ -229,9 +275,36 @@ MEASURES = {
         lambda run, acc: root_of_mean(sum(_mean(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
     ),
-    "ise": Measure("cm^2 s", "output", ("e2",), _per_run("e2", lambda run: run.dt), "integral of the squared error"),
+    "mean_square_error": Measure(
+        "cm^2",
+        "output",
+        ("e2",),
+        _per_run("e2", lambda run: 1.0 / run.samples),
+        "mean square tracking error",
+        residual="e2",
+        scale=lambda run: 1.0 / run.samples,
+    ),
+    "ise": Measure(
+        "cm^2 s",
+        "output",
+        ("e2",),
+        _per_run("e2", lambda run: run.dt),
+        "integral of the squared error",
+        residual="e2",
+        scale=lambda run: run.dt,
+    ),
     "iae": Measure("cm s", "output", ("abs_e",), _per_run("abs_e", lambda run: run.dt), "integral of the absolute error"),
     "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
+    "mean_square_overshoot": Measure(
+        "cm^2",
+        "output",
+        ("past2",),
+        _per_run("past2", lambda run: 1.0 / run.samples),
+        "mean square of the level past the target of a change, in its direction",
+        windows=True,
+        residual="past2",
+        scale=lambda run: 1.0 / run.samples,
+    ),
     "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square voltage"),
     "input_travel": Measure(
         "V",
@@ -239,6 +312,25 @@ MEASURES = {
         ("travel",),
         lambda run, acc: _list(acc["travel"][1]),
         "sum of the absolute changes of voltage",
+    ),
+    "mean_square_travel": Measure(
+        "V^2",
+        "pump",
+        ("changes2",),
+        lambda run, acc: _list(acc["changes2"][1]) / run.samples,
+        "mean of the squared changes of voltage from sample to sample",
+        residual="changes2",
+        scale=lambda run: 1.0 / run.samples,
+    ),
+    "input_deviation": Measure(
+        "V^2 s",
+        "pump",
+        ("deviation2",),
+        _per_run("deviation2", lambda run: run.dt),
+        "integral of the squared distance of the voltage from the one that holds the setpoint",
+        rests=True,
+        residual="deviation2",
+        scale=lambda run: run.dt,
     ),
     "saturated_fraction": Measure(
         "-",
@@ -293,6 +385,9 @@ MEASURES = {
     "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
 }
 
+SQUARES = tuple(m for m, spec in MEASURES.items() if spec.residual)
+"""Measures that are sums of squares over the run."""
+
 
 def check_names(names):
     """Raise InputError for a name that is no measure."""
@@ -327,9 +422,17 @@ def wants_pours(names):
     return any(MEASURES[name].pours for name in names)
 
 
+def wants_rests(names):
+    """True if a measure in `names` refers to the inputs that hold the setpoint."""
+    return any(MEASURES[name].rests for name in names)
+
+
 def serves(name, loop):
-    """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into."""
+    """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into, its steady inputs
+    are known in closed form."""
     spec = MEASURES[name]
+    if spec.rests and (loop.plant.pipes or loop.plant.pumps != len(loop.plant.outputs)):
+        return False
     return (not spec.windows or hasattr(loop.reference, "windows")) and (not spec.pours or hasattr(loop.disturbance, "since"))
 
 
@@ -338,9 +441,21 @@ def start(run, names):
     return {a: ACCUMULATORS[a].start(run) for a in needs(names)}
 
 
-def update(run, states, sample, window, since=None):
+def update(run, states, sample, window, since=None, rest=None):
     """{accumulator: state} after `sample`."""
-    return {a: ACCUMULATORS[a].update(run, state, sample, since if a == "recovery" else window) for a, state in states.items()}
+    known = {"recovery": since, "deviation2": rest}
+    return {a: ACCUMULATORS[a].update(run, state, sample, known.get(a, window)) for a, state in states.items()}
+
+
+def residuals(states, sample, window, rest, squares):
+    """The residuals of one sample, a flat tuple. squares: ((measure, weight), ...), each a sum of squares (`Measure.residual`)."""
+    return tuple(v for m, _ in squares for a in [MEASURES[m].residual] for v in RESIDUALS[a](states[a], sample, window, rest))
+
+
+def residual_weights(run, squares):
+    """What the square of each of `residuals` counts in the weighted sum of the measures."""
+    counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
+    return tuple(w * MEASURES[m].scale(run) for m, w in squares for _ in range(counts[MEASURES[m].per]))
 
 
 def read(run, states, names):

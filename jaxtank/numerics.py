@@ -75,8 +75,9 @@ def _floored_root_jvp(primals, tangents):
 
 
 def root_of_mean(x):
-    """sqrt(x) of a mean of squares x >= 0. Slope 0 at exactly 0, where a norm has no slope: what is zero throughout stays so."""
-    return jnp.where(x > 0.0, jnp.sqrt(jnp.where(x > 0.0, x, 1.0)), 0.0)
+    """sqrt(x) of a mean of squares x >= 0. Slope 0 at exactly 0, where a norm has no slope: what is zero throughout stays so. NaN stays
+    NaN."""
+    return jnp.where(x == 0.0, 0.0, jnp.sqrt(jnp.where(x == 0.0, 1.0, x)))
 
 
 def at_least(x, floor):

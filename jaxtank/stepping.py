@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.actuators import PumpBank
+from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.observers.base import Observer
@@ -62,6 +63,7 @@ class Inputs(NamedTuple):
     xi: tuple | None
     window: tuple | None
     since: Any  # time since the last pour [s], or None
+    rest: tuple | None  # inputs that hold the setpoint [V]
     plan: Any  # what the law has prepared
     own: Any  # signals of the law's own
     fault: tuple | None  # 1 while a fault lasts
@@ -90,10 +92,17 @@ def inputs(loop, clock, names, key):
         xi=loop.sensor.draw(key, clock.samples),
         window=window,
         since=since,
+        rest=_rests(loop, r) if ms.wants_rests(names) else None,
         plan=loop.controller.prepare(r, dr, ddr),
         own=loop.controller.inputs(clock),
         fault=None if loop.faults is None else loop.faults.sample(clock),
     )
+
+
+def _rests(loop, r):
+    if not ms.serves("input_deviation", loop):
+        raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
+    return steady_along(loop.plant, r)[1]
 
 
 def initial(loop, clock):

@@ -1,21 +1,24 @@
 """What is made small and what must hold, as numbers with exact derivatives."""
 
-import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.errors import InputError
 from jaxtank.rig import check_limits, check_objective
 from jaxtank.tree import get_value, with_values
+from tuning import scenarios as sc
 from tuning.bounds import bounds
+from tuning.memo import Memo
 
-FORWARD_LIMIT = 10
-"""Number of free parameters up to which derivatives run forward with the simulation; above, checkpointed reverse."""
+FORWARD_LIMIT = 24
+"""Number of free parameters up to which derivatives run forward with the simulation; above, checkpointed
+reverse, without a Gauss-Newton matrix."""
+
+ROOT = "rms_error_total"
+"""The measure that is the root of a sum of squares over all outputs."""
 
 LOWER = {"min_level"}
 """Measures whose limit is a lower one."""
@@ -31,11 +34,13 @@ SPILL = 1e-3
 
 
 class Limit(NamedTuple):
-    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in the measure's unit."""
+    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in the measure's unit, in one scenario."""
 
     measure: str
     index: int
     value: float
+    lane: int = 0
+    scenario: str = ""
 
     @property
     def sign(self):
@@ -44,9 +49,10 @@ class Limit(NamedTuple):
 
     @property
     def label(self):
-        """Name with the entry, counted from 1: "max_level of tank 3"."""
+        """Name with the entry, counted from 1: "max_level of tank 3", and its scenario."""
         per = ms.MEASURES[self.measure].per
-        return self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}"
+        where = f" in {self.scenario}" if self.scenario else ""
+        return (self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}") + where
 
     def margin(self, measures):
         """How far the limit is from being met exactly: positive where it holds. A measure that does not apply (the settling time of an
@@ -61,12 +67,13 @@ class Point(NamedTuple):
     """The problem at one point z of the unit cube, derivatives with respect to z."""
 
     z: np.ndarray  # (P,)
-    cost: float  # weighted sum of measures
+    cost: float  # weighted sum of measures, mean over scenarios
     gradient: np.ndarray  # (P,)
-    gauss_newton: np.ndarray  # (P, P) of the mean squared tracking error [cm^2]
+    gauss_newton: np.ndarray  # (P, P) second derivative of what `Problem.model` names, without the residuals' own curvature
     margins: np.ndarray  # (limits,) in each measure's unit
     margin_slopes: np.ndarray  # (limits, P)
-    measures: dict
+    measures: tuple  # of each scenario, {name: value}
+    rows: tuple = ()  # which of the problem's limits the margins are of, where not all
 
     @property
     def finite(self):
@@ -74,7 +81,7 @@ class Point(NamedTuple):
         return all(np.all(np.abs(v) < EXPLODED) for v in (self.cost, self.gradient, self.margins, self.margin_slopes))
 
 
-def resolve_limits(case, limits=None):
+def resolve_limits(case, limits=None, lane=0, scenario=""):
     """The Limits of {measure: number, list or "rim"}; the case's own where None.
 
     With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume. Raises InputError for
@@ -86,23 +93,30 @@ def resolve_limits(case, limits=None):
         values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
         for i, v in enumerate(values):
             held = plant.overflow and measure == "max_level" and v >= plant.rim[i]
-            found.append(Limit("overflow_volume", i, SPILL) if held else Limit(measure, i, float(v)))
+            measured, at = ("overflow_volume", SPILL) if held else (measure, float(v))
+            found.append(Limit(measured, i, at, lane, scenario))
     return found
 
 
 class Problem:
-    """A case, its free parameters, its cost and its limits.
+    """A case, its free parameters, its cost and its limits, over one run or several scenarios.
 
-    free: {name: Free}; objective: {measure: weight} (a list measure counts with the sum of its entries); limits as in
-    resolve_limits; key: jax random key for sensor noise, the same for every evaluation (common random numbers).
+    free: {name: Free}; objective: {measure: weight} (a list measure counts with the sum of its entries; scenarios count with their
+    weighted mean); limits as in resolve_limits, held in every scenario; scenarios: tuple of Scenario, () for the case's own run, None
+    for those of the case; seed: of the sensor noise, which is the same for every evaluation (common random numbers); memo: a Memo of
+    what was evaluated before.
     """
 
-    def __init__(self, case, free=None, objective=None, limits=None, key=None):
-        self.case, self.loop, self.clock, self.key = case, case.loop, case.clock, key
+    def __init__(self, case, free=None, objective=None, limits=None, scenarios=None, seed=0, memo=None):
+        self.case, self.loop, self.clock, self.seed = case, case.loop, case.clock, seed
         self.bounds = bounds(case.loop, case.free if free is None else free)
         self.objective = check_objective(case.objective if objective is None else objective)
-        self.limits = resolve_limits(case, limits)
+        self.scenarios = sc.check_scenarios(case, case.scenarios if scenarios is None else scenarios, self.names)
+        self.lanes = sc.lanes_of(case, self.scenarios, seed)
+        self.groups = sc.groups_of(self.lanes)
+        self.limits = [limit for i, lane in enumerate(self.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
+        self.memo = Memo() if memo is None else memo
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
 
     @property
@@ -111,9 +125,14 @@ class Problem:
         return [b.name for b in self.bounds]
 
     @property
-    def squares(self):
-        """True if the cost is the tracking error alone, so that Gauss-Newton applies."""
-        return set(self.objective) == {"rms_error_total"}
+    def model(self):
+        """What the Gauss-Newton matrix is the second derivative of: "square" (the cost is one root mean square: its square), "cost", or
+        None where no term of the cost is made of squares, or the parameters are too many to carry slopes of."""
+        if len(self.bounds) > FORWARD_LIMIT:
+            return None
+        if set(self.objective) == {ROOT} and len(self.lanes) == 1:
+            return "square"
+        return "cost" if any(m == ROOT or m in ms.SQUARES for m in self.objective) else None
 
     def start(self):
         """(P,) z of the case's own values. Raises InputError if one lies outside its range."""
@@ -134,68 +153,98 @@ class Problem:
         return with_values(self.loop, self.values(z))
 
     def cost(self, measures):
-        """Weighted sum of measures."""
+        """Weighted sum of the measures of one run."""
         return sum(w * float(np.sum(measures[m])) for m, w in self.objective.items())
 
-    def margins(self, measures):
-        """(limits,) margin of each limit."""
-        return np.array([limit.margin(measures) for limit in self.limits])
+    def total(self, table):
+        """The cost of `table`, the measures of every scenario: the weighted mean of theirs."""
+        return sum(lane.weight * self.cost(row) for lane, row in zip(self.lanes, table))
 
-    def screen(self, zs, clock):
-        """(cost, margins) at many points (points, P), at `clock`, without derivatives."""
-        values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
-        measures, broken = _batch(self.loop, clock, self.needed, values, self.key)
-        self.simulations += len(zs)
-        table = [{m: np.asarray(v[i]) for m, v in measures.items()} for i in range(len(zs))]
-        costs = np.where(broken, np.nan, [self.cost(row) for row in table])
-        return costs, np.array([self.margins(row) for row in table]).reshape(len(zs), -1)
+    def margins(self, table):
+        """(limits,) margin of each limit, of the measures of every scenario."""
+        return np.array([limit.margin(table[limit.lane]) for limit in self.limits])
 
-    @np.errstate(over="ignore", invalid="ignore")  # what explodes is told by Point.finite
+    def screen(self, zs, coarse=False):
+        """(costs (points,), margins (points, limits)) at many points (points, P), without derivatives; coarse: at the coarse clock."""
+        zs = np.asarray(zs, dtype=float)
+        self.simulations += len(zs) * len(self.lanes)
+        return tuple(v.copy() for v in self.memo.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse)))
+
+    def _screen(self, zs, coarse):
+        points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
+        tables, broken = [[None] * len(self.lanes) for _ in zs], np.zeros(len(zs), dtype=bool)
+        for group in self.groups:
+            clock = sc.coarse_clock(group.clock) if coarse else group.clock
+            measures, flags = sc.values_of(group, self.needed, points, clock)
+            measures, broken = {m: np.asarray(v) for m, v in measures.items()}, broken | np.asarray(flags).any(axis=1)
+            for j, lane in enumerate(group.lanes):
+                for i, table in enumerate(tables):
+                    table[lane] = {m: v[i, j] for m, v in measures.items()}
+        costs = np.where(broken, np.nan, [self.total(table) for table in tables])
+        return costs, np.array([self.margins(table) for table in tables]).reshape(len(zs), -1)
+
     def point(self, z):
-        """The Point at z: one run at the case's own step, with derivatives."""
+        """The Point at z: every scenario at its own step, with derivatives."""
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        values = {name: np.float64(v) for name, v in self.values(z).items()}
-        measures, slopes, gauss_newton, broken = self._run(values)
-        self.simulations, self.gradients = self.simulations + 1, self.gradients + 1
-        per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
-        measures = {m: np.asarray(v) for m, v in measures.items()}
-        slopes = {m: np.asarray(v).reshape(-1, len(z)) * per_z for m, v in slopes.items()}
-        gradient = sum(w * slopes[m].sum(axis=0) for m, w in self.objective.items())
-        margins = self.margins(measures)
-        margin_slopes = np.array([-limit.sign * slopes[limit.measure][limit.index] for limit in self.limits]).reshape(-1, len(z))
-        margin_slopes[np.abs(margins) >= NOT_A_NUMBER] = 0.0
-        found = Point(
-            z=z,
-            cost=np.nan if broken else self.cost(measures),
-            gradient=gradient,
-            gauss_newton=np.asarray(gauss_newton) * np.outer(per_z, per_z),
-            margins=margins,
-            margin_slopes=margin_slopes,
-            measures=measures,
-        )
+        self.simulations, self.gradients = self.simulations + len(self.lanes), self.gradients + len(self.lanes)
+        found = Point(z, *self.memo.recall("point", [z], lambda: self._point(z, self.groups)))
         self.non_finite += not found.finite
         return found
 
-    def _run(self, values):
+    def part(self, z, batch, rng):
+        """The Point at z of about `batch` scenarios drawn by rng, the same number of every group, so that nothing is compiled twice."""
+        z, groups = np.clip(np.asarray(z, dtype=float), 0.0, 1.0), []
+        for group in self.groups:
+            count = min(len(group.lanes), max(1, round(batch * len(group.lanes) / len(self.lanes))))
+            groups.append(sc.take(group, np.sort(rng.choice(len(group.lanes), count, replace=False))))
+        drawn = [i for group in groups for i in group.lanes]
+        self.simulations, self.gradients = self.simulations + len(drawn), self.gradients + len(drawn)
+        found = self.memo.recall("part", [z, np.array(drawn, dtype=float)], lambda: self._point(z, groups))
+        return Point(z, *found, rows=tuple(i for i, limit in enumerate(self.limits) if limit.lane in drawn))
+
+    @np.errstate(over="ignore", invalid="ignore")  # what explodes is told by Point.finite
+    def _point(self, z, groups):
+        """The fields of the Point at z after z itself, of the lanes in `groups` alone; others count nothing."""
+        values = {name: np.float64(v) for name, v in self.values(z).items()}
+        per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
+        count, share = len(z), sum(self.lanes[i].weight for group in groups for i in group.lanes)
+        gradient, matrix, ruined = np.zeros(count), np.zeros((count, count)), False
+        table, slopes = [None] * len(self.lanes), [None] * len(self.lanes)
+        for group in groups:
+            measures, rates, curvature, broken = self._run(group, values)
+            ruined = ruined or bool(np.any(broken))
+            for j, i in enumerate(group.lanes):
+                weight = self.lanes[i].weight / share
+                table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
+                slopes[i] = {m: np.asarray(v)[j].reshape(-1, count) * per_z for m, v in rates.items()}
+                mine = sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items())
+                gradient = gradient + weight * mine
+                matrix = matrix + weight * self._curvature(np.asarray(curvature)[j] * np.outer(per_z, per_z), table[i], slopes[i])
+        mine = [limit for limit in self.limits if table[limit.lane] is not None]
+        margins = np.array([limit.margin(table[limit.lane]) for limit in mine])
+        margin_slopes = np.array([-limit.sign * slopes[limit.lane][limit.measure][limit.index] for limit in mine]).reshape(
+            -1, count
+        )
+        margin_slopes[np.abs(margins) >= NOT_A_NUMBER] = 0.0
+        cost = sum(lane.weight / share * self.cost(row) for lane, row in zip(self.lanes, table) if row is not None)
+        return np.nan if ruined else cost, gradient, matrix, margins, margin_slopes, tuple(row for row in table if row is not None)
+
+    def _squares(self):
+        """((measure, weight), ...) of the sums of squares that the Gauss-Newton matrix is made of."""
+        own = tuple((m, w) for m, w in self.objective.items() if m in ms.SQUARES)
+        return (("mean_square_error", 1.0),) if ROOT in self.objective or not own else own
+
+    def _curvature(self, matrix, measures, slopes):
+        if self.model != "cost" or ROOT not in self.objective:
+            return matrix
+        # of a root: (matrix of its square / 2 - slope slope') / root, which is never negative
+        root, slope = max(float(measures[ROOT]), 1e-12), slopes[ROOT][0]
+        return self.objective[ROOT] * (0.5 * matrix - np.outer(slope, slope)) / root
+
+    def _run(self, group, values):
         if len(values) <= FORWARD_LIMIT:
-            return lp.sensitivities(self.loop, self.clock, self.needed, values, self.key)
-        measures, slopes = _reverse(self.loop, self.clock, self.needed, tuple(values), np.array(list(values.values())), self.key)
+            needed = tuple(dict.fromkeys([*self.needed, *([ROOT] if self.model == "cost" and ROOT in self.objective else [])]))
+            return sc.slopes_of(group, needed, values, self._squares())
+        measures, slopes = sc.reverse_slopes_of(group, self.needed, values)
         broken = not all(np.all(np.isfinite(v)) for v in slopes.values())
-        return measures, slopes, np.full((len(values),) * 2, np.nan), broken
-
-
-@functools.partial(jax.jit, static_argnames=("clock", "names"))
-def _batch(loop, clock, names, values, key):
-    return jax.vmap(lambda v: lp.evaluate_and_flag(with_values(loop, v), clock, names, key))(values)
-
-
-@functools.partial(jax.jit, static_argnames=("clock", "names", "order"))
-def _reverse(loop, clock, names, order, theta, key):
-    """(measures, {measure: (entries, P) slopes}) by reverse mode through checkpointed pieces; theta: (P,) values of `order`."""
-
-    def run(theta):
-        measures = lp.evaluate_for_reverse(with_values(loop, dict(zip(order, theta))), clock, names, key)
-        return measures, measures
-
-    slopes, measures = jax.jacrev(run, has_aux=True)(theta)
-    return measures, slopes
+        return measures, slopes, np.full((len(group.lanes), len(values), len(values)), np.nan), broken

@@ -116,11 +116,16 @@ def json_of(result):
         "units": units(result.tuned.loop.units),
         "constraints": clean(result.constraints),
         "evaluations": result.evaluations,
+        "scenarios": scenario_rows(result),
         "starts": clean(result.starts),
+        "mirror": clean(result.mirrored),
+        "choices": clean(result.choices),
         "optimality": clean(result.optimality),
+        "curvature": clean(result.curvature),
+        "tradeoff": clean(result.tradeoff),
         "wall_s": result.wall_s,
-        "bound": None,
-        "validation": None,
+        "bound": None if result.bound is None else clean(result.bound.to_json()),
+        "validation": clean(result.validation),
         "provenance": result.provenance,
     }
 
@@ -159,6 +164,7 @@ def text(result):
             )
     parts += [table(rows, ["measure", "unit", "before", "after"]), ""]
     if result.constraints:
+        shown = worst_of_scenarios(result.constraints)
         rows = [
             [
                 c["name"],
@@ -168,7 +174,7 @@ def text(result):
                 number(c["margin"], 3),
                 f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
             ]
-            for c in result.constraints
+            for c in shown
         ]
         parts += [
             table(
@@ -184,12 +190,113 @@ def text(result):
             ),
             "",
         ]
+    parts += _scenario_table(result) + _validation_table(result) + _choice_table(result) + _tradeoff_table(result)
+    if result.bound is not None:
+        parts += [result.bound.text(), ""]
     rims = (
         "rims are physics: liquid past them is lost"
         if result.tuned.loop.plant.overflow
         else "rims are limits: a level may rise past one"
     )
     return "\n".join([*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s", _wrap(result.message)])
+
+
+def worst_of_scenarios(constraints):
+    """The rows of `constraints`, of those that differ by their scenario alone the one with the least margin."""
+    worst = {}
+    for c in constraints:
+        same = (c["measure"], c["tank"], c["name"].removesuffix(f" in {c['scenario']}"))
+        if same not in worst or c["margin"] < worst[same]["margin"]:
+            worst[same] = c
+    return list(worst.values())
+
+
+def scenario_rows(result):
+    """One dict for each scenario: {name, weight, objective {before, after}, limits_held {before, after}}; [] for the case's own run alone."""
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    rows = []
+    for i, lane in enumerate(problem.lanes):
+        mine = [limit for limit in problem.limits if limit.lane == i]
+        sides = {k: t[i] for k, t in result.tables.items()}
+        rows.append(
+            {
+                "name": lane.name,
+                "weight": lane.weight,
+                "objective": clean({k: problem.cost(row) for k, row in sides.items()}),
+                "limits_held": {k: all(limit.margin(row) >= 0 for limit in mine) for k, row in sides.items()},
+            }
+        )
+    return rows
+
+
+def _scenario_table(result):
+    rows = [
+        [
+            s["name"],
+            number(s["weight"], 3),
+            *(number(s["objective"][k]) if s["objective"][k] is not None else "-" for k in ("before", "after")),
+            "yes" if s["limits_held"]["after"] else "no",
+        ]
+        for s in scenario_rows(result)
+    ]
+    head = ["scenario", "weight", "objective before", "after", "limits held after"]
+    return [table(rows, head), ""] if rows else []
+
+
+def _validation_table(result):
+    found = result.validation
+    if not found:
+        return []
+    spread = ", ".join(f"{n} +-{100 * s:g} %" for n, s in found["spread"].items()) or "the plant as it is"
+    noise = ", fresh noise" if found["noise"] else ""
+    rows = [
+        [
+            side,
+            *(number(found["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")),
+            f"{100 * found['limits_held'][side]:.0f} %",
+        ]
+        for side in ("before", "after")
+        if found["limits_held"][side] is not None
+    ]
+    if not rows:
+        return [f"held-out runs: all {found['samples']} failed", ""]
+    head = [f"on {found['samples']} held-out runs", "mean objective", "5 %", "median", "95 %", "all limits held in"]
+    failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
+    share = f"tuned is better in {100 * found['better_share']:.0f} % of them; perturbed: {spread}{noise}{failed}"
+    return [table(rows, head), share, ""]
+
+
+def _choice_table(result):
+    if not result.choices:
+        return []
+    rows = [
+        [
+            ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
+            c["status"],
+            number(c["objective"]["before"]),
+            number(c["objective"]["after"]),
+        ]
+        for c in result.choices
+    ]
+    return [table(rows, ["choice", "status", "objective before", "after"]), ""]
+
+
+def _tradeoff_table(result):
+    if not result.tradeoff:
+        return []
+    unit = ms.unit(result.tradeoff["measure"], result.tuned.loop.units)
+    rows = [
+        [
+            number(p["limit"]),
+            p["status"],
+            number(p["objective"]),
+            ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items()),
+        ]
+        for p in result.tradeoff["points"]
+    ]
+    return [table(rows, [f"limit of {result.tradeoff['measure']} [{unit}]", "status", "objective", "at"]), ""]
 
 
 def _wrap(message):
@@ -239,22 +346,29 @@ def _png(figure):
     return out.getvalue()
 
 
+def result_key(result):
+    """The key of the sensor noise of the case's own run, None where it has none."""
+    import jax
+
+    return jax.random.key(result.problem.seed) if bool(np.any(np.asarray(result.case.loop.sensor.noise) > 0)) else None
+
+
 def figures(result, runs=None):
     """Matplotlib figures of a tuning result: "responses" (before against after), "convergence", "landscape"."""
     import matplotlib.pyplot as plt
 
     from jaxtank import plotting
 
-    key = result.problem.key
+    key = result_key(result)
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
-    tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level"}
+    tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level" and limit.lane == 0}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
     told = {"before": "", "after": ""}
     if result.problem.limits:
         told = {
-            k: ", breaks a limit" if (result.problem.margins(m) < 0).any() else ", holds all limits"
-            for k, m in result.measures.items()
+            k: ", breaks a limit" if (result.problem.margins(t) < 0).any() else ", holds all limits"
+            for k, t in result.tables.items()
         }
     title = (
         f"{result.tuned.name}: objective {number(result.objective['before'], 4)}{told['before']} -> "
@@ -286,7 +400,7 @@ def _landscape(ax, result, unit):
     z0 = problem.start()
     if len(z) == 1:
         grid = np.linspace(0.0, 1.0, 128)
-        costs, margins = problem.screen(grid[:, None], problem.clock)
+        costs, margins = problem.screen(grid[:, None])
         violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
         b = problem.bounds[0]
         return plotting.curve(
@@ -306,7 +420,7 @@ def _landscape(ax, result, unit):
     a, c = np.meshgrid(side, side)
     points = np.tile(z, (a.size, 1))
     points[:, first], points[:, second] = a.ravel(), c.ravel()
-    costs, margins = problem.screen(points, problem.clock)
+    costs, margins = problem.screen(points)
     worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
     x, y = problem.bounds[first], problem.bounds[second]
     plotting.contours(
@@ -331,7 +445,7 @@ def save(result, folder):
     """Write result.json, rig.toml, trajectory.csv and PNG pictures to `folder`, each whole or not at all; returns their paths."""
     check_folder(folder)
     folder = Path(folder)
-    key = result.problem.key
+    key = result_key(result)
     runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
     files = {
         "result.json": dumps(json_of(result)) + "\n",

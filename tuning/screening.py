@@ -1,6 +1,5 @@
 """Where to start: Sobol points at a coarse step, and which of them only the coarse step makes unstable."""
 
-import dataclasses
 import functools
 
 import jax
@@ -12,19 +11,10 @@ from jaxtank.analysis import equilibrium
 from jaxtank.errors import InputError
 from jaxtank.stepping import Inputs, initial, step
 from jaxtank.tree import with_values
+from tuning.scenarios import coarse_clock
 
 LARGEST_STATE = 60
 """Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their cube."""
-
-COARSE = 10
-"""How many samples of the case make one of the coarse stage."""
-
-
-def coarse_clock(clock):
-    """The clock of the coarse stage: ten times the step, where that leaves at least a thousand samples; else the clock itself."""
-    if clock.samples < 1000 * COARSE:
-        return clock
-    return dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
 def sobol(count, dimensions, seed):
@@ -75,6 +65,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             xi=None,
             window=None,
             since=None,
+            rest=None,
             plan=jax.tree.map(lambda a: a[0], plan),
             own=jax.tree.map(lambda a: a[0], here.controller.inputs(clock)),
             fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),
@@ -100,7 +91,7 @@ def screen(problem, count, seed):
     """
     zs = sobol(count, len(problem.bounds), seed)
     clock = coarse_clock(problem.clock)
-    costs, margins = problem.screen(zs, clock)
+    costs, margins = problem.screen(zs, coarse=True)
     unstable = np.zeros(count, dtype=bool)
     if clock != problem.clock:
         unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(spectral_radius(problem, zs, problem.clock) > 1.0)
@@ -108,7 +99,7 @@ def screen(problem, count, seed):
         if suspect.any():
             # always the same number of lanes, so that one compiled program serves every search
             again = np.concatenate([zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)])
-            true_costs, true_margins = problem.screen(again, problem.clock)
+            true_costs, true_margins = problem.screen(again)
             costs[suspect], margins[suspect] = true_costs[: suspect.sum()], true_margins[: suspect.sum()]
     return zs, costs, margins, int(unstable.sum())
 

@@ -1,10 +1,9 @@
 """tune: better gains for a case, found through the simulation and checked at its own step."""
 
-import dataclasses
+import hashlib
 import os
 import platform
 import time
-from typing import Any
 
 import jax
 import numpy as np
@@ -12,106 +11,86 @@ import numpy as np
 import jaxtank
 from jaxtank import loop as lp
 from jaxtank import measures as ms
+from jaxtank import rig
 from jaxtank._xla import KEY
 from jaxtank.errors import InputError
 from jaxtank.tree import get_value, with_values
+from tuning import evidence, scenarios
+from tuning.evidence import REPORTED
+from tuning.memo import Log
 from tuning.objective import Problem
+from tuning.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.screening import coarse_clock, distinct_starts, screen
-from tuning.solvers import METHODS, Search, optimality, slsqp
+from tuning.solvers import METHODS, Search, minibatches, optimality, restore, slsqp
 
-REPORTED = tuple(m for m in ms.MEASURES if m not in ("time_of_max_level",))
-"""Measures in a result, before and after."""
+OFFERED = ("trf", "slsqp", "lbfgs", "adam")
+"""Methods that can be asked for by name."""
 
-BARELY = 0.5
-"""Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
-
-STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TuningResult:
-    """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
-
-    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent}}, the last how much 10 % of the value changes the
-    objective [%]; measures: {"before": {}, "after": {}}; constraints: one dict per limit with value, margin, tank and time; history:
-    (start, cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search. case and tuned are the Case
-    before and after.
-    """
-
-    case: Any
-    tuned: Any
-    method: str
-    status: str
-    message: str
-    parameters: dict
-    objective: dict
-    measures: dict
-    constraints: list
-    evaluations: dict
-    wall_s: float
-    history: list
-    starts: list
-    optimality: dict
-    provenance: dict
-    problem: Any
-
-    @property
-    def success(self):
-        """True if a search converged and every limit holds at the case's own step."""
-        return self.status == "converged"
-
-    def save(self, folder):
-        """Write result.json, rig.toml, trajectory.csv and the pictures to a folder."""
-        from tuning.report import save
-
-        return save(self, folder)
-
-    def plot(self):
-        """Matplotlib figures {name: figure}: responses before and after, convergence, landscape."""
-        from tuning.report import figures
-
-        return figures(self)
-
-    def __repr__(self):
-        from tuning.report import text
-
-        return text(self)
+MANY = 4
+"""Number of parameters from which "auto" tries Gauss-Newton before it looks at limits."""
 
 
 def tune(
-    case, method="auto", *, free=None, objective=None, limits=None, starts=8, seed=0, screening=64, iterations=60, progress=None
+    case,
+    method="auto",
+    *,
+    free=None,
+    objective=None,
+    limits=None,
+    scenarios=None,
+    choices=None,
+    starts=8,
+    seed=0,
+    screening=64,
+    iterations=60,
+    batch=None,
+    validation=64,
+    log=None,
+    resume=False,
+    progress=None,
 ):
     """Better values for the free parameters of a case, under its limits.
 
-    case: presets Case; method: "auto" (trf without limits, slsqp with them), "slsqp", "trf", "lbfgs" or "adam"; free: {name: (low,
-    high) or Free}; objective: {measure: weight}; limits: {measure: value}, {} for none; starts: local searches, from the case's own
-    values and the best distinct ones of `screening` Sobol points; seed: of the Sobol points and the sensor noise; iterations: of
-    each local search; progress: called with a dict after every evaluation. Ctrl-C ends the search with the best point so far.
-    Returns a TuningResult. Raises InputError for anything it cannot use, before anything is run.
+    case: presets Case; method: "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "lbfgs"
+    or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight}; limits: {measure: value}, {} for none, held in every
+    scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; choices: {static name: [values]}, each combination of
+    which is tuned, the best taken; starts: local searches, from the case's own values and the best distinct ones of `screening` Sobol
+    points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
+    adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; log: folder for
+    the log of evaluations, with which a killed search is continued by resume=True, to the same bits; progress: called with a dict after
+    every evaluation. Ctrl-C ends the search with the best point so far. Returns a TuningResult. Raises InputError for anything it
+    cannot use, before anything is run.
     """
+    options = dict(
+        free=free,
+        objective=objective,
+        limits=limits,
+        scenarios=scenarios,
+        starts=starts,
+        seed=seed,
+        screening=screening,
+        iterations=iterations,
+        batch=batch,
+        validation=validation,
+        progress=progress,
+    )
+    if choices:
+        from tuning.choices import tune_choices
+
+        return tune_choices(case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
-    if jax.numpy.result_type(float) != np.float64:
-        raise InputError(
-            "tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)"
-        )
-    for name, value, low in (("starts", starts, 1), ("screening", screening, 1), ("iterations", iterations, 1)):
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
-    noisy = bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
-    key = jax.random.key(seed) if noisy else None
+    _check_options(starts=starts, screening=screening, iterations=iterations, batch=batch, validation=validation)
+    problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed)
+    key = jax.random.key(seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
-    problem = Problem(case, free=free, objective=objective, limits=limits, key=key)
-    method = _method(method, problem)
+    method = _method(method, problem, batch)
     first = problem.start()
     before = run_measures(case.loop, case.clock, key)  # a start that is not finite is an input error, told by evaluate
+    _check_objective(problem, before)
+    if log is not None:
+        problem.memo = Log(log, fingerprint(problem, method, options), resume)
 
-    for measure in problem.objective:
-        if not np.all(np.isfinite(before[measure])):
-            raise InputError(
-                f"objective {measure} is not a number at the starting values (it cannot be measured on this run), so it cannot be tuned"
-            )
-
-    search, outcomes, interrupted, redone, polished = None, [], False, 0, False
+    search, outcomes, interrupted, redone, polished, curved = None, [], False, 0, False, None
     report = _reporter(progress, problem, starts)
     try:
         reference = problem.point(first)
@@ -121,30 +100,46 @@ def tune(
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)
         for i, z in enumerate(distinct_starts(zs, merits, starts, first)):
             search.start = i
-            count, converged = len(search.history), METHODS[method](search, z, iterations)
+            count = len(search.history)
+            if batch is None:
+                converged = METHODS[method](search, z, iterations)
+            else:
+                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, i]))
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
-        if method in ("slsqp", "trf") and search.best is not None:
+        if search.best is not None and search.violation(search.best) > 0 and method != "trf":
+            restore(search, search.best.z, iterations)
+        if method in ("slsqp", "trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
+        if search.best is not None and search.violation(search.best) == 0:
+            curved = evidence.curvature(problem, search, search.best)
     except KeyboardInterrupt:
         interrupted = True
     best = search.best if search and search.best else None
     z = first if best is None else best.z
     values = problem.values(z)
     if best is not None and np.array_equal(z, first):
-        values = {b.name: float(get_value(case.loop, b.name)) for b in problem.bounds}
-    felt = [None] * len(z) if interrupted or best is None else _felt(problem, z)
+        values = own_values(problem)
+    felt = [None] * len(z) if interrupted or best is None else evidence.felt(problem, z)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
-    checked = _constraints(problem, after, tuned)
+    tables = {"before": [before], "after": [after]}
+    if problem.scenarios:
+        tables = {"before": evidence.table_of(problem, own_values(problem)), "after": evidence.table_of(problem, values)}
+    checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
     status = "interrupted" if interrupted else _status(outcomes, holds, search, polished)
-    return TuningResult(
+    assert status in STATUSES
+    mirrored = None if interrupted or best is None else evidence.mirror_of(problem, outcomes, values)
+    validated = None
+    if validation and not interrupted and (case.uncertain or any(lane.key is not None for lane in problem.lanes)):
+        validated = evidence.validate(problem, own_values(problem), values, validation, seed)
+    result = TuningResult(
         case=case,
         tuned=tuned,
         method=method,
         status=status,
-        message=_message(status, problem, outcomes, checked, _constraints(problem, before, case), z, felt, redone),
+        message="",
         parameters={
             b.name: {
                 "before": float(get_value(case.loop, b.name)),
@@ -157,8 +152,9 @@ def tune(
             }
             for b, v, f in zip(problem.bounds, z, felt)
         },
-        objective={"before": problem.cost(before), "after": problem.cost(after), "terms": problem.objective},
+        objective={"before": problem.total(tables["before"]), "after": problem.total(tables["after"]), "terms": problem.objective},
         measures={"before": before, "after": after},
+        tables=tables,
         constraints=checked,
         evaluations={
             "simulations": problem.simulations,
@@ -170,21 +166,67 @@ def tune(
         history=search.history if search else [],
         starts=outcomes,
         optimality=_optimality(search, best),
+        curvature=curved,
+        mirrored=mirrored,
+        validation=validated,
         provenance=provenance(case, seed),
         problem=problem,
     )
+    result = result.replace(message=message(result, z, felt, redone))
+    if log is not None:
+        problem.memo.close()
+    return result
 
 
-def _method(method, problem):
+def own_values(problem):
+    """{name: value} of the case itself."""
+    return {b.name: float(get_value(problem.loop, b.name)) for b in problem.bounds}
+
+
+def _check_options(**counts):
+    if jax.numpy.result_type(float) != np.float64:
+        raise InputError(
+            "tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)"
+        )
+    for name, value in counts.items():
+        low = 0 if name == "validation" else 1
+        if name == "batch" and value is None:
+            continue
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
+            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
+
+
+def _check_objective(problem, before):
+    for measure in problem.objective:
+        if measure not in before or not np.all(np.isfinite(before[measure])):
+            raise InputError(
+                f"objective {measure} is not a number at the starting values (it cannot be measured on this run), so it cannot be tuned"
+            )
+
+
+def _method(method, problem, batch):
+    if batch is not None:
+        if method not in ("auto", "adam"):
+            raise InputError(f"batch = {batch}: only method adam draws scenarios, not {method}")
+        return "adam"
     if method == "auto":
-        return "trf" if problem.squares and not problem.limits else "slsqp"
-    if method not in METHODS:
-        raise InputError(f"method = {method!r}: must be one of auto, {', '.join(METHODS)}")
+        if problem.model and not problem.limits:
+            return "trf"
+        return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
+    if method not in OFFERED:
+        raise InputError(f"method = {method!r}: must be one of auto, {', '.join(OFFERED)}")
     if method == "trf" and problem.limits:
         raise InputError("method trf cannot hold limits: use slsqp (or auto), or drop them with --limit none")
-    if method == "trf" and not problem.squares:
-        raise InputError("method trf is for the objective rms_error_total alone: use slsqp (or auto)")
+    if method == "trf" and not problem.model:
+        raise InputError(
+            f"method trf needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)}) in the objective: use slsqp"
+        )
     return method
+
+
+def noisy(case):
+    """True if a run of the case draws noise."""
+    return scenarios.noisy(case)
 
 
 def run_measures(loop, clock, key):
@@ -211,40 +253,6 @@ def _outcome(search, z, count, converged):
     }
 
 
-def _felt(problem, z):
-    """Percent by which the objective changes when each parameter alone goes 10 % up or down (of its range where that is linear)."""
-    trials = [z]
-    for i, b in enumerate(problem.bounds):
-        value = float(b.from_unit(z[i]))
-        for factor in (-0.1, 0.1):
-            moved = b.to_unit(value * (1 + factor)) if b.scale == "log" else z[i] + factor
-            trials.append(np.where(np.arange(len(z)) == i, np.clip(moved, 0.0, 1.0), z))
-    costs, _ = problem.screen(np.array(trials), problem.clock)
-    change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
-    return [float(c) if np.isfinite(c) else None for c in change]
-
-
-def _constraints(problem, after, tuned):
-    checked = []
-    for limit in problem.limits:
-        value = float(np.ravel(after[limit.measure])[limit.index])
-        per = ms.MEASURES[limit.measure].per
-        tank = limit.index if per == "tank" else tuned.loop.plant.outputs[limit.index] if per == "output" else None
-        checked.append(
-            {
-                "name": limit.label,
-                "measure": limit.measure,
-                "unit": ms.unit(limit.measure, tuned.loop.units),
-                "limit": limit.value,
-                "value": value,
-                "margin": limit.margin(after),
-                "tank": None if tank is None else tank + 1,
-                "time_s": float(after["time_of_max_level"][limit.index]) if limit.measure == "max_level" else None,
-            }
-        )
-    return checked
-
-
 def _status(outcomes, holds, search, polished):
     """Converged means: the search that gave the answer did, or the last polish of it."""
     if search.best is None:
@@ -253,47 +261,6 @@ def _status(outcomes, holds, search, polished):
         return "infeasible"
     mine = search.best_start < len(outcomes) and outcomes[search.best_start]["converged"]
     return "converged" if mine or polished else "not_converged"
-
-
-def _message(status, problem, outcomes, checked, started, z, felt, redone):
-    """One paragraph for people: what was found, what is tight, what to doubt."""
-    words = []
-    broken = [c for c in checked if c["margin"] < 0]
-    if status == "infeasible":
-        worst = min(broken, key=lambda c: c["margin"])
-        words.append(
-            f"no point was found that meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, "
-            f"limit {worst['limit']:.6g} {worst['unit']}"
-        )
-    if status == "interrupted":
-        words.append("interrupted: this is the best point so far")
-    if status == "not_converged":
-        words.append("no search converged within its iterations: raise --iterations, or try other starts")
-    over = [c for c in started if c["margin"] < 0]
-    if over and status != "infeasible":
-        told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over)
-        words.append(f"the starting values break a limit ({told}), so their objective is not one to reach")
-    tight = [c for c in checked if 0 <= c["margin"] < 1e-3 * abs(c["limit"])]
-    for c in tight:
-        when = f" at {c['time_s']:.2f} s" if c["time_s"] is not None else ""
-        words.append(f"tight: {c['name']}{when} ({c['value']:.7g} of {c['limit']:.7g} {c['unit']})")
-    if checked and not tight and not broken:
-        words.append("no limit is tight")
-    for b, v, f in zip(problem.bounds, z, felt):
-        if v < 1e-6 or v > 1 - 1e-6:
-            words.append(f"{b.name} ends at its {'lower' if v < 0.5 else 'upper'} bound, {b.low if v < 0.5 else b.high:g} {b.unit}")
-        if f is not None and f < BARELY:
-            words.append(f"{b.name} is barely felt: 10 % changes the objective by {f:.2g} %")
-    held = [o for o in outcomes if o["violation"] == 0.0] or outcomes
-    if held:
-        best = min(o["cost"] for o in held)
-        agree = sum(o["violation"] == 0.0 and o["cost"] <= best * 1.001 for o in outcomes)
-        words.append(f"{agree} of {len(outcomes)} starts ended within 0.1 % of the best")
-    if redone:
-        words.append(f"{redone} screening points are unstable at the coarse step alone and were judged at the true one")
-    if problem.non_finite:
-        words.append(f"{problem.non_finite} trial points gave numbers that are not finite and were shrunk away from")
-    return "; ".join(words)
 
 
 def _optimality(search, best):
@@ -306,7 +273,7 @@ def _optimality(search, best):
 
 def _reporter(progress, problem, starts):
     def report(search):
-        if progress is not None:
+        if progress is not None and search.history:
             best = search.best
             progress(
                 {
@@ -322,6 +289,22 @@ def _reporter(progress, problem, starts):
             )
 
     return report
+
+
+def fingerprint(problem, method, options):
+    """What two runs must share for one to go on where the other ended: {what: text}."""
+    return {
+        "case": hashlib.sha256(rig.dump(problem.case).encode()).hexdigest(),
+        "free": repr([tuple(b) for b in problem.bounds]),
+        "objective": repr(problem.objective),
+        "limits": repr([tuple(limit) for limit in problem.limits]),
+        "scenarios": repr([(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]),
+        "method": method,
+        **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation")},
+        "jaxtank": jaxtank.__version__,
+        "jax": jax.__version__,
+        "xla_option": repr(KEY in os.environ.get("XLA_FLAGS", "")),
+    }
 
 
 def provenance(case, seed):

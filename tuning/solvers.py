@@ -4,7 +4,7 @@ import numpy as np
 import optax
 from scipy.optimize import least_squares, minimize, nnls
 
-from tuning.objective import EXPLODED
+from tuning.objective import EXPLODED, ROOT
 
 BACKOFF = 1e-6
 """Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
@@ -45,6 +45,10 @@ class Search:
             self.last_finite = point
             if self.best is None or self.better(point, self.best):
                 self.best, self.best_start = point, self.start
+        self.report(self)
+
+    def passed(self):
+        """Tell the reporter that something was evaluated that is not a Point of its own."""
         self.report(self)
 
     def violation(self, point):
@@ -89,20 +93,27 @@ def slsqp(search, z, iterations, tolerance=1e-8):
 
 
 def trf(search, z, iterations, tolerance=1e-10):
-    """Bounded Gauss-Newton trust region on the mean squared tracking error, P + 1 residuals that give the same model as all samples."""
-
-    weight = search.problem.objective["rms_error_total"]
+    """Bounded Gauss-Newton trust region on P + 1 residuals that have the cost's value, slope and second derivative (the latter without
+    the residuals' own curvature). Limits are not looked at. Returns True if it converged."""
+    squared = search.problem.model == "square"
+    weight = search.problem.objective[ROOT] if squared else 1.0
 
     def model(z):
         point = search.point(z)
         if not point.finite or not np.all(np.abs(point.gauss_newton) < EXPLODED**2):
             return np.full(len(z) + 1, 1e3), np.eye(len(z) + 1, len(z))
-        normal = 0.5 * weight**2 * point.gauss_newton / search.scale**2
-        slope = point.cost * point.gradient / search.scale**2
+        cost = point.cost / search.scale
+        if squared:
+            value, slope = cost**2, cost * point.gradient / search.scale
+            normal = 0.5 * weight**2 * point.gauss_newton / search.scale**2
+        else:  # the residuals' squares sum to the cost and one more, so that a steep cost near 0 fits too
+            value, slope, normal = cost + 1.0, 0.5 * point.gradient / search.scale, 0.5 * point.gauss_newton / search.scale
         root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
         head = np.linalg.solve(root, slope)
-        rest = np.sqrt(max((point.cost / search.scale) ** 2 - head @ head, 0.0))
-        return np.append(head, rest), np.vstack([root.T, np.zeros(len(z))])
+        excess = max(1.0, float(head @ head) / value)  # terms without squares may slope more than the model's curvature allows
+        return np.append(head / excess**0.5, max(value - head @ head / excess, 0.0) ** 0.5), np.vstack(
+            [root.T * excess**0.5, 0 * z]
+        )
 
     done = least_squares(
         lambda z: model(z)[0],
@@ -118,6 +129,40 @@ def trf(search, z, iterations, tolerance=1e-10):
     return bool(done.success)
 
 
+def gauss_newton_first(search, z, iterations):
+    """`trf` as if there were no limits; where it ends outside one, `slsqp` from where it began. The cheapest way where limits are slack."""
+    mark = len(search.history)
+    converged = trf(search, z, iterations, tolerance=1e-6)
+    mine = [h for h in search.history[mark:] if np.isfinite(h[1])]
+    if mine and min(mine, key=lambda h: h[1])[2] == 0.0:
+        return converged
+    return slsqp(search, z, iterations)
+
+
+def restore(search, z, iterations):
+    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with every margin at least -t."""
+    if not search.problem.limits:
+        return
+
+    def holds(y):
+        return search.margins(y[:-1])[0] + y[-1]
+
+    def slopes(y):
+        rows = search.margins(y[:-1])[1]
+        return np.hstack([rows, np.ones((len(rows), 1))])
+
+    worst = max(0.0, float(-search.margins(z)[0].min()))
+    minimize(
+        lambda y: (y[-1], np.eye(len(y))[-1]),
+        np.append(z, worst),
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * len(z) + [(0.0, None)],
+        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
+        options={"maxiter": iterations, "ftol": 1e-10},
+    )
+
+
 def lbfgs(search, z, iterations):
     """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
     return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
@@ -128,6 +173,31 @@ def adam(search, z, iterations):
     steps = 5 * iterations
     schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
     return _augmented(search, z, steps, optax.adam(schedule), descend=False)
+
+
+def minibatches(search, z, iterations, batch, rng):
+    """optax's Adam on the mean of `batch` scenarios drawn afresh for every step, limits of those by a quadratic penalty. All scenarios
+    are looked at ten times on the way, and they decide what is best."""
+    steps = 5 * iterations
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
+    state, every = optimiser.init(z), max(1, steps // 10)
+    for k in range(steps):
+        point = search.problem.part(z, batch, rng)
+        search.passed()
+        if not point.finite:
+            z = 0.5 * (z + search.last_finite.z)
+            continue
+        room = (
+            np.array([max(abs(limit.value), 1.0) for limit in search.problem.limits])[point.rows] if len(point.rows) else np.ones(0)
+        )
+        push = 100.0 * np.maximum(0.0, -point.margins / room)
+        g = point.gradient / search.scale - push @ (point.margin_slopes / room[:, None])
+        g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
+        update, state = optimiser.update(g, state, z)
+        z = np.clip(z + np.asarray(update), 0.0, 1.0)
+        if (k + 1) % every == 0:
+            search.point(z)
+    return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
 def _rounds(search):
@@ -193,4 +263,4 @@ def optimality(search, point):
     return float(np.linalg.norm(g)), float(np.linalg.norm(residual)), multipliers
 
 
-METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam}
+METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam, "trf-slsqp": gauss_newton_first}

@@ -6,11 +6,13 @@ case = preset.cases["backstepping"]     # .loop .clock .limits
 A paper is a module of this folder with a function `preset`; to add one, add its file.
 """
 
+import dataclasses
+import functools
 import importlib
 import pkgutil
 
 from jaxtank.errors import InputError, unknown
-from jaxtank.presets.base import Case, Claim, Free, Preset, Published
+from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 
 PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "base" and not m.name.startswith("_")))
 
@@ -19,7 +21,14 @@ def load(paper):
     """The Preset of `paper`, one of PAPERS. Raises InputError for another name."""
     if paper not in PAPERS:
         raise unknown("paper", paper, PAPERS)
-    return importlib.import_module(f"jaxtank.presets.{paper}").preset()
+    return _load(paper)
+
+
+@functools.cache
+def _load(paper):
+    preset = importlib.import_module(f"jaxtank.presets.{paper}").preset()
+    spread = {name: share for name, (share, _) in preset.uncertain.items()}
+    return dataclasses.replace(preset, cases={name: case.replace(uncertain=spread) for name, case in preset.cases.items()})
 
 
 def names():
@@ -35,4 +44,4 @@ def find(name):
     raise unknown("case", name, names())
 
 
-__all__ = ["PAPERS", "Case", "Claim", "Free", "InputError", "Preset", "Published", "find", "load", "names"]
+__all__ = ["PAPERS", "Case", "Claim", "Free", "InputError", "Mirror", "Preset", "Published", "Scenario", "find", "load", "names"]

@@ -37,13 +37,32 @@ class Claim(NamedTuple):
     text: str
 
 
+class Scenario(NamedTuple):
+    """One of several runs that a tuning is judged by: the case with `values` set by dotted name (a gust of noise, a tired pump, other
+    setpoints, another duration), its sensor noise drawn with `seed`, counted with `weight` in the mean over scenarios [-]."""
+
+    name: str
+    values: Mapping[str, Any] = {}
+    seed: int = 0
+    weight: float = 1.0
+
+
+class Mirror(NamedTuple):
+    """Gains that exchange roles: image({name: value}) are the values, of some or all names, that give the same loop or nearly so."""
+
+    words: str
+    image: Callable
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
     """One rig, one law, one reference, one clock, with the gains its paper prints.
 
     limits: {measure: upper limit (number, or one per entry), or "rim" for the rim of each tank}; free: {parameter: Free}, what
     `tune` tunes unless told otherwise; objective: {measure: weight}, what it makes small; reachable: whether every plateau of the
-    reference must have a steady state within the pumps' direction (False where the paper asks for one that has none).
+    reference must have a steady state within the pumps' direction (False where the paper asks for one that has none); scenarios: what
+    `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange roles, where the law has such;
+    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on.
     """
 
     name: str
@@ -54,6 +73,9 @@ class Case:
     free: Mapping[str, Free]
     objective: Mapping[str, float]
     reachable: bool = True
+    scenarios: tuple[Scenario, ...] = ()
+    mirror: Mirror | None = None
+    uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def replace(self, **changes):
         """A copy with the named fields changed."""

@@ -264,8 +264,8 @@ def preset():
                 clock=CLOCK,
                 limits={"max_level": "rim"},
                 free={name: TUNABLE[name.replace("q[1]", "q")] for name in free},
-                # RMS alone is flat once the pumps saturate (spec D); at 1e-4 per U0 r_w still runs to its lower bound without limits
-                objective={"rms_error_total": 1.0, "input_travel": 3e-4},
+                # J of spec D with its price of overshoot: the error alone is flat once the pumps saturate
+                objective={"mean_square_error": 1e4, "mean_square_travel": 20.0, "mean_square_overshoot": 1e5},
             )
     return Preset(
         paper="khalid",

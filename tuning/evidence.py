@@ -1,0 +1,194 @@
+"""What is said of an answer besides the answer: what it feels, where it is flat, what it is the mirror of, how it does on rigs unseen."""
+
+import dataclasses
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.tree import get_value, with_values
+from tuning import scenarios as sc
+
+STEP = 1e-4
+"""Step of the differences of the gradient, in the unit cube [-]."""
+
+LARGEST_CURVATURE = 24
+"""Number of parameters up to which the second derivative is looked into."""
+
+HELD_OUT = 1_000_003
+"""Offset of the seeds of the validation from those of the search."""
+
+REPORTED = tuple(m for m in ms.MEASURES if m not in ("time_of_max_level",))
+"""Measures in a result, before and after."""
+
+
+def felt(problem, z):
+    """Percent by which the objective changes when each parameter alone goes 10 % up or down (of its range where that is linear)."""
+    trials = [z]
+    for i, b in enumerate(problem.bounds):
+        value = float(b.from_unit(z[i]))
+        for factor in (-0.1, 0.1):
+            moved = b.to_unit(value * (1 + factor)) if b.scale == "log" else z[i] + factor
+            trials.append(np.where(np.arange(len(z)) == i, np.clip(moved, 0.0, 1.0), z))
+    costs, _ = problem.screen(np.array(trials))
+    change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
+    return [float(c) if np.isfinite(c) else None for c in change]
+
+
+def curvature(problem, search, point):
+    """The second derivative of the scaled cost at an answer, along the directions that active limits and bounds leave free.
+
+    By differences of the exact gradient. Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
+    [{name: component}, ...] in the unit cube, "flattest": {...}}, where "flattest" is a step along the first direction that moves its
+    largest component by 10 % (of the range, where the parameter is linear): {"factors": {name: ratio or change}, "changes_percent": of
+    the objective, run}.
+    """
+    z, count = point.z, len(point.z)
+    if count < 2 or count > LARGEST_CURVATURE:
+        return None
+    columns = []
+    for i in range(count):
+        e = np.eye(count)[i] * STEP
+        up, down = problem.point(np.clip(z + e, 0, 1)), problem.point(np.clip(z - e, 0, 1))
+        if not (up.finite and down.finite):
+            return None
+        columns.append((up.gradient - down.gradient) / (up.z - down.z)[i] / search.scale)
+    held = [s for m, s, room in zip(point.margins, point.margin_slopes, search.room) if m / room < 1e-4]
+    held += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6]
+    basis = np.eye(count)
+    if held:
+        _, sizes, rows = np.linalg.svd(np.array(held))
+        basis = rows[np.sum(sizes > 1e-9 * max(sizes[0], 1e-300)) :].T
+    if not basis.shape[1]:
+        return None
+    matrix = basis.T @ (0.5 * (np.array(columns) + np.array(columns).T)) @ basis
+    values, vectors = np.linalg.eigh(matrix)
+    directions = (basis @ vectors).T
+    flat = directions[0] * np.sign(directions[0][np.argmax(np.abs(directions[0]))])
+    largest = int(np.argmax(np.abs(flat)))
+    b = problem.bounds[largest]
+    step = np.log(1.1) / np.log(b.high / b.low) if b.scale == "log" else 0.1
+    step = step / flat[largest]
+    if not 0 <= z[largest] + step * flat[largest] <= 1:
+        step = -step
+    there = np.clip(z + step * flat, 0.0, 1.0)
+    costs, _ = problem.screen(np.array([z, there]))
+    factors = {}
+    for b, old, new in zip(problem.bounds, z, there):
+        before, after = float(b.from_unit(old)), float(b.from_unit(new))
+        factors[b.name] = after / before if b.scale == "log" else after - before
+    return {
+        "eigenvalues": values.tolist(),
+        "directions": [dict(zip(problem.names, map(float, d))) for d in directions],
+        "flattest": {"factors": factors, "changes_percent": float(100 * abs(costs[1] / costs[0] - 1))},
+    }
+
+
+def flat_words(problem, found):
+    """The flattest direction as a sentence."""
+    parts = []
+    for b, factor in zip(problem.bounds, found["flattest"]["factors"].values()):
+        if b.scale == "log" and abs(factor - 1) > 5e-3:
+            parts.append(f"{b.name} x {factor:.3g}")
+        elif b.scale != "log" and abs(factor) > 5e-3 * (b.high - b.low):
+            parts.append(f"{b.name} {factor:+.2g} {b.unit}")
+    if not parts:
+        return ""
+    together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
+    return f"flattest direction: {together} changes the objective by {found['flattest']['changes_percent']:.2g} %"
+
+
+def mirror_of(problem, outcomes, values):
+    """The answer `values` with the gains exchanged that the case's `mirror` names; None where it has none, or outside the ranges.
+
+    Returns {"words", "values" {name: value}, "objective", "starts": indices of the searches that ended there rather than here}.
+    """
+    if problem.case.mirror is None:
+        return None
+    image = problem.case.mirror.image(values)
+    if not image or not all(n in values for n in image):
+        return None
+    there = {**values, **image}
+    z = np.array([float(b.to_unit(there[b.name])) for b in problem.bounds])
+    if np.any(z < 0) or np.any(z > 1):
+        return None
+
+    def apart(a, b):
+        return max(abs(np.log(a[n] / b[n])) for n in image)
+
+    half = 0.5 * apart(values, there)
+    starts = [i for i, o in enumerate(outcomes) if o["violation"] == 0.0 and half > 0 and apart(o["to"], there) < half]
+    cost = float(problem.screen(z[None])[0][0])
+    return {"words": problem.case.mirror.words, "values": there, "objective": cost, "starts": starts}
+
+
+def table_of(problem, values):
+    """Measures of every scenario at {parameter: value}: a list of {name: value}, with all that is reported where it is served."""
+    points = {n: np.array([v]) for n, v in values.items()}
+    table = [None] * len(problem.lanes)
+    for group in problem.groups:
+        loop = problem.lanes[group.lanes[0]].case.loop
+        names = (*(m for m in REPORTED if ms.serves(m, loop)), "time_of_max_level")
+        measures, _ = sc.values_of(group, names, points)
+        for j, lane in enumerate(group.lanes):
+            table[lane] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
+    return table
+
+
+def perturbed(problem, samples, seed):
+    """Lanes that the search never saw: its scenarios in turn, with every uncertain parameter of the plant off by its own factor, uniform
+    within the case's spread, and fresh sensor noise."""
+    rng, lanes = np.random.default_rng([HELD_OUT, seed]), []
+    for i in range(samples):
+        lane = problem.lanes[i % len(problem.lanes)]
+        loop = lane.case.loop
+        for name, spread in problem.case.uncertain.items():
+            value = np.asarray(get_value(loop, name))
+            loop = with_values(loop, {name: value * (1.0 + spread * rng.uniform(-1.0, 1.0, value.shape))})
+        key = None if lane.key is None else jax.random.fold_in(jax.random.key(HELD_OUT + seed), i)
+        lanes.append(lane._replace(case=lane.case.replace(loop=loop), key=key, name=f"held-out {i + 1}", weight=1.0 / samples))
+    return lanes
+
+
+def validate(problem, before, after, samples, seed):
+    """How the values `before` and `after` do on `samples` runs that the search never saw (see `perturbed`).
+
+    Returns {"samples", "spread" {name: share}, "noise", "failed", "objective" {"before"/"after": {"mean", "p05", "p50", "p95"}},
+    "better_share": of the runs in which the tuned values cost less, "limits_held" {"before"/"after": share of the runs in which every
+    limit holds}}.
+    """
+    lanes = perturbed(problem, samples, seed)
+    points = {n: np.array([before[n], after[n]]) for n in problem.names}
+    costs, held, broken = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool), np.zeros(samples, dtype=bool)
+    for group in sc.groups_of(lanes):
+        measures, flags = sc.values_of(group, problem.needed, points)
+        measures, flags = {m: np.asarray(v) for m, v in measures.items()}, np.asarray(flags)
+        for j, i in enumerate(group.lanes):
+            mine = [limit for limit in problem.limits if limit.lane == i % len(problem.lanes)]
+            broken[i] = flags[:, j].any()
+            for side in (0, 1):
+                row = {m: v[side, j] for m, v in measures.items()}
+                costs[i, side] = problem.cost(row)
+                held[i, side] = all(limit.margin(row) >= 0 for limit in mine)
+    good = ~broken & np.isfinite(costs).all(axis=1)
+
+    def summary(column):
+        quantiles = np.quantile(column, (0.05, 0.5, 0.95)) if column.size else [np.nan] * 3
+        return dict(zip(("mean", "p05", "p50", "p95"), map(float, (column.mean() if column.size else np.nan, *quantiles))))
+
+    return {
+        "samples": samples,
+        "spread": {n: float(s) for n, s in problem.case.uncertain.items()},
+        "noise": any(lane.key is not None for lane in lanes),
+        "failed": int((~good).sum()),
+        "objective": {name: summary(costs[good, side]) for side, name in enumerate(("before", "after"))},
+        "better_share": float(np.mean(costs[good, 1] < costs[good, 0])) if good.any() else None,
+        "limits_held": {
+            name: float(np.mean(held[good, side])) if good.any() else None for side, name in enumerate(("before", "after"))
+        },
+    }
+
+
+def changed(case, values):
+    """`case` with leaves set, without the checks at the door."""
+    return dataclasses.replace(case, loop=with_values(case.loop, values))

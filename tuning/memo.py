@@ -1,0 +1,123 @@
+"""What was evaluated before: a log that a killed run is continued from, to the same bits."""
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank.errors import InputError
+
+NAME = "evaluations.jsonl"
+LARGEST = 1 << 30
+"""Largest log that is read [bytes]."""
+
+
+class Memo:
+    """Results by what was asked. A search asks in an order that its results alone decide, so one that is started again and finds its
+    earlier results here walks the same path, and goes on where the log ends."""
+
+    def __init__(self):
+        self.found = {}
+
+    def recall(self, kind, asked, compute):
+        """compute(), or what it gave when the same was asked before. asked: list of arrays and plain values."""
+        key = _digest(kind, asked)
+        if key not in self.found:
+            self.found[key] = self.keep(kind, key, compute())
+        return self.found[key]
+
+    def keep(self, kind, key, result):
+        """`result`, entered wherever it is to be kept."""
+        return result
+
+
+class Log(Memo):
+    """A Memo that is also a file, a line per evaluation, numbers in hexadecimal so that not a bit is lost.
+
+    The first line says what problem it belongs to. A line that a kill cut short is dropped. Raises InputError for a log of another
+    problem, or one that is no log.
+    """
+
+    def __init__(self, folder, problem, resume=False):
+        super().__init__()
+        self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 1, "problem": problem}, sort_keys=True)
+        whole = self._read(head) if resume else b""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.file = open(self.path, "r+b" if whole else "wb")  # noqa: SIM115  (open for the life of the search)
+        if whole:
+            self.file.seek(len(whole))
+            self.file.truncate()
+        else:
+            self.file.write(head.encode() + b"\n")
+        self.file.flush()
+        self.resumed = len(self.found)
+
+    def _read(self, head):
+        try:
+            if self.path.stat().st_size > LARGEST:
+                raise InputError(f"{NAME}: larger than {LARGEST >> 20} MiB, not a log of this program")
+            data = self.path.read_bytes()
+        except OSError as error:
+            raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} cannot be read ({error.strerror})") from None
+        lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)
+        if not lines:
+            return b""
+        try:
+            mine, theirs = json.loads(head)["problem"], json.loads(lines[0])["problem"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(f"--resume: {NAME} is not a log of this program") from None
+        if mine != theirs:
+            other = [k for k in mine if not isinstance(theirs, dict) or mine[k] != theirs.get(k)]
+            raise InputError(
+                f"--resume: the run in {str(self.path.parent)!r} was of another problem; what differs: {', '.join(other)}"
+            )
+        for i, line in enumerate(lines[1:]):
+            try:
+                entry = json.loads(line)
+                self.found[entry["key"]] = tuple(_read(v) for v in entry["result"])
+            except (ValueError, KeyError, TypeError):
+                raise InputError(f"--resume: line {i + 2} of {NAME} is not one of its entries") from None
+        return b"".join(lines)
+
+    def keep(self, kind, key, result):
+        text = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]})
+        self.file.write(text.encode() + b"\n")
+        self.file.flush()
+        return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
+
+    def close(self, remove=False):
+        """End the log; `remove` it, for a run that has its result."""
+        self.file.close()
+        if remove:
+            os.unlink(self.path)
+
+
+def _digest(kind, asked):
+    digest = hashlib.sha256(kind.encode())
+    for value in asked:
+        array = np.asarray(value)
+        digest.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def _write(value):
+    """A number, an array, a dict or a tuple of them as JSON without loss."""
+    if isinstance(value, dict):
+        return {"of": {k: _write(v) for k, v in value.items()}}
+    if isinstance(value, (tuple, list)):
+        return {"all": [_write(v) for v in value]}
+    array = np.asarray(value)
+    if array.dtype != np.float64:
+        raise TypeError(f"a log holds float64, not {array.dtype}")
+    return {"shape": array.shape, "hex": [float(v).hex() for v in array.ravel()]}
+
+
+def _read(entry):
+    if "of" in entry:
+        return {k: _read(v) for k, v in entry["of"].items()}
+    if "all" in entry:
+        return tuple(_read(v) for v in entry["all"])
+    array = np.array([float.fromhex(v) for v in entry["hex"]], dtype=np.float64).reshape([int(n) for n in entry["shape"]])
+    return float(array) if array.ndim == 0 else array

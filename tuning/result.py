@@ -1,0 +1,158 @@
+"""A tuning result, and what it says of itself in words."""
+
+import dataclasses
+from typing import Any
+
+from jaxtank import measures as ms
+from tuning.evidence import flat_words
+
+BARELY = 0.5
+"""Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
+
+STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuningResult:
+    """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
+
+    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent}}, the last how much 10 % of the value changes the
+    objective [%]; measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
+    that the search was judged by; constraints: one dict per limit and scenario with value, margin, tank and time; history: (start,
+    cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search; curvature, validation: see
+    `evidence`; mirrored: the answer's mirror image, see
+    `evidence.mirror_of`; choices: what each combination of discrete choices gave;
+    bound: what no law could beat, where asked. case and tuned are the Case before and after.
+    """
+
+    case: Any
+    tuned: Any
+    method: str
+    status: str
+    message: str
+    parameters: dict
+    objective: dict
+    measures: dict
+    tables: dict
+    constraints: list
+    evaluations: dict
+    wall_s: float
+    history: list
+    starts: list
+    optimality: dict
+    curvature: dict | None
+    mirrored: dict | None
+    validation: dict | None
+    provenance: dict
+    problem: Any
+    choices: list = dataclasses.field(default_factory=list)
+    bound: Any = None
+    tradeoff: Any = None
+
+    @property
+    def success(self):
+        """True if a search converged and every limit holds at the case's own step, in every scenario."""
+        return self.status == "converged"
+
+    def replace(self, **changes):
+        """A copy with the named fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def save(self, folder):
+        """Write result.json, rig.toml, trajectory.csv and the pictures to a folder."""
+        from tuning.report import save
+
+        return save(self, folder)
+
+    def plot(self):
+        """Matplotlib figures {name: figure}: responses before and after, convergence, landscape."""
+        from tuning.report import figures
+
+        return figures(self)
+
+    def __repr__(self):
+        from tuning.report import text
+
+        return text(self)
+
+
+def constraint_rows(problem, table):
+    """One dict for each limit of the problem: {name, measure, unit, limit, value, margin, tank, time_s, scenario}."""
+    rows = []
+    for limit in problem.limits:
+        measures, plant = table[limit.lane], problem.lanes[limit.lane].case.loop.plant
+        per = ms.MEASURES[limit.measure].per
+        tank = limit.index if per == "tank" else plant.outputs[limit.index] if per == "output" else None
+        rows.append(
+            {
+                "name": limit.label,
+                "measure": limit.measure,
+                "unit": ms.unit(limit.measure, problem.loop.units),
+                "limit": limit.value,
+                "value": float(measures[limit.measure].ravel()[limit.index]),
+                "margin": limit.margin(measures),
+                "tank": None if tank is None else tank + 1,
+                "time_s": float(measures["time_of_max_level"][limit.index]) if limit.measure == "max_level" else None,
+                "scenario": limit.scenario or None,
+            }
+        )
+    return rows
+
+
+def message(result, z, felt, redone):
+    """One paragraph for people, parts joined by "; ": what was found, what is tight, what to doubt."""
+    words, problem, checked = [], result.problem, result.constraints
+    broken = [c for c in checked if c["margin"] < 0]
+    if result.status == "infeasible":
+        worst = min(broken, key=lambda c: c["margin"] / max(abs(c["limit"]), 1.0))
+        words.append(
+            f"no point was found that meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, "
+            f"limit {worst['limit']:.6g} {worst['unit']}, missed by {-worst['margin']:.3g} {worst['unit']} at the least"
+        )
+    if result.status == "interrupted":
+        words.append("interrupted: this is the best point so far")
+    if result.status == "not_converged":
+        words.append("no search converged within its iterations: raise --iterations, or try other starts")
+    over = [c for c in constraint_rows(problem, result.tables["before"]) if c["margin"] < 0]
+    if over and result.status != "infeasible":
+        told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over[:4])
+        more = f" and {len(over) - 4} more" if len(over) > 4 else ""
+        words.append(f"the starting values break a limit ({told}{more}), so their objective is not one to reach")
+    tight = [c for c in checked if 0 <= c["margin"] < 1e-3 * abs(c["limit"])]
+    for c in tight:
+        when = f" at {c['time_s']:.2f} s" if c["time_s"] is not None else ""
+        words.append(f"tight: {c['name']}{when} ({c['value']:.7g} of {c['limit']:.7g} {c['unit']})")
+    if checked and not tight and not broken:
+        words.append("no limit is tight")
+    for b, v, f in zip(problem.bounds, z, felt):
+        if v < 1e-6 or v > 1 - 1e-6:
+            words.append(f"{b.name} ends at its {'lower' if v < 0.5 else 'upper'} bound, {b.low if v < 0.5 else b.high:g} {b.unit}")
+        if f is not None and f < BARELY:
+            words.append(f"{b.name} is barely felt: 10 % changes the objective by {f:.2g} %")
+    flat = flat_words(problem, result.curvature) if result.curvature else ""
+    if flat:
+        words.append(flat)
+    words += _agreement(result)
+    if redone:
+        words.append(f"{redone} screening points are unstable at the coarse step alone and were judged at the true one")
+    if problem.non_finite:
+        words.append(f"{problem.non_finite} trial points gave numbers that are not finite and were shrunk away from")
+    return "; ".join(words)
+
+
+def _agreement(result):
+    outcomes, words = result.starts, []
+    held = [o for o in outcomes if o["violation"] == 0.0] or outcomes
+    if not held:
+        return words
+    best = min(o["cost"] for o in held)
+    alike = [i for i, o in enumerate(outcomes) if o["violation"] == 0.0 and o["cost"] <= best * 1.001]
+    words.append(f"{len(alike)} of {len(outcomes)} starts ended within 0.1 % of the best")
+    image = result.mirrored
+    if image and image["objective"] is not None:
+        at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
+        above = 100 * (image["objective"] / result.objective["after"] - 1)
+        same = "the same objective" if abs(above) < 1e-3 else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
+        ended = f"; {len(image['starts'])} of the starts ended there, and count as this answer" if image["starts"] else ""
+        words.append(f"mirror image: {image['words']}: {at} gives {same}{ended.replace('; ', ', ')}")
+    return words
