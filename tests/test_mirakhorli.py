@@ -924,7 +924,22 @@ def test_every_published_number_that_can_be_measured_is():
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
     assert [verdicts[f"rise time, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["not reproduced"] * 3
-    assert verdicts["30 % change of an outlet"] == "partly"
+    assert verdicts["30 % change of an outlet"] == verdicts["zero steady-state error of the SFC"] == "partly"
+
+
+def test_the_verdict_on_zero_error_follows_the_numbers():
+    """With LQI in the place of SFC the claim holds; with a pump that is weaker than the model in every run it does not."""
+    swapped = {"sfc": "lqi", "sfc-warm": "lqi-warm"}
+
+    def told(instead, always):
+        def other(name, values=None, save_every=1):
+            values = {**{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}, **always}
+            return run(instead.get(name, name), **values)
+
+        return mirakhorli.measured(other)["zero steady-state error of the SFC"].verdict
+
+    assert told(swapped, {}) == "reproduced"
+    assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
 
 
 def _hash(value):
