@@ -21,12 +21,22 @@ LAYERS = [
     {"scheduling"},
     {"rig", "plotting"},
 ]
-ABOVE = [{"bounds"}, {"objective"}, {"screening", "solvers"}, {"search"}, {"report"}, {"manual"}, {"bench", "compare"}, {"cli"}]
+ABOVE = [
+    {"bounds", "inputs", "projected", "memo", "scenarios"},
+    {"objective"},
+    {"screening", "solvers", "input_search", "evidence"},
+    {"result"},
+    {"search", "choices", "bound", "tradeoff"},
+    {"report"},
+    {"manual"},
+    {"bench", "compare"},
+    {"cli"},
+]
 RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer}
 RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for room in layer}
 
 # Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
-DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.search", "tuning.report")}
+DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.result", "tuning.report")}
 
 
 def room(module):

@@ -20,8 +20,9 @@ def minimise(function, z, iterations, tolerance=1e-8):
     L-BFGS-B does the same with small dense factorisations, which spend more on threads than such a simulation takes.)
     """
     value, gradient = function(z)
-    pairs, flat, k = deque(maxlen=MEMORY), 0, 0
-    for k in range(1, iterations + 1):
+    pairs, flat, count = deque(maxlen=MEMORY), 0, 0
+    for _ in range(iterations):
+        count += 1
         free = ~(((z <= 0.0) & (gradient > 0.0)) | ((z >= 1.0) & (gradient < 0.0)))
         slope = np.where(free, gradient, 0.0)
         if not np.any(slope):
@@ -50,7 +51,7 @@ def minimise(function, z, iterations, tolerance=1e-8):
         z, value, gradient = new, trial, trial_gradient
         if flat >= FLAT:
             break
-    return z, value, gradient, k
+    return z, value, gradient, count
 
 
 def _inverse_hessian(q, pairs, free):
