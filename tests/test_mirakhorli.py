@@ -240,6 +240,13 @@ def test_the_printed_gain_is_linear_quadratic():
     np.testing.assert_allclose(np.abs(rounded - np.array(GAIN)).max(), 0.0034, atol=5e-5)
 
 
+def test_no_other_split_of_four_digits_gives_the_printed_gain():
+    """Spec 3: among its neighbours on a grid of 1e-4 (0.4165, 0.3414) is the only node within the rounding of all eight entries."""
+    nodes = [(0.4165 + 1e-4 * i, 0.3414 + 1e-4 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    near = [n for n in nodes if np.abs(designed(n) - np.array(GAIN)).max() <= 5e-5]
+    np.testing.assert_allclose(near, [UNROUNDED_SPLIT], rtol=1e-12)
+
+
 @pytest.mark.parametrize("r, worst", [(2.5, 0.0325), (2.8, 0.0133), (3.2, 0.0101), (3.5, 0.0212)])
 def test_other_weights_miss_the_printed_gain(r, worst):
     A, B, C = linearise(PLANT, X0, U0)
