@@ -110,7 +110,7 @@ def test_what_is_said_of_it(climbed):
 @pytest.mark.parametrize(
     "paper, name, values",
     [
-        ("mirakhorli", "sfc-warm", {}),
+        pytest.param("mirakhorli", "sfc-warm", {}, marks=pytest.mark.slow),
         ("gouta2022", "enmpc", {"sensor.noise": 0.02, "actuator.delay": 1.0, "actuator.lag": 0.5}),
         pytest.param("calofir", "backstepping", {}, marks=pytest.mark.slow),
         pytest.param("khalid", "gpc", {}, marks=pytest.mark.slow),
