@@ -63,7 +63,7 @@ class PumpBank:
         return ActuatorState(
             running=tuple(z + 1.0 for z in zero) if self.dead_zone is not None and self.dead_zone_kind == "hysteresis" else (),
             owed=zero if self.dead_zone is not None and self.dead_zone_kind == "pulse" else (),
-            lagged=start if self.lag is not None else (),
+            lagged=self._turning(start) if self.lag is not None else (),
             line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
             head=jnp.int32(0),
         )
@@ -83,6 +83,7 @@ class PumpBank:
         if self.dead_zone is not None and self.dead_zone_kind != "offset":
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
+            u = self._turning(u)
             # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
             slow = [self.lag[i] > 0 for i in range(self.pumps)]
             keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
@@ -95,6 +96,12 @@ class PumpBank:
             state = state._replace(line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1))
             u = out
         return u, state
+
+    def _turning(self, u):
+        """What a lag sees: with an "offset" dead zone nothing below it, so that noise is rectified before the lag and not after."""
+        if self.dead_zone is None or self.dead_zone_kind != "offset":
+            return u
+        return tuple(at_least(v, self.dead_zone[i]) for i, v in enumerate(u))
 
     def driving(self, u):
         """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead zone, else u itself."""

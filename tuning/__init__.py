@@ -13,7 +13,9 @@ import importlib
 _HOMES = {
     "Bound": "tuning.bounds",
     "Problem": "tuning.objective",
-    "TuningResult": "tuning.search",
+    "TuningResult": "tuning.result",
+    "bound": "tuning.bound",
+    "tradeoff": "tuning.tradeoff",
     "tune": "tuning.search",
 }
 

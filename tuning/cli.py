@@ -97,6 +97,27 @@ def parser():
         metavar="MEASURE=WEIGHT",
         help="what is made small (default rms_error_total=1); repeatable",
     )
+    tune.add_argument(
+        "--scenario",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE[;NAME=VALUE]",
+        help='a run to judge by, as "sensor.noise=0.05;reference.ramp=30"; replaces those of the case; none: its own run; repeatable',
+    )
+    tune.add_argument(
+        "--choose",
+        action="append",
+        default=[],
+        metavar="NAME=V1,V2",
+        help="a static number or text to try the values of; repeatable",
+    )
+    tune.add_argument(
+        "--validation", default="64", metavar="N", help="held-out runs to judge the answer on (default 64, 0 for none)"
+    )
+    tune.add_argument("--tradeoff", metavar="MEASURE=LOW:HIGH[:N]", help="also: the best objective for N (6) values of one limit")
+    tune.add_argument("--bound", action="store_true", help="also: what no law could beat, by optimising the input itself")
+    tune.add_argument("--batch", metavar="N", help="scenarios drawn for each step of method adam (default all)")
+    tune.add_argument("--resume", metavar="DIR", help="go on where a killed run with --out DIR ended, to the same answer")
     tune.add_argument("--starts", default="8", metavar="N", help="local searches (default 8)")
     tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
     tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
@@ -274,6 +295,52 @@ def _limits(args, case):
     return limits
 
 
+def _scenarios(args):
+    from jaxtank.presets import Scenario
+
+    if not args.scenario:
+        return None
+    if args.scenario == ["none"]:
+        return ()
+    found = []
+    for i, text in enumerate(args.scenario):
+        values = dict(_pair("--scenario", part, parse_value) for part in text.split(";") if part.strip())
+        seed = values.pop("seed", i)
+        weight = values.pop("weight", 1.0)
+        found.append(Scenario(values.pop("name", text), values, seed, weight))
+    return tuple(found)
+
+
+def _choices(args):
+    found = {}
+    for text in args.choose:
+        name, values = _pair("--choose", text, lambda v: [parse_value(p.strip()) for p in v.split(",") if p.strip()])
+        found[name] = values
+    return found or None
+
+
+def _tradeoff(args):
+    """(measure, values) of --tradeoff."""
+    if args.tradeoff is None:
+        return None
+    measure, text = _pair("--tradeoff", args.tradeoff, str)
+    parts = text.split(":")
+    try:
+        low, high = (float(_plain_number(p)) for p in parts[:2])
+        count = int(parts[2]) if len(parts) > 2 else 6
+        good = len(parts) <= 3 and low < high and 2 <= count <= 50
+    except ValueError:
+        good = False
+    if not good:
+        raise InputError(
+            f"--tradeoff {args.tradeoff!r}: must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW below HIGH, N from 2 to 50"
+        )
+    from jaxtank.measures import check_names
+
+    check_names([measure])
+    return measure, [low + (high - low) * i / (count - 1) for i in range(count)]
+
+
 def _list(args):
     from jaxtank import presets
     from tuning import report
@@ -344,12 +411,23 @@ def _tune(args):
     objective = dict(_pair("--objective", text, lambda v: _number("--objective", v)) for text in args.objective) or None
     if objective:
         objective = check_objective(objective)
+    limits, scenarios, sweep = _limits(args, case), _scenarios(args), _tradeoff(args)
+    if args.resume and args.out and args.resume != args.out:
+        raise InputError("--resume and --out name different folders: a run is continued in its own")
+    folder = args.resume or args.out
+    choices = _choices(args)
     result = search.tune(
         case,
         args.method,
         free=free,
         objective=objective,
-        limits=_limits(args, case),
+        limits=limits,
+        scenarios=scenarios,
+        choices=choices,
+        batch=None if args.batch is None else _whole("--batch", args.batch, 1, 100_000),
+        validation=_whole("--validation", args.validation, 0, 100_000),
+        log=None if choices else folder,
+        resume=args.resume is not None,
         starts=_whole("--starts", args.starts, 1, 1000),
         seed=seed,
         screening=_whole("--screening", args.screening, 1, 65536),
@@ -358,7 +436,22 @@ def _tune(args):
     )
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
-    written = result.save(args.out) if args.out else []
+    if sweep and result.status != "interrupted":
+        from tuning.tradeoff import tradeoff
+
+        answer = {n: p["after"] for n, p in result.parameters.items()}
+        options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}
+        result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, **options))
+    if args.bound and result.status != "interrupted":
+        from tuning.bound import bound
+
+        result = result.replace(bound=bound(result.tuned, objective, limits))
+    written = result.save(folder) if folder else []
+    args.out = folder
+    if folder and not choices and result.status != "interrupted":
+        from tuning.memo import discard
+
+        discard(folder)  # the result is whole: there is nothing left to go on with
     print(report.dumps(report.json_of(result)) if args.json else report.text(result))
     _written(written, args)
     if not args.out and not args.json and not args.quiet:

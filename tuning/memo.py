@@ -1,5 +1,6 @@
 """What was evaluated before: a log that a killed run is continued from, to the same bits."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -87,11 +88,15 @@ class Log(Memo):
         self.file.flush()
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
 
-    def close(self, remove=False):
-        """End the log; `remove` it, for a run that has its result."""
+    def close(self):
+        """End the log."""
         self.file.close()
-        if remove:
-            os.unlink(self.path)
+
+
+def discard(folder):
+    """Remove the log of a folder, if it has one."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(Path(folder) / NAME)
 
 
 def _digest(kind, asked):

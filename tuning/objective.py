@@ -29,8 +29,8 @@ EXPLODED = 1e9
 NOT_A_NUMBER = 1e6
 """Amount by which an infinite measure (never settled) is taken to break its limit, and one that does not apply to hold it."""
 
-SPILL = 1e-3
-"""Volume over a rim that counts as none [cm^3], where rims are physics."""
+SPILL = 1e-6
+"""Volume over a rim that counts as none, where rims are physics, as a share of what the tank holds [-]."""
 
 
 class Limit(NamedTuple):
@@ -93,7 +93,7 @@ def resolve_limits(case, limits=None, lane=0, scenario=""):
         values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
         for i, v in enumerate(values):
             held = plant.overflow and measure == "max_level" and v >= plant.rim[i]
-            measured, at = ("overflow_volume", SPILL) if held else (measure, float(v))
+            measured, at = ("overflow_volume", SPILL * float(plant.area[i] * plant.rim[i])) if held else (measure, float(v))
             found.append(Limit(measured, i, at, lane, scenario))
     return found
 

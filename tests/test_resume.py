@@ -1,0 +1,131 @@
+"""A search that is killed goes on where it ended, to the same bits."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import tuning
+from jaxtank.errors import InputError
+from tuning.memo import NAME, Log, Memo
+
+FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
+OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
+SAME = (
+    "parameters",
+    "objective",
+    "measures",
+    "constraints",
+    "evaluations",
+    "starts",
+    "optimality",
+    "curvature",
+    "validation",
+    "message",
+)
+
+
+def told(result):
+    from tuning import report
+
+    page = report.json_of(result)
+    return json.dumps({k: page[k] for k in SAME}, sort_keys=True)
+
+
+@pytest.fixture(scope="module")
+def whole(gouta, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return tuning.tune(gouta("backstepping", FAST), log=folder, **OPTIONS), (folder / NAME).read_bytes()
+
+
+def test_with_and_without_a_log_alike(gouta, whole):
+    assert told(tuning.tune(gouta("backstepping", FAST), **OPTIONS)) == told(whole[0])
+
+
+@pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
+def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
+    data = whole[1]
+    (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
+    kept = data[: int(share * len(data))].count(b"\n")
+    result = tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+    assert told(result) == told(whole[0])
+    assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
+
+
+def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
+    (tmp_path / NAME).write_bytes(whole[1])
+    monkeypatch.setattr(Log, "keep", lambda *_: pytest.fail("something was evaluated"))
+    assert told(tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)) == told(whole[0])
+
+
+def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
+    (tmp_path / NAME).write_bytes(whole[1])
+    with pytest.raises(InputError, match="of another problem; what differs: seed"):
+        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, seed=1, **OPTIONS)
+    with pytest.raises(InputError, match="what differs: case"):
+        tuning.tune(gouta("backstepping", {**FAST, "controller.k": 0.031}), log=tmp_path, resume=True, **OPTIONS)
+    assert (tmp_path / NAME).read_bytes() == whole[1]
+    with pytest.raises(InputError, match="cannot be read"):
+        tuning.tune(gouta("backstepping", FAST), log=tmp_path / "none", resume=True, **OPTIONS)
+
+
+@pytest.mark.parametrize("text", [b"hello\n", b"[1]\n", b'{"jaxtank": 1}\n', b"\xff\xfe\n"])
+def test_what_is_no_log_is_refused(gouta, tmp_path, text):
+    (tmp_path / NAME).write_bytes(text)
+    with pytest.raises(InputError, match="not a log"):
+        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+    assert (tmp_path / NAME).read_bytes() == text
+
+
+def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
+    lines = whole[1].splitlines(keepends=True)
+    (tmp_path / NAME).write_bytes(b"".join([*lines[:3], b"{}\n", *lines[3:]]))
+    with pytest.raises(InputError, match="line 4"):
+        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+
+
+def test_numbers_go_through_a_log_without_loss(tmp_path):
+    result = (np.nan, np.array([[0.1, -np.inf], [5e-324, -0.0]]), ({"a": np.array([1 / 3])},), np.zeros((0, 2)))
+    log = Log(tmp_path, {"p": 1})
+    first = log.recall("x", [np.arange(2.0)], lambda: result)
+    log.close()
+    again = Log(tmp_path, {"p": 1}, resume=True).recall("x", [np.arange(2.0)], lambda: pytest.fail("run again"))
+    for a, b in ((first, result), (again, result)):
+        assert np.isnan(a[0]) and a[3].shape == (0, 2)
+        np.testing.assert_array_equal(a[1], b[1])
+        assert np.signbit(a[1][1, 1]) and a[2][0]["a"] == b[2][0]["a"]
+
+
+def test_what_is_asked_decides(tmp_path):
+    memo, calls = Memo(), []
+    for asked in ([np.zeros(2), False], [np.zeros(2), True], [np.zeros((1, 2)), False], [np.zeros(2), False]):
+        memo.recall("screen", asked, lambda: calls.append(1) or (0.0,))
+    assert len(calls) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wait", [8.0, 11.0, 15.0])
+def test_the_command_killed_and_resumed(tmp_path, wait):
+    """SIGKILL at some moment of the search; the result is that of a run left alone."""
+    command = [sys.executable, "-m", "tuning.cli", "tune", "gouta2015/backstepping", "--quiet", "--json", "--starts", "2"]
+    command += ["--screening", "8", "--validation", "8", "--set", "clock.dt=0.1"]
+    alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    process = subprocess.Popen([*command, "--out", str(tmp_path / "run")], stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + wait
+    while time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.05)
+    if process.poll() is None:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        if not (tmp_path / "run" / NAME).exists():
+            pytest.skip("killed before the search began")
+        done = subprocess.run([*command, "--resume", str(tmp_path / "run")], capture_output=True, check=True)
+        page = json.loads(done.stdout)
+        assert {k: page[k] for k in SAME} == {k: alone[k] for k in SAME}
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["parameters"] == alone["parameters"]
+    assert not (tmp_path / "run" / NAME).exists()
