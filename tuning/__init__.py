@@ -9,6 +9,8 @@ result.save("tuned")
 """
 
 import importlib
+import sys
+import types
 
 _HOMES = {
     "Bound": "tuning.bounds",
@@ -20,6 +22,17 @@ _HOMES = {
 }
 
 __all__ = list(_HOMES)
+
+
+class _Package(types.ModuleType):
+    """A package in which a function and the module it lives in share a name: the name stays the function's, whichever is imported first."""
+
+    def __setattr__(self, name, value):
+        if not (name in _HOMES and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name):

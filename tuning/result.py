@@ -107,7 +107,7 @@ def message(result, z, felt, redone):
         worst = min(broken, key=lambda c: c["margin"] / max(abs(c["limit"]), 1.0))
         words.append(
             f"no point was found that meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, "
-            f"limit {worst['limit']:.6g} {worst['unit']}, missed by {-worst['margin']:.3g} {worst['unit']} at the least"
+            f"limit {worst['limit']:.6g} {worst['unit']}, missed by {-worst['margin']:.3g} {worst['unit']}, the least that was found"
         )
     if result.status == "interrupted":
         words.append("interrupted: this is the best point so far")

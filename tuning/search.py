@@ -108,7 +108,7 @@ def tune(
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method != "trf":
-            restore(search, search.best.z, iterations)
+            _find_feasible(search, zs, margins, iterations)
         if method in ("slsqp", "trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
         if search.best is not None and search.violation(search.best) == 0:
@@ -176,6 +176,17 @@ def tune(
     if log is not None:
         problem.memo.close()
     return result
+
+
+def _find_feasible(search, zs, margins, iterations):
+    """Where no search met the limits: least violations from the best so far and from the screened points that come nearest to them."""
+    shortfall = np.maximum(0.0, -margins / search.room).max(axis=1)
+    nearest = [zs[i] for i in np.argsort(np.where(np.isfinite(shortfall), shortfall, np.inf), kind="stable")[:2]]
+    for z in (search.best.z, *nearest):
+        restore(search, z, iterations)
+        if search.violation(search.best) == 0:
+            slsqp(search, search.best.z, iterations)
+            return
 
 
 def own_values(problem):

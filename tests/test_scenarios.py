@@ -1,0 +1,300 @@
+"""Several runs behind one cost, and what is said of an answer: against runs made one by one, closed forms and other solvers."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+import tuning
+from jaxtank import presets, rig
+from jaxtank.errors import InputError
+from jaxtank.presets import Mirror, Scenario
+from jaxtank.tree import with_values
+from tuning import evidence, solvers
+from tuning.objective import Limit, Point, Problem
+from tuning.solvers import Search
+
+FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
+SQUARES = {"mean_square_error": 1.0, "mean_square_travel": 5.0}
+SEVERAL = (
+    Scenario("strong pumps", {"plant.pump_gain": (7.9, 7.8)}, weight=2.0),
+    Scenario("noise", {"sensor.noise": 0.05}, seed=3),
+    Scenario("more noise", {"sensor.noise": 0.1}, seed=4),
+    Scenario("short", {"clock.duration": 120.0, "reference.ramp": 30.0}),
+)
+
+
+@pytest.fixture(scope="module")
+def case(gouta):
+    return gouta("backstepping-ff", FAST)
+
+
+@pytest.fixture(scope="module")
+def problem(case):
+    return Problem(case, objective={**SQUARES, "input_travel": 1e-3}, limits={"max_level": 34.0}, scenarios=SEVERAL, seed=7)
+
+
+def one_by_one(case, values, objective, seed):
+    """The weighted mean of the costs of SEVERAL, each run by `evaluate`."""
+    total = 0.0
+    for s in SEVERAL:
+        here = rig.set_values(case, {**s.values, **values})
+        noisy = "sensor.noise" in s.values
+        key = jax.random.fold_in(jax.random.key(seed), s.seed) if noisy else None
+        found = jaxtank.evaluate(here.loop, here.clock, list(objective), key)
+        total += s.weight * sum(w * float(np.sum(found[m])) for m, w in objective.items())
+    return total / sum(s.weight for s in SEVERAL)
+
+
+def test_the_cost_is_the_weighted_mean_of_the_runs(case, problem):
+    assert len(problem.groups) == 3  # the two noisy ones share a compiled loop
+    for z in (problem.start(), np.array([0.4, 0.7])):
+        expected = one_by_one(case, problem.values(z), problem.objective, 7)
+        assert problem.point(z).cost == pytest.approx(expected, rel=1e-10)
+        assert problem.screen(z[None])[0][0] == pytest.approx(expected, rel=1e-10)
+
+
+def test_its_slope_is_that_of_differences(problem):
+    z, h = np.array([0.45, 0.62]), 1e-6
+    moves = h * np.concatenate([np.eye(2), -np.eye(2)])
+    costs, margins = problem.screen(z + moves)
+    found = problem.point(z)
+    np.testing.assert_allclose(found.gradient, (costs[:2] - costs[2:]) / (2 * h), rtol=1e-5)
+    assert found.margins.shape == (16,) and found.margin_slopes.shape == (16, 2)
+    np.testing.assert_allclose(found.margin_slopes.T, (margins[:2] - margins[2:]) / (2 * h), rtol=1e-4, atol=1e-6)
+
+
+def test_forward_and_reverse_agree_over_scenarios(case, monkeypatch):
+    make = lambda: Problem(case, objective=SQUARES, limits={"max_level": 34.0}, scenarios=SEVERAL, seed=7)
+    z = np.array([0.45, 0.62])
+    forward = make().point(z)
+    monkeypatch.setattr("tuning.objective.FORWARD_LIMIT", 1)
+    reverse = make().point(z)
+    assert reverse.cost == pytest.approx(forward.cost, rel=1e-12)
+    np.testing.assert_allclose(reverse.gradient, forward.gradient, rtol=1e-8)
+    np.testing.assert_allclose(reverse.margin_slopes, forward.margin_slopes, rtol=1e-8, atol=1e-10)
+
+
+def test_the_gauss_newton_matrix_is_that_of_the_trajectory(case):
+    """2 sum w J'J of errors and of changes of voltage, J by forward mode through a whole trajectory."""
+    names = ("controller.k", "controller.k1")
+    values = {"controller.k": 0.2, "controller.k1": 0.1}
+
+    def residuals(theta):
+        t = jaxtank.simulate(with_values(case.loop, dict(zip(names, theta))), case.clock)
+        return t.e, jax.numpy.diff(t.u, axis=0)
+
+    e, du = jax.jacfwd(residuals)(np.array(list(values.values())))
+    n = len(e)
+    expected = 2 / n * (np.einsum("kip,kiq->pq", e, e) + 5.0 * np.einsum("kip,kiq->pq", du, du))
+    found = jaxtank.sensitivities(case.loop, case.clock, ["rms_error"], values, squares=SQUARES)[2]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    plain = jaxtank.sensitivities(case.loop, case.clock, ["rms_error"], values)[2]
+    np.testing.assert_allclose(plain, 2 / n * np.einsum("kip,kiq->pq", e, e), rtol=1e-9)
+    with pytest.raises(InputError, match="iae is not a sum of squares"):
+        jaxtank.sensitivities(case.loop, case.clock, ["iae"], values, squares={"iae": 1.0})
+
+
+def test_slopes_by_what_a_law_prepares_beforehand():
+    """State feedback computes its steady states before the loop: a parameter of its model acts through them too."""
+    case = rig.set_values(presets.find("mirakhorli/sfc"), {"clock.duration": 60.0})
+    name = "controller.model.pump_gain[0]"
+    carried = jaxtank.sensitivities(case.loop, case.clock, "ise", {name: 27.43})[1]["ise"]
+    f = lambda v: jaxtank.evaluate(with_values(case.loop, {name: v}), case.clock, "ise")["ise"]
+    np.testing.assert_allclose(carried[:, 0], (f(27.43 + 1e-4) - f(27.43 - 1e-4)) / 2e-4, rtol=1e-6)
+
+
+def test_new_measures_against_the_trajectory():
+    case = rig.set_values(presets.find("mirakhorli/sfc"), {"clock.duration": 100.0})
+    t = jaxtank.simulate(case.loop, case.clock)
+    t = type(t)(*(np.asarray(v) for v in t))
+    names = ("mean_square_error", "mean_square_travel", "mean_square_overshoot", "input_deviation")
+    found = jaxtank.evaluate(case.loop, case.clock, names)
+    rest = jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[1]
+    np.testing.assert_allclose(found["mean_square_error"], (t.e**2).mean(axis=0), rtol=1e-10)
+    np.testing.assert_allclose(found["mean_square_travel"], (np.diff(t.u, axis=0) ** 2).sum(axis=0) / len(t.t), rtol=1e-10)
+    np.testing.assert_allclose(found["mean_square_overshoot"], (np.maximum(t.e, 0) ** 2).mean(axis=0), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found["input_deviation"], 0.1 * ((t.u - rest) ** 2).sum(axis=0), rtol=1e-10)
+
+
+def test_limits_hold_in_every_scenario(case):
+    limits = {"max_level": 36.5}
+    result = tuning.tune(case, scenarios=SEVERAL[:2], limits=limits, starts=2, screening=16, validation=0)
+    assert result.success and len(result.constraints) == 8
+    for s, key in zip(SEVERAL[:2], (None, jax.random.fold_in(jax.random.key(0), 3))):
+        here = rig.set_values(case, {**s.values, **{n: p["after"] for n, p in result.parameters.items()}})
+        assert np.asarray(jaxtank.evaluate(here.loop, here.clock, "max_level", key)["max_level"]).max() <= 36.5
+    tight = min(result.constraints, key=lambda c: c["margin"])
+    assert tight["scenario"] in tight["name"] and f"tight: {tight['name']}" in result.message
+
+
+@pytest.mark.parametrize("objective", [SQUARES, {**SQUARES, "input_travel": 1e-3}, {"rms_error_total": 1.0, "input_travel": 1e-3}])
+def test_gauss_newton_finds_what_slsqp_finds(case, objective):
+    options = {"objective": objective, "limits": {}, "scenarios": SEVERAL[1:3], "starts": 1, "screening": 8, "validation": 0}
+    a, b = (tuning.tune(case, method, **options) for method in ("trf", "slsqp"))
+    assert a.success and b.success
+    assert a.objective["after"] == pytest.approx(b.objective["after"], rel=1e-5)
+
+
+def test_minibatches_come_near_the_whole(case):
+    options = {"objective": SQUARES, "limits": {}, "scenarios": SEVERAL, "starts": 1, "screening": 8, "validation": 0}
+    best = tuning.tune(case, **options).objective["after"]
+    drawn = tuning.tune(case, batch=2, iterations=30, **options)
+    assert drawn.method == "adam" and drawn.objective["after"] < 1.03 * best
+    again = tuning.tune(case, batch=2, iterations=30, **options)
+    assert again.parameters == drawn.parameters
+    with pytest.raises(InputError, match="only method adam"):
+        tuning.tune(case, "slsqp", batch=2, **options)
+
+
+@pytest.mark.parametrize(
+    "scenarios, words",
+    [
+        ((Scenario("a", {"controller.k": 1.0}),), "'a' sets controller.k, which is free"),
+        ((Scenario("a", {"plant.dran": 1.0}),), "scenario 'a'.*plant.drain"),
+        ((Scenario("a", {"sensor.noise": -1.0}),), "scenario 'a'.*at least 0"),
+        ((Scenario("a"), Scenario("a")), "same name"),
+        ((Scenario("a", weight=0.0),), "weight"),
+        ((Scenario("a", seed=-1),), "seed"),
+    ],
+)
+def test_scenarios_that_cannot_be_run_are_refused(case, scenarios, words):
+    with pytest.raises(InputError, match=words):
+        tuning.tune(case, scenarios=scenarios)
+
+
+# evidence
+
+
+def test_validation_is_of_runs_the_search_never_saw(case):
+    case = case.replace(uncertain={"plant.drain": 0.1})
+    problem = Problem(case, scenarios=SEVERAL[:2], seed=0)
+    lanes = evidence.perturbed(problem, 6, 0)
+    drains = np.array([lane.case.loop.plant.drain for lane in lanes])
+    base = np.array([problem.lanes[i % 2].case.loop.plant.drain for i in range(6)])
+    assert len(np.unique(drains[:, :2])) == 12 and 0.05 < np.abs(drains[:, :2] / base[:, :2] - 1).max() <= 0.1
+    own, tuned = {"controller.k": 0.03, "controller.k1": 0.088}, {"controller.k": 0.3, "controller.k1": 0.2}
+    found = evidence.validate(problem, own, tuned, 6, 0)
+    costs = []
+    for lane in lanes:
+        costs.append(
+            [
+                float(
+                    jaxtank.evaluate(with_values(lane.case.loop, v), lane.case.clock, "rms_error_total", lane.key)[
+                        "rms_error_total"
+                    ]
+                )
+                for v in (own, tuned)
+            ]
+        )
+    costs = np.array(costs)
+    assert found["objective"]["before"]["mean"] == pytest.approx(costs[:, 0].mean(), rel=1e-9)
+    assert found["objective"]["after"]["p50"] == pytest.approx(np.median(costs[:, 1]), rel=1e-9)
+    assert found["better_share"] == np.mean(costs[:, 1] < costs[:, 0]) and found["failed"] == 0
+    assert found == evidence.validate(problem, own, tuned, 6, 0) != evidence.validate(problem, own, tuned, 6, 1)
+
+
+class Quadratic:
+    """Cost 1 + (z - c)' H (z - c) / 2 with limits a z <= b: a problem whose curvature, least violation and answer are known."""
+
+    def __init__(self, H, c, a=(), b=(), names=("k", "l")):
+        self.H, self.c, self.a, self.b = np.array(H), np.array(c), np.array(a).reshape(-1, len(c)), np.array(b)
+        self.limits = [Limit("max_level", i, 1.0) for i in range(len(self.b))]
+        self.names, self.model, self.objective = list(names), "cost", {"mean_square_error": 1.0}
+        self.bounds = [tuning.Bound(n, 0.01, 100.0, "log", "1/s") for n in names]
+
+    def point(self, z):
+        d = np.asarray(z) - self.c
+        return Point(z, 1 + 0.5 * d @ self.H @ d, self.H @ d, self.H, self.b - self.a @ z, -self.a, ())
+
+    def screen(self, zs):
+        return np.array([self.point(z).cost for z in zs]), np.array([self.point(z).margins for z in zs])
+
+
+def test_curvature_and_the_flattest_direction():
+    problem = Quadratic([[4.0, -1.9], [-1.9, 1.0]], [0.5, 0.5])
+    best = problem.point(np.array([0.5, 0.5]))
+    search = Search(problem, best, lambda s: None)
+    found = evidence.curvature(problem, search, best)
+    values, vectors = np.linalg.eigh(problem.H)
+    np.testing.assert_allclose(found["eigenvalues"], values, rtol=1e-6)
+    first = np.array([found["directions"][0][n] for n in ("k", "l")])
+    assert abs(first @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
+    step = np.log(1.1) / np.log(1e4) / vectors[1, 0] * vectors[:, 0]
+    assert found["flattest"]["changes_percent"] == pytest.approx(50 * step @ problem.H @ step, rel=1e-4)
+    assert found["flattest"]["factors"]["l"] == pytest.approx(1.1)
+    words = evidence.flat_words(problem, found)
+    assert "k x 1.0" in words and "l x 1.1" in words
+
+
+def test_directions_that_limits_hold_are_left_out():
+    problem = Quadratic([[2.0, 0.0], [0.0, 6.0]], [0.9, 0.5], a=[[1.0, 0.0]], b=[0.5])
+    at = problem.point(np.array([0.5, 0.5]))
+    found = evidence.curvature(problem, Search(problem, at, lambda s: None), at)
+    np.testing.assert_allclose(found["eigenvalues"], [6.0 / at.cost], rtol=1e-6)
+
+
+def test_the_least_violation_of_limits_that_exclude_each_other():
+    """z1 <= 0.3 and z1 >= 0.7 (and z2 free): no point does better than to miss both by 0.2."""
+    problem = Quadratic(np.eye(2), [0.1, 0.2], a=[[1.0, 0.0], [-1.0, 0.0]], b=[0.3, -0.7])
+    search = Search(problem, problem.point(np.array([0.1, 0.2])), lambda s: None)
+    search.take(search.last_finite)
+    solvers.restore(search, np.array([0.1, 0.2]), 50)
+    assert search.violation(search.best) == pytest.approx(0.2, abs=1e-5)
+
+
+def test_trf_on_a_quadratic_is_one_step_from_its_answer():
+    problem = Quadratic([[4.0, -1.9], [-1.9, 1.0]], [0.4, 0.7])
+    search = Search(problem, problem.point(np.array([0.2, 0.2])), lambda s: None)
+    assert solvers.trf(search, np.array([0.2, 0.2]), 20)
+    np.testing.assert_allclose(search.best.z, (0.4, 0.7), atol=1e-5)
+    assert len(search.history) < 12
+
+
+def test_mirror_images_are_named_and_counted_once():
+    case = rig.set_values(presets.find("calofir/backstepping"), {"clock.substeps": 1})
+    result = tuning.tune(case, starts=4, screening=16, validation=0)
+    a, b = (result.parameters[n]["after"] for n in ("controller.K_phi", "controller.K_y"))
+    assert result.mirrored["values"] == {"controller.K_phi": b, "controller.K_y": a}
+    assert result.mirrored["objective"] == pytest.approx(result.objective["after"], rel=1e-6)
+    assert "K_phi and K_y exchange roles" in result.message and "the same objective" in result.message
+    # spec A.8: the ridge of least error
+    assert 0.0205 <= min(a, b) <= 0.024 and max(a, b) >= 0.1
+    # an image outside the ranges, and a case without one
+    assert evidence.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0}) is None
+    other = Problem(case.replace(mirror=Mirror("none", lambda v: {})))
+    assert evidence.mirror_of(other, [], result.problem.values(result.problem.start())) is None
+
+
+def test_the_trade_off_of_a_limit(case):
+    values = [36.0, 33.0, 31.0, 25.0]
+    found = tuning.tradeoff(case, "max_level", values, limits={})
+    points = found["points"]
+    assert [p["limit"] for p in points] == values
+    assert [p["status"] for p in points[:3]] == ["converged"] * 3 and points[3]["status"] == "infeasible"
+    costs = [p["objective"] for p in points[:3]]
+    assert costs == sorted(costs) and costs[2] > 1.05 * costs[0]
+    alone = tuning.tune(case, limits={"max_level": 31.0}, starts=4, screening=16, validation=0)
+    assert points[2]["objective"] == pytest.approx(alone.objective["after"], rel=2e-3)
+    assert points[3]["violation"] > 3.0
+
+
+def test_choices_are_tried_one_by_one(case):
+    options = {"limits": {}, "starts": 1, "screening": 8, "validation": 0}
+    result = tuning.tune(case, choices={"controller.reference_rates": [False, True]}, **options)
+    rows = {row["values"]["controller.reference_rates"]: row["objective"]["after"] for row in result.choices}
+    assert rows[True] == result.objective["after"] == min(rows.values()) < rows[False]
+    assert result.tuned.loop.controller.reference_rates is True
+    assert result.message.startswith("best of 2 choices: controller.reference_rates = True")
+    with pytest.raises(InputError, match=r"controller\.reference_rates"):
+        tuning.tune(case, choices={"controller.reference_rat": [1]}, **options)
+    with pytest.raises(InputError, match="combinations"):
+        tuning.tune(case, choices={"clock.substeps": list(range(1, 100))}, **options)
+
+
+def test_functions_keep_their_names_beside_their_modules():
+    import importlib
+
+    importlib.import_module("tuning.tradeoff")
+    importlib.import_module("tuning.bound")
+    assert callable(tuning.tradeoff) and callable(tuning.bound)
