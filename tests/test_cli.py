@@ -318,7 +318,9 @@ def test_tune_json_has_the_keys_of_the_contract(tuned):
         assert (c["limit"], c["tank"], c["value"]) == (30.0, i + 1, found["measures"]["after"]["max_level"][i])
         assert c["margin"] == c["limit"] - c["value"] >= 0 and 0 <= c["time_s"] <= 200
     assert found["evaluations"]["simulations"] >= found["evaluations"]["gradients"] > 0
-    assert found["bound"] is None and found["validation"] is None and found["wall_s"] > 0
+    assert found["bound"] is None and found["wall_s"] > 0
+    assert found["validation"]["samples"] == 64 and set(found["validation"]["objective"]["after"]) == {"mean", "p05", "p50", "p95"}
+    assert found["scenarios"] == [] and found["choices"] == [] and found["tradeoff"] is None
 
 
 def test_tune_is_no_worse_than_its_start_and_its_numbers_are_of_its_runs(tuned, gouta):
@@ -394,6 +396,18 @@ def test_tune_of_the_printed_gains_under_their_own_limit():
     assert said.code == 0 and said.err == ""
     assert set(said.json["parameters"]) == {"controller.k", "controller.k1"}
     assert said.json["objective"]["after"] < said.json["objective"]["before"]
+
+
+def test_scenarios_choices_trade_off_and_bound_from_the_command_line(here):
+    scenarios = ("--scenario", "name=noise;sensor.noise=0.02;weight=2", "--scenario", "reference.ramp=40;seed=5")
+    more = ("--choose", "controller.reference_rates=false,true", "--tradeoff", "max_level=24:28:2", "--bound", "--validation", "4")
+    said = done("tune", CASE, *SHORT, *SEARCH, *scenarios, *more, "--json", "--quiet", "--out", "out", "--starts", "1")
+    found = said.json
+    assert [(s["name"], round(s["weight"], 6)) for s in found["scenarios"]] == [("noise", 0.666667), ("reference.ramp=40;seed=5", 0.333333)]
+    assert [row["values"] for row in found["choices"]] == [{"controller.reference_rates": v} for v in (False, True)]
+    assert [p["limit"] for p in found["tradeoff"]["points"]] == [28.0, 24.0] and found["validation"]["samples"] == 4
+    assert 0 < found["bound"]["cost"] < found["objective"]["after"]
+    assert json.loads((here / "out" / "result.json").read_text(encoding="utf-8")) == found
 
 
 def test_a_limit_that_cannot_be_met_ends_with_4_and_the_best_of_it(here):
@@ -553,6 +567,20 @@ BAD = [  # arguments, words that the line must have
     (["tune", CASE, "--starts", "many"], "--starts 'many'"),
     (["tune", CASE, "--screening", "0"], "--screening '0'"),
     (["tune", CASE, "--iterations", "0"], "--iterations '0'"),
+    (["tune", CASE, "--scenario", "sensor.noise"], "--scenario 'sensor.noise': must be NAME=VALUE"),
+    (["tune", CASE, "--scenario", "sensor.nois=0.1"], "unknown parameter 'sensor.nois'; nearest: sensor.noise"),
+    (["tune", CASE, "--scenario", "controller.k=1"], "sets controller.k, which is free"),
+    (["tune", CASE, "--scenario", "seed=1.5"], "seed = 1.5 must be a whole number"),
+    (["tune", CASE, "--scenario", "weight=0"], "weight = 0 must be a finite number above 0"),
+    (["tune", CASE, "--choose", "controller.reference_rate=true"], "unknown parameter 'controller.reference_rate'"),
+    (["tune", CASE, "--choose", "controller.reference_rates=3"], "controller.reference_rates = 3: must be one of false, true"),
+    (["tune", CASE, "--tradeoff", "max_level=30:20"], "--tradeoff 'max_level=30:20'"),
+    (["tune", CASE, "--tradeoff", "max_levl=20:30"], "unknown measure 'max_levl'; nearest: max_level"),
+    (["tune", CASE, "--batch", "0"], "--batch '0'"),
+    (["tune", CASE, "--batch", "2", "--method", "slsqp"], "only method adam"),
+    (["tune", CASE, "--validation", "-1"], "--validation '-1'"),
+    (["tune", CASE, "--resume", "out/deep"], "'out/deep' cannot be read"),
+    (["tune", CASE, "--resume", "a", "--out", "b"], "different folders"),
     (["bench", "--rounds", "0"], "--rounds '0'"),
 ]
 

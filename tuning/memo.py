@@ -89,8 +89,11 @@ class Log(Memo):
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
 
     def close(self):
-        """End the log."""
+        """End the file; returns a Memo of what it holds, for what is asked later."""
         self.file.close()
+        memo = Memo()
+        memo.found = self.found
+        return memo
 
 
 def discard(folder):

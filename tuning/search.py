@@ -174,7 +174,7 @@ def tune(
     )
     result = result.replace(message=message(result, z, felt, redone))
     if log is not None:
-        problem.memo.close()
+        problem.memo = problem.memo.close()
     return result
 
 
