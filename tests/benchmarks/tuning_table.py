@@ -1,0 +1,232 @@
+"""What tuning gains: published gains beside tuned, on plants and noise unseen, with the bound that no law could beat.
+
+    python tests/benchmarks/tuning_table.py               # every row; an hour or two on two cores
+    python tests/benchmarks/tuning_table.py 'khalid*'     # some, by name
+    python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone
+    python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into the README
+
+Rows and bounds are those of tuning_rows.py. Each is stored in tuning_table.json as soon as it is done, with the versions it was made with.
+"""
+
+import fnmatch
+import json
+import re
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+from tuning_rows import BOUNDS, ROWS, case_of
+
+import jaxtank  # noqa: F401  (before jax starts)
+import tuning
+from jaxtank.files import write_atomic
+from tuning import search
+
+HERE = Path(__file__).parent
+STORE, README = HERE / "tuning_table.json", HERE.parents[1] / "README.md"
+BEGIN, END = "<!-- tests/benchmarks/tuning_table.py -->", "<!-- end of tuning table -->"
+VERSIONS = ("jaxtank", "python", "jax", "jaxlib", "numpy", "scipy", "optax", "dtype", "xla_option")
+
+
+def tuned(name):
+    """The TuningResult of a row."""
+    row = ROWS[name]
+    given = {"free": row.free, "objective": row.objective, "limits": row.limits, "scenarios": row.scenarios, "choices": row.choices}
+    return tuning.tune(case_of(row), **given, **row.options)
+
+
+def held_out(row, result):
+    """{"runs", "before", "after", ...} on runs that the tuning never saw: means of the objective, and the share of runs made better."""
+    if row.held is None:
+        found = result.validation
+        return found and {
+            "runs": found["samples"],
+            "before": found["objective"]["before"]["mean"],
+            "after": found["objective"]["after"]["mean"],
+            "better_share": found["better_share"],
+            "limits_held": found["limits_held"],
+        }
+    problem = tuning.Problem(result.case, free=row.free, objective=row.objective, limits=row.limits, scenarios=row.held())
+    rows = {side: [{n: p[side] for n, p in result.parameters.items()}] for side in ("before", "after")}
+    points = np.array([[float(b.to_unit(rows[side][0][b.name])) for b in problem.bounds] for side in ("before", "after")])
+    costs, margins = problem.screen(points)
+    return {
+        "runs": len(problem.lanes),
+        "before": float(costs[0]),
+        "after": float(costs[1]),
+        "limits_held": {"before": bool(np.all(margins[0] >= 0)), "after": bool(np.all(margins[1] >= 0))},
+    }
+
+
+def worst(constraints):
+    """The limit that is broken most, or nearest to it, with the amount by which it is passed [its unit]; None without limits."""
+    tight = min(constraints, key=lambda c: c["margin"], default=None)
+    return tight and {
+        "name": tight["name"],
+        "unit": tight["unit"],
+        "limit": tight["limit"],
+        "violation": max(0.0, -tight["margin"]),
+    }
+
+
+def levels(measures):
+    """What the levels did on the case's own run: {"highest", "lost"}, in the rig's unit of length and its cube."""
+    return {"highest": float(np.max(measures["max_level"])), "lost": float(np.sum(measures["overflow_volume"]))}
+
+
+def measure(name):
+    """What is stored of a row."""
+    row, result = ROWS[name], tuned(name)
+    choice = [c for c in result.choices if c["objective"]["after"] == result.objective["after"]]
+    return {
+        "case": result.case.name,
+        "method": result.method,
+        "status": result.status,
+        "message": result.message,
+        "parameters": {n: {k: p[k] for k in ("before", "after", "unit", "at_bound")} for n, p in result.parameters.items()},
+        "choices": result.choices,
+        "chosen": choice[0]["values"] if choice else {},
+        "objective": {**result.objective, "unit": row.unit, "target": row.target and float(row.target)},
+        "limits": worst(result.constraints),
+        "levels": {side: levels(result.measures[side]) for side in ("before", "after")},
+        "length": result.case.loop.plant.units[0],
+        "held_out": held_out(row, result),
+        "bound": row.bound,
+        "agree": sum(s["violation"] == 0.0 and s["cost"] <= result.objective["after"] * 1.001 for s in result.starts),
+        "starts": len(result.starts),
+        "evaluations": result.evaluations,
+        "wall_s": result.wall_s,
+        "versions": {n: result.provenance[n] for n in VERSIONS},
+    }
+
+
+def best_inputs(name):
+    """What is stored of a bound."""
+    asked = BOUNDS[name]
+    case = case_of(asked)
+    found = tuning.bound(case, asked.objective, asked.limits)
+    provenance = search.provenance(case, 0)
+    told = found.to_json()
+    kept = ("cost", "objective", "holds", "closed_loop", "source", "interval_s", "grids", "wall_s")
+    return {"case": case.name, **{n: told[n] for n in kept}, "versions": {n: provenance[n] for n in VERSIONS}}
+
+
+def load():
+    """{"rows": {name: ...}, "bounds": {name: ...}} as stored."""
+    return json.loads(STORE.read_text()) if STORE.exists() else {"rows": {}, "bounds": {}}
+
+
+def keep(kind, name, found):
+    """Enter one finished row or bound into the store."""
+    stored = load()
+    stored[kind][name] = _plain(found)
+    order = {"rows": ROWS, "bounds": BOUNDS}
+    stored = {kind: {n: stored[kind][n] for n in order[kind] if n in stored[kind]} for kind in order}
+    write_atomic(STORE, json.dumps(stored, indent=1, allow_nan=False) + "\n")
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (bool, int, str)) or value is None:
+        return value
+    return float(value) if np.isfinite(value) else None
+
+
+def _pair(before, after, digits=4):
+    return f"{before:.{digits}g} → {after:.{digits}g}"
+
+
+def _free(row):
+    # entries of one array stand together
+    arrays, units = {}, {}
+    for name, p in row["parameters"].items():
+        base = name.removeprefix("controller.").removeprefix("observer.").split("[")[0]
+        arrays.setdefault(base, []).append((p["before"], p["after"]))
+        units[base] = p["unit"]
+    shown = []
+    for base, values in arrays.items():
+        if len(values) > 4:
+            shown.append(f"{base} ({len(values)} entries)")
+            continue
+        sides = [", ".join(f"{v:.3g}" for v in side) for side in zip(*values)]
+        shown.append(f"{base} {sides[0]} → {sides[1]}{' ' + units[base] if units[base] not in ('', '-') else ''}")
+    shown += [f"{n.removeprefix('controller.')} = {v}" for n, v in row["chosen"].items()]
+    return "; ".join(shown)
+
+
+def _limits(row):
+    side, limit = row["levels"], row["limits"]
+    per = 100.0 if row["length"] == "m" else 1.0
+    if limit is not None:
+        factor = 100.0 if limit["unit"] == "m" else 1.0
+        return f"passed by {factor * limit['violation']:.3f} {'cm' if limit['unit'] in ('m', 'cm') else limit['unit']}"
+    if side["before"]["lost"] > 0:
+        return "rims are physics; lost {:.0f} → {:.0f} cm^3".format(*(per**3 * side[s]["lost"] for s in ("before", "after")))
+    return "none; highest {:.1f} → {:.1f} cm".format(*(per * side[s]["highest"] for s in ("before", "after")))
+
+
+def _held(row):
+    found = row["held_out"]
+    return _pair(found["before"], found["after"]) if found else "-"
+
+
+def _bound(row, bounds):
+    found = bounds.get(row["bound"])
+    return "-" if found is None else f"{found['cost']:.3g}"
+
+
+def markdown(stored):
+    """The table that belongs between the marks."""
+    heads = ("row", "published → tuned", "objective", "limits at the true step", "unseen plants and noise", "bound", "s")
+    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for name, row in stored["rows"].items():
+        aim = row["objective"]
+        change = 100 * (aim["after"] / aim["before"] - 1)
+        cells = [
+            name,
+            _free(row),
+            f"{_pair(aim['before'], aim['after'])} {aim['unit']} ({change:+.1f} %)".replace("-", "−"),
+            _limits(row),
+            _held(row),
+            _bound(row, stored["bounds"]),
+            f"{row['wall_s']:.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def picked(patterns, names):
+    """Those of `names` that one of the patterns matches; all of them where there is no pattern. Raises KeyError where one matches none."""
+    for pattern in patterns:
+        if not fnmatch.filter(names, pattern):
+            raise KeyError(f"no row is named {pattern}; there are {', '.join(names)}")
+    return [n for n in names if not patterns or any(fnmatch.fnmatch(n, p) for p in patterns)]
+
+
+def main(words):
+    jax.config.update("jax_enable_x64", True)
+    patterns = [w for w in words if not w.startswith("--")]
+    if "--markdown" in words:
+        text = README.read_text()
+        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{markdown(load())}\n{END}", text, flags=re.DOTALL))
+        return
+    if "--bounds" not in words:
+        for name in picked(patterns, ROWS):
+            found = measure(name)
+            keep("rows", name, found)
+            aim = found["objective"]
+            print(f"{name}: {_pair(aim['before'], aim['after'])}, {found['status']}, {found['wall_s']:.0f} s", flush=True)
+    needed = picked(patterns, BOUNDS) if "--bounds" in words else {ROWS[n].bound for n in picked(patterns, ROWS)} - {None}
+    for name in sorted(set(needed) - (set() if "--bounds" in words else set(load()["bounds"]))):
+        found = best_inputs(name)
+        keep("bounds", name, found)
+        held = "holds" if found["holds"] else "LIMITS BROKEN"
+        print(f"bound {name}: {found['cost']:.5g}, {held}, {found['wall_s']:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
