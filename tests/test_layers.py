@@ -22,13 +22,13 @@ LAYERS = [
     {"rig", "plotting"},
 ]
 ABOVE = [
-    {"bounds", "inputs", "projected", "memo", "scenarios"},
+    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects"},
     {"objective"},
     {"screening", "solvers", "input_search", "evidence"},
     {"result"},
-    {"search", "choices", "bound", "tradeoff"},
+    {"search", "choices", "bound", "tradeoff", "sensitivity"},
     {"report"},
-    {"manual"},
+    {"manual", "sensitivity_report"},
     {"bench", "compare"},
     {"cli"},
 ]
@@ -36,7 +36,7 @@ RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer
 RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for room in layer}
 
 # Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
-DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.result", "tuning.report")}
+DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.result", "tuning.report"), ("tuning.sensitivity", "tuning.sensitivity_report")}
 
 
 def room(module):

@@ -17,6 +17,7 @@ _HOMES = {
     "Problem": "tuning.objective",
     "TuningResult": "tuning.result",
     "bound": "tuning.bound",
+    "sensitivity": "tuning.sensitivity",
     "tradeoff": "tuning.tradeoff",
     "tune": "tuning.search",
 }

@@ -121,6 +121,28 @@ def parser():
     tune.add_argument("--starts", default="8", metavar="N", help="local searches (default 8)")
     tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
     tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
+    sense = commands.add_parser(
+        "sensitivity", parents=[common, case, run], help="which parameter moves which measure: local, Morris, Sobol"
+    )
+    sense.add_argument("--method", default="local", metavar="NAME", help="local (default: exact derivatives), morris or sobol")
+    sense.add_argument(
+        "--samples", metavar="N", help="trajectories of morris (default 32), base points of sobol (default 512, a power of 2)"
+    )
+    sense.add_argument("--spread", metavar="FRACTION", help="one share for all that the case calls uncertain, as 0.05")
+    sense.add_argument(
+        "--vary",
+        action="append",
+        default=[],
+        metavar="NAME=DISTRIBUTION",
+        help="what varies, as plant.drain=uniform:5%% or normal:MEAN:SD; replaces the case's own unless --spread is given; repeatable",
+    )
+    sense.add_argument(
+        "--measure",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a measure to look at (default: those of the objective, rms_error_total, max_level); repeatable",
+    )
     commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
     compare = commands.add_parser(
         "compare", parents=[common], help="published numbers beside measured ones, and why they differ; PAPER or all"
@@ -493,6 +515,43 @@ def _written(paths, args):
         print(f"written to {args.out}: " + ", ".join(p.name for p in paths), file=sys.stderr)
 
 
+def _sensitivity(args):
+    _out(args)
+    seed, case = _seed(args), _open(args)
+    from tuning import report, sensitivity_report
+    from tuning.distributions import parse
+    from tuning.sensitivity import MOST, sensitivity
+
+    terminal, told = sys.stderr.isatty(), [0]
+
+    def progress(done, total):
+        if args.quiet or (not terminal and done < total and done - told[0] < total / 10):
+            return
+        told[0] = done
+        start, end = ("\r", "") if terminal else ("", "\n")
+        print(f"{start}run {done}/{total}", end=end, file=sys.stderr, flush=True)
+
+    varied = [_pair("--vary", text, str) for text in args.vary]
+    if len({name for name, _ in varied}) < len(varied):
+        raise InputError("--vary: a parameter is given twice")
+    result = sensitivity(
+        case,
+        {name: parse(name, text) for name, text in varied} or None,
+        method=args.method,
+        measures=args.measure or None,
+        samples=None if args.samples is None else _whole("--samples", args.samples, 1, MOST),
+        spread=None if args.spread is None else _number("--spread", args.spread),
+        seed=seed,
+        progress=progress,
+    )
+    if terminal and not args.quiet:
+        print(file=sys.stderr)
+    written = result.save(args.out) if args.out else []
+    print(report.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
+    _written(written, args)
+    return 0
+
+
 def _bench(args):
     rounds = _whole("--rounds", args.rounds, 1, 1000)
     import jax
@@ -549,6 +608,7 @@ COMMANDS = {
     "show": _show,
     "simulate": _simulate,
     "tune": _tune_interruptibly,
+    "sensitivity": _sensitivity,
     "init": _init,
     "compare": _compare,
     "bench": _bench,

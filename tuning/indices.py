@@ -1,0 +1,131 @@
+"""Sensitivity of any function on the unit cube: designs and estimators, plain arrays in and out.
+
+Elementary effects: Morris, Technometrics 33(2) 1991, 161; their absolute mean: Campolongo, Cariboni and Saltelli, Environ. Model. Softw.
+22(10) 2007, 1509. Shares of the variance: Saltelli et al., Comput. Phys. Commun. 181(2) 2010, 259, first order by its table 2 (b), total
+order by Jansen's estimator, its table 2 (f).
+"""
+
+import numpy as np
+from scipy import stats
+
+LEVELS = 4
+"""Levels of Morris' grid; with 4 and a step of 2/3 every level is as likely as every other."""
+
+RESAMPLES = 1000
+"""Bootstrap resamples of an interval."""
+
+BLOCK = 1 << 22
+"""Bootstrap weights held at once."""
+
+FLAT = 1e-10
+"""Spread of an output, as a share of its size, that is rounding rather than an answer to the parameters [-]."""
+
+
+def sobol_points(dimensions, samples, seed):
+    """(samples, D + 2, D) points for `sobol_indices`: in each row A, then A with one column of B for each of the D columns, then B.
+
+    A and B are the two halves of a scrambled Sobol sequence in 2 D dimensions; samples is best a power of 2.
+    """
+    base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(samples)
+    a, b = base[:, :dimensions], base[:, dimensions:]
+    points = np.repeat(a[:, None], dimensions + 2, axis=1)
+    points[:, -1] = b
+    for j in range(dimensions):
+        points[:, j + 1, j] = b[:, j]
+    return points
+
+
+def sobol_indices(y, seed=0):
+    """Shares of the variance of y (samples, D + 2), the outputs at `sobol_points`, that each input has: alone and in all.
+
+    S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance over A and B. A row with an output that
+    is not finite is left out whole, so that what remains stays paired. Returns {"first", "total": (D,), "first_interval95",
+    "total_interval95": (D, 2), "kept": rows used, "variance"}; shares are NaN where y does not vary or fewer than 2 rows remain. The
+    intervals are quantiles of a bootstrap over rows; for Sobol points, more even than random ones, they are on the wide side.
+    """
+    y = np.asarray(y, dtype=float)
+    dimensions = y.shape[1] - 2
+    kept = y[np.isfinite(y).all(axis=1)]
+    unknown = np.full(dimensions, np.nan)
+    ends = np.full((dimensions, 2), np.nan)
+    nothing = {"first": unknown, "total": unknown, "first_interval95": ends, "total_interval95": ends, "kept": len(kept)}
+    if len(kept) < 2:
+        return {**nothing, "variance": np.nan}
+    size, kept = np.abs(kept).max(), kept - kept.mean()  # an output far from 0 would spoil the first-order products
+    a, mixed, b = kept[:, :1], kept[:, 1:-1], kept[:, -1:]
+    terms = np.hstack([b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)])
+
+    def shares(means):
+        variance = means[..., -1:] - means[..., -2:-1] ** 2
+        return means[..., :-2] / np.where(variance > 0, variance, np.nan), variance
+
+    point, variance = shares(terms.mean(axis=0))
+    if not variance[0] > (FLAT * size) ** 2:
+        return {**nothing, "variance": 0.0}
+    low, high = np.nanquantile(shares(bootstrap_means(terms, seed))[0], (0.025, 0.975), axis=0)
+    intervals = np.stack([low, high], axis=1)
+    return {
+        "first": point[:dimensions],
+        "total": point[dimensions:],
+        "first_interval95": intervals[:dimensions],
+        "total_interval95": intervals[dimensions:],
+        "kept": len(kept),
+        "variance": float(variance[0]),
+    }
+
+
+def bootstrap_means(terms, seed, resamples=RESAMPLES):
+    """(resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
+    n, rng, found = len(terms), np.random.default_rng(seed), []
+    rows = max(1, BLOCK // n)
+    for start in range(0, resamples, rows):
+        count = min(rows, resamples - start)
+        drawn = rng.integers(n, size=(count, n)) + n * np.arange(count)[:, None]
+        found.append(np.bincount(drawn.ravel(), minlength=count * n).reshape(count, n) @ terms / n)
+    return np.concatenate(found)
+
+
+def morris_points(dimensions, trajectories, seed, levels=LEVELS):
+    """(trajectories, D + 1, D) points for `morris_effects`: from a random point of the grid, each coordinate in a random order steps once
+    by levels / (2 (levels - 1)), to the side that stays inside. levels is even."""
+    rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
+    base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
+    moved = np.clip(np.where(base < 0.5, base + step, base - step), 0.0, 1.0)
+    turn = rng.permuted(np.tile(np.arange(dimensions), (trajectories, 1)), axis=1)  # when each coordinate moves
+    return np.where(np.arange(dimensions + 1)[:, None] > turn[:, None, :], moved[:, None, :], base[:, None, :])
+
+
+def morris_effects(points, y):
+    """(trajectories, D) elementary effects of outputs y (trajectories, D + 1) at `morris_points`: change of y over the step, per unit of
+    the cube; NaN where an end of the step is not finite."""
+    y = np.where(np.isfinite(y), y, np.nan)
+    change = np.diff(points, axis=1)
+    mover = np.abs(change).argmax(axis=2)
+    step = np.take_along_axis(change, mover[..., None], axis=2)[..., 0]
+    effects = np.empty(mover.shape)
+    np.put_along_axis(effects, mover, np.diff(y, axis=1) / step, axis=1)
+    return effects
+
+
+def morris_indices(effects):
+    """Mean, mean size and standard deviation of the elementary effects (trajectories, D) of each input.
+
+    Returns {"mu", "mu_star", "sigma": (D,), "mu_interval95", "mu_star_interval95": (D, 2), "kept": (D,) effects used}: mu near mu_star in
+    size says that the effect has one sign, sigma near mu_star that it depends on the other inputs or is curved. Effects that are not
+    finite are left out; the intervals are Student's, trajectories being independent; NaN below 2 effects.
+    """
+    dimensions = effects.shape[1]
+    found = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
+    found |= {k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")}
+    found["kept"] = np.isfinite(effects).sum(axis=0)
+    for j in range(dimensions):
+        mine = effects[np.isfinite(effects[:, j]), j]
+        if len(mine) < 2:
+            continue
+        half = stats.t.ppf(0.975, len(mine) - 1) / np.sqrt(len(mine))
+        found["sigma"][j] = mine.std(ddof=1)
+        for name, values in (("mu", mine), ("mu_star", np.abs(mine))):
+            found[name][j] = mean = values.mean()
+            found[f"{name}_interval95"][j] = mean - half * values.std(ddof=1), mean + half * values.std(ddof=1)
+    found["mu_star_interval95"] = np.maximum(found["mu_star_interval95"], 0.0)
+    return found

@@ -1,0 +1,252 @@
+"""Which parameter moves which measure: exact derivatives, Morris' elementary effects, Sobol's shares of the variance."""
+
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import measures as ms
+from jaxtank.errors import InputError, unknown
+from jaxtank.tree import get_value
+from tuning import indices
+from tuning import scenarios as sc
+from tuning.distributions import Correlated, Draws, Uniform
+from tuning.effects import Column, entries_of, local_columns
+
+METHODS = ("local", "morris", "sobol")
+
+SAMPLES = {"local": None, "morris": 32, "sobol": 512}
+"""Trajectories of Morris and base points of Sobol unless told otherwise."""
+
+LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
+"""Fewest samples that an interval can be drawn from, and most that are taken."""
+
+LANES, NUMBERS = 64, 1 << 22
+"""Runs in a batch, and the samples that all of them may have together: what is prepared before the loop is held for each."""
+
+COUNTED = ("settling_time", "rise_time", "recovery_time", "saturated_fraction", "time_of_max_level")
+"""Measures that count whole samples: a step function of the parameters, whose derivative says nothing."""
+
+RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SensitivityResult:
+    """What `sensitivity` found. `.text()` for tables, `.to_json()`, `.figures()` for pictures, `.save(dir)` for files.
+
+    parameters: (D,) dotted names of what varies; values: {name: its own value (list of them where entries are tied)}; half_width: {name:
+    (D,) of the local method, in the parameter's unit}; columns: one Column for each entry of each measure; runs: simulations; failed: how
+    many of them stopped being finite; samples: trajectories or base points, None for the local method.
+    """
+
+    case: Any
+    method: str
+    samples: int | None
+    runs: int
+    failed: int
+    seed: int
+    distributions: dict
+    parameters: list
+    half_width: dict
+    columns: list
+    notes: list
+    wall_s: float
+
+    def order(self, column):
+        """The parameters' indices, the one that moves the column most first; those without an index last."""
+        size = np.abs(column.felt[RANKED_BY[self.method]])
+        return np.argsort(np.where(np.isfinite(size), -size, np.inf), kind="stable")
+
+    def to_json(self):
+        """The JSON object of `jaxtank sensitivity --json`."""
+        from tuning.sensitivity_report import json_of
+
+        return json_of(self)
+
+    def text(self):
+        """The result as a page of text."""
+        from tuning.sensitivity_report import text
+
+        return text(self)
+
+    def figures(self):
+        """Matplotlib figures {"tornado" or "sobol": figure}."""
+        from tuning.sensitivity_report import figures
+
+        return figures(self)
+
+    def save(self, folder):
+        """Write result.json, sensitivity.csv and the picture to a folder; returns their paths."""
+        from tuning.sensitivity_report import save
+
+        return save(self, folder)
+
+    def __repr__(self):
+        return self.text()
+
+
+def sensitivity(
+    case,
+    distributions=None,
+    *,
+    method="local",
+    measures=None,
+    samples=None,
+    spread=None,
+    seed=0,
+    batch=None,
+    progress=None,
+):
+    """Which uncertain parameter moves which measure of a case.
+
+    distributions: {dotted name: distribution}; what the case calls uncertain, uniform within its own share, where None; spread: one share
+    for all that the case calls uncertain [-], beside which `distributions` adds or replaces. method: "local": derivative at the case's
+    own values times half-width of the distribution; "morris": elementary effects over `samples` (32) trajectories, samples (D + 1) runs;
+    "sobol": first and total order from `samples` (512) base points, rounded up to a power of 2, samples (D + 2) runs. measures: names,
+    those of the case's objective, rms_error_total and max_level where None; seed: of the points and of the sensor noise, which is the same
+    in every run; batch: runs at once; progress: called with (runs done, runs in all). Returns a SensitivityResult. Raises InputError
+    before anything is run, and NonFiniteError if the local method meets a run that is not finite.
+    """
+    began = time.perf_counter()
+    if method not in METHODS:
+        raise unknown("method", method, METHODS)
+    given = spread_of(case, distributions, spread)
+    draws = Draws(case.loop, given)
+    if not draws.dimensions:
+        raise InputError("nothing moves: a relative spread leaves zeros alone, and all values are zero")
+    names = check_measures(case, measures, method)
+    notes = []
+    if method == "local":
+        if samples is not None:
+            notes.append("the local method takes one run and its derivatives: samples are not used")
+        samples = None
+    else:
+        samples = check_samples(samples, method, notes)
+        for name, d in given.items():
+            if isinstance(d, Correlated):
+                raise InputError(f"{name}: parameters that vary together have no effects of their own; take the local method")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError(f"seed = {seed!r}: must be a whole number from 0 to {2**31 - 1}")
+    if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
+        raise InputError(f"batch = {batch!r}: must be a whole number of at least 1")
+    random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
+    key = jax.random.key(seed) if random else None  # one key for all runs: differences are the parameters' alone
+    lp.check(case.loop, case.clock, key)
+    half_width = {}
+    if method == "local":
+        columns, half_width = local_columns(case, draws, names, key, progress)
+        runs, failed = 1, 0
+    else:
+        points = (indices.morris_points if method == "morris" else indices.sobol_points)(draws.dimensions, samples, seed)
+        run = Runs(case, draws, names, key, batch, progress)
+        found = run(points.reshape(-1, draws.dimensions)).reshape(*points.shape[:2], -1)
+        columns = [
+            _column(case, names, k, run.nominal[k], found[..., k], _indices(method, points, found[..., k], seed))
+            for k in range(found.shape[-1])
+        ]
+        runs, failed = found.shape[0] * found.shape[1], run.failed
+    return SensitivityResult(
+        case=case,
+        method=method,
+        samples=samples,
+        runs=runs,
+        failed=failed,
+        seed=seed,
+        distributions=given,
+        parameters=draws.labels,
+        half_width=half_width,
+        columns=columns,
+        notes=notes,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def spread_of(case, distributions=None, spread=None):
+    """{name: distribution} of a study: `distributions`, or what the case calls uncertain, or both where `spread` is given too."""
+    if spread is not None and (isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1):
+        raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
+    if distributions is not None and spread is None:
+        return dict(distributions)
+    if not case.uncertain:
+        raise InputError(f"{case.name} names nothing uncertain: say what varies, as --vary plant.drain=uniform:5%")
+    own = {n: Uniform(relative=float(share if spread is None else spread)) for n, share in case.uncertain.items()}
+    return {**own, **(distributions or {})}
+
+
+def check_measures(case, measures, method):
+    """The names of the measures of a study, if the case has them all and the method can say something of each."""
+    if measures is None:
+        names = [m for m in (*case.objective, "rms_error_total", "max_level") if ms.serves(m, case.loop)]
+        names = [m for m in names if method != "local" or m not in COUNTED]
+    else:
+        names = [measures] if isinstance(measures, str) else list(measures)
+        if not names:
+            raise InputError("measures: name at least one")
+        ms.check_names(names)
+        for m in names:
+            if not ms.serves(m, case.loop):
+                raise InputError(f"measure {m} means nothing for {case.name}: it has no changes of setpoint, or nothing is poured")
+            if method == "local" and m in COUNTED:
+                raise InputError(f"measure {m} counts whole samples and has no derivative: take the method morris or sobol")
+    return tuple(dict.fromkeys(names))
+
+
+def check_samples(samples, method, notes):
+    """The number of samples, for Sobol a power of 2; says in `notes` if that is not what was asked."""
+    samples = SAMPLES[method] if samples is None else samples
+    if isinstance(samples, bool) or not isinstance(samples, int) or not LEAST[method] <= samples <= MOST:
+        raise InputError(f"samples = {samples!r}: the method {method} takes a whole number from {LEAST[method]} to {MOST}")
+    if method == "sobol" and samples & (samples - 1):
+        notes.append(f"samples: {samples} rounded up to {1 << samples.bit_length()}, Sobol points are even in powers of 2")
+        samples = 1 << samples.bit_length()
+    return samples
+
+
+class Runs:
+    """A case as a function of the unit cube: (n, D) probabilities in, (n, K) entries of measures out, NaN where a run is not finite.
+
+    Batches have one size, so that one compiled program serves; the case's own run goes first. After a call `nominal` (K,) holds its
+    values and `failed` the number of other runs that stopped being finite.
+    """
+
+    def __init__(self, case, draws, names, key, batch=None, progress=None):
+        (self.group,) = sc.groups_of([sc.Lane("", case, key, 1.0)])
+        self.own = {name: np.asarray(get_value(case.loop, name))[None] for name in draws.values(np.zeros((0, draws.dimensions)))}
+        self.draws, self.names, self.progress = draws, names, progress
+        self.batch = batch or max(8, min(LANES, 1 << (max(1, NUMBERS // case.clock.samples).bit_length() - 1)))
+        self.nominal, self.failed = None, 0
+
+    def __call__(self, p):
+        values = {name: np.concatenate([self.own[name], v]) for name, v in self.draws.values(p).items()}
+        total, found = len(p) + 1, []
+        size = min(self.batch, total)
+        for start in range(0, total, size):
+            rows = np.minimum(np.arange(start, start + size), total - 1)  # the last run repeated to fill the batch
+            measures, broken = sc.values_of(self.group, self.names, {name: v[rows] for name, v in values.items()})
+            flat = np.concatenate([np.asarray(measures[m])[:, 0].reshape(size, -1) for m in self.names], axis=1)
+            found.append(np.where(np.asarray(broken), np.nan, flat)[: total - start])
+            lost = np.asarray(broken)[: total - start, 0]
+            self.failed += int(lost.sum()) - int(start == 0 and lost[0])
+            if self.progress is not None:
+                self.progress(min(start + size, total) - 1, len(p))
+        found = np.concatenate(found)
+        self.nominal = found[0]
+        return found[1:]
+
+
+def _column(case, names, k, nominal, y, felt):
+    measure, label, unit = entries_of(case, names)[k]
+    bad = int(np.sum(~np.isfinite(y)))
+    reason = ""
+    if not np.isfinite(felt["total" if "total" in felt else "mu_star"]).all():
+        reason = "too few runs in which it is finite" if bad else "it does not vary"
+    return Column(measure, label, unit, float(nominal), bad, felt, reason)
+
+
+def _indices(method, points, y, seed):
+    if method == "sobol":
+        return indices.sobol_indices(y, seed)
+    return indices.morris_indices(indices.morris_effects(points, y))

@@ -1,0 +1,211 @@
+"""Tables, JSON, CSV and the picture of a sensitivity study."""
+
+import csv
+import dataclasses
+import io
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank.files import check_folder
+from jaxtank.tree import describe, get_value
+from tuning import report, search
+from tuning.distributions import Correlated, Normal
+from tuning.effects import NORMAL_WIDTH
+
+SHOWN = 8
+"""Parameters in the table of a measure."""
+
+PANELS = 12
+"""Measures in the picture."""
+
+WIDE = 0.2
+"""Width of an interval of a share of the variance above which more samples are advised [-]."""
+
+HEADS = {
+    "local": {"effect": "effect", "derivative": "derivative", "elasticity": "% per %"},
+    "morris": {"mu_star": "mu*", "mu_star_interval95": "95 % interval", "mu": "mu", "sigma": "sigma"},
+    "sobol": {"first": "first", "first_interval95": "95 % interval", "total": "total", "total_interval95": "95 % interval"},
+}
+TITLES = {
+    "local": "change of each measure for the half-width of each parameter, by derivatives",
+    "morris": "elementary effects of each parameter on each measure (Morris)",
+    "sobol": "shares of the variance of each measure (Sobol)",
+}
+WORDS = {
+    "local": "effect: derivative at the case's own values times the half-width of the distribution (half its range; "
+    f"{NORMAL_WIDTH:g} standard deviations of a normal one)",
+    "morris": "mu: mean change of the measure over the whole range of the parameter, at random values of the others; mu*: mean size of it; "
+    "sigma: its standard deviation (large where it interacts or is curved); intervals of Student",
+    "sobol": "first: share of the variance that the parameter has alone; total: with all its interactions; intervals by bootstrap",
+}
+LOST = {
+    "local": "",
+    "morris": "steps with such an end are left out",
+    "sobol": "a base point with such a run is left out whole, so shares are those among the others",
+}
+
+
+def notes_of(result):
+    """Sentences that go with the numbers: what they are, what was left out, where more samples are advised."""
+    found = [WORDS[result.method], *result.notes]
+    if result.failed:
+        found.append(f"{result.failed} of {result.runs} runs stopped being finite")
+    lost = {c.label: c.not_finite for c in result.columns if c.not_finite and result.method != "local"}
+    if lost:
+        found.append(
+            "runs in which a measure is no finite number: "
+            + ", ".join(f"{label} {count}" for label, count in lost.items())
+            + f"; {LOST[result.method]}"
+        )
+    if result.method == "sobol":
+        widest = max((np.ptp(c.felt["total_interval95"], axis=1).max() for c in result.columns if not c.reason), default=0.0)
+        if widest > WIDE:
+            found.append(f"the widest interval of a total share is {widest:.2g}: more samples would narrow it")
+    return found
+
+
+def json_of(result):
+    """The JSON object of `jaxtank sensitivity --json`; measures by name and entry, each with every parameter, the one that moves it most
+    first."""
+    return {
+        "case": result.case.name,
+        "method": result.method,
+        "samples": result.samples,
+        "runs": result.runs,
+        "failed": result.failed,
+        "distributions": {
+            n: {"kind": type(d).__name__, **report.clean(dataclasses.asdict(d))} for n, d in result.distributions.items()
+        },
+        "parameters": {
+            n: {
+                "value": report.clean(np.asarray(get_value(result.case.loop, n))),
+                "unit": describe(result.case.loop, n)["unit"],
+                **({"half_width": result.half_width[n], "half_width_is": _width_words(result, n)} if result.half_width else {}),
+            }
+            for n in result.parameters
+        },
+        "measures": {c.label: _column_json(result, c) for c in result.columns},
+        "notes": notes_of(result),
+        "wall_s": result.wall_s,
+        "provenance": search.provenance(result.case, result.seed),
+    }
+
+
+def _width_words(result, label):
+    for name, d in result.distributions.items():
+        if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
+            normal = isinstance(d, (Normal, Correlated))
+            return f"{min(NORMAL_WIDTH, d.cut):g} standard deviations" if normal else "half the range"
+    return ""
+
+
+def _column_json(result, c):
+    extra = {}
+    if result.method == "sobol":
+        extra = {
+            "variance": report.clean(float(c.felt["variance"])),
+            "sum_of_first": report.clean(float(np.sum(c.felt["first"]))),
+            "base_points_used": int(c.felt["kept"]),
+        }
+    rows = {}
+    for i in result.order(c):
+        rows[result.parameters[i]] = {q: report.clean(c.felt[q][i]) for q in HEADS[result.method]}
+        if result.method == "morris":
+            rows[result.parameters[i]]["mu_interval95"] = report.clean(c.felt["mu_interval95"][i])
+            rows[result.parameters[i]]["effects_used"] = int(c.felt["kept"][i])
+    return {
+        "measure": c.measure,
+        "unit": c.unit,
+        "nominal": report.clean(c.nominal),
+        "not_finite": c.not_finite,
+        "reason": c.reason or None,
+        **extra,
+        "parameters": rows,
+    }
+
+
+def text(result):
+    """The result as a page of text."""
+    asked = "" if result.samples is None else f", {result.samples} {'trajectories' if result.method == 'morris' else 'base points'}"
+    runs = f"{result.runs} run{'s' if result.runs > 1 else ''}" + (" with derivatives" if result.method == "local" else "")
+    spread = ", ".join(f"{n} {_said(d)}" for n, d in result.distributions.items())
+    parts = [
+        f"{result.case.name}: sensitivity, {result.method}{asked}, {runs}, {result.failed} not finite, seed {result.seed}, {result.wall_s:.1f} s",
+        f"varied: {spread}",
+        "",
+    ]
+    heads = HEADS[result.method]
+    for c in result.columns:
+        title = f"{c.label} [{c.unit}], {report.number(c.nominal)} in the case's own run"
+        if c.reason:
+            parts += [f"{title}: no indices, {c.reason}", ""]
+            continue
+        rows = [[result.parameters[i], *(_cell(c.felt[q][i]) for q in heads)] for i in result.order(c)[:SHOWN]]
+        more = len(result.parameters) - len(rows)
+        tail = [f"and {more} more parameters, each below these"] if more > 0 else []
+        if result.method == "sobol":
+            tail.append(f"first-order shares sum to {np.sum(c.felt['first']):.3f}; to 1 where nothing interacts")
+        parts += [title, report.table(rows, ["parameter", *heads.values()]), *tail, ""]
+    return "\n".join([*parts, *(f"- {note}" for note in notes_of(result))])
+
+
+def _said(distribution):
+    fields = {n: v for n, v in dataclasses.asdict(distribution).items() if v is not None and v is not False}
+    return f"{type(distribution).__name__.lower()} ({', '.join(f'{n} {v}' for n, v in fields.items())})"
+
+
+def _cell(value):
+    return " : ".join(report.number(v, 3) for v in value) if np.ndim(value) else report.number(value, 4)
+
+
+def table_csv(result):
+    """Every measure and parameter as CSV, one row each; empty where there is no number."""
+    quantities = list(HEADS[result.method])
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    heads = [
+        h
+        for q in quantities
+        for h in ([q.replace("interval95", "low"), q.replace("interval95", "high")] if "interval95" in q else [q])
+    ]
+    writer.writerow(["measure", "unit", "parameter", "parameter unit", "rank", *heads])
+    for c in result.columns:
+        for rank, i in enumerate(result.order(c), start=1):
+            name = result.parameters[i]
+            numbers = [f"{v:.10g}" if np.isfinite(v) else "" for q in quantities for v in np.ravel(c.felt[q][i])]
+            writer.writerow([c.label, c.unit, name, describe(result.case.loop, name)["unit"], rank, *numbers])
+    return out.getvalue()
+
+
+def figures(result):
+    """{"tornado" or "sobol": figure} with one panel for each measure that has indices, at most PANELS of them."""
+    from jaxtank import plotting
+
+    shown = [c for c in result.columns if not c.reason][:PANELS]
+    draws = []
+    for c in shown:
+        order = result.order(c)
+        names = [result.parameters[i] for i in order]
+        felt = {q: np.asarray(c.felt[q])[order] for q in HEADS[result.method]}
+        title = f"{c.label} ({report.number(c.nominal, 4)} {c.unit})"
+        draws.append(lambda ax, n=names, f=felt, u=c.unit, t=title: _panel(plotting, result.method, ax, n, f, u, t))
+    name = "sobol" if result.method == "sobol" else "tornado"
+    rows = min(len(result.parameters), plotting.BARS)
+    return {name: plotting.panels(draws, f"{result.case.name}: {TITLES[result.method]}", rows)} if draws else {}
+
+
+def _panel(plotting, method, ax, names, felt, unit, title):
+    if method == "local":
+        return plotting.tornado(ax, names, felt["effect"], unit, title)
+    if method == "morris":
+        return plotting.elementary(ax, names, felt["mu_star"], felt["mu_star_interval95"], felt["sigma"], unit, title)
+    return plotting.shares(ax, names, felt["first"], felt["total"], felt["first_interval95"], felt["total_interval95"], title)
+
+
+def save(result, folder):
+    """Write result.json, sensitivity.csv and tornado.png or sobol.png to `folder`; returns their paths."""
+    check_folder(folder)
+    files = {"result.json": report.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
+    written = report.write_files(Path(folder), files)
+    return written + report.write_files(Path(folder), {f"{n}.png": report._png(f) for n, f in figures(result).items()})
