@@ -75,7 +75,7 @@ def parser():
     commands.add_parser("show", parents=[common, case], help="one case: rig, law, every parameter, published numbers, departures")
     commands.add_parser("simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures")
     tune = commands.add_parser("tune", parents=[common, case, run], help="tune the gains of a case under its limits")
-    tune.add_argument("--method", default="auto", metavar="NAME", help="auto (default), trf, slsqp, lbfgs or adam")
+    tune.add_argument("--method", default="auto", metavar="NAME", help="auto (default), trf, coarse-trf, slsqp, lbfgs or adam")
     tune.add_argument(
         "--free",
         action="append",

@@ -22,12 +22,20 @@ MANY = 1024
 COARSE = 10
 """How many samples of the case make one of the coarse stage."""
 
+FEWEST = 200
+"""Samples that a first local search needs at least."""
+
 
 def coarse_clock(clock):
     """The clock of the coarse stage: ten times the step, where that leaves at least a thousand samples; else the clock itself."""
     if clock.samples < 1000 * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
+
+
+def rough_clock(clock):
+    """The clock of a first local search: ten times the step, where that leaves at least FEWEST samples; else the clock itself."""
+    return clock if clock.samples < FEWEST * COARSE else dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
 class Lane(NamedTuple):

@@ -23,8 +23,11 @@ from tuning.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.screening import coarse_clock, distinct_starts, screen
 from tuning.solvers import METHODS, Search, minibatches, optimality, restore, slsqp
 
-OFFERED = ("trf", "slsqp", "lbfgs", "adam")
+OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
+
+FREELY = ("trf", "coarse-trf")
+"""Those that do not look at limits."""
 
 MANY = 4
 """Number of parameters from which "auto" tries Gauss-Newton before it looks at limits."""
@@ -51,8 +54,9 @@ def tune(
 ):
     """Better values for the free parameters of a case, under its limits.
 
-    case: presets Case; method: "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "lbfgs"
-    or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight}; limits: {measure: value}, {} for none, held in every
+    case: presets Case; method: "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "coarse-trf"
+    (trf at a tenth of the samples, then at all), "lbfgs" or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight};
+    limits: {measure: value}, {} for none, held in every
     scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; choices: {static name: [values]}, each combination of
     which is tuned, the best taken; starts: local searches, from the case's own values and the best distinct ones of `screening` Sobol
     points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
@@ -107,9 +111,9 @@ def tune(
                 converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, i]))
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
-        if search.best is not None and search.violation(search.best) > 0 and method != "trf":
+        if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             _find_feasible(search, zs, margins, iterations)
-        if method in ("slsqp", "trf", "trf-slsqp") and search.best is not None:
+        if method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
         if search.best is not None and search.violation(search.best) == 0:
             curved = evidence.curvature(problem, search, search.best)
@@ -226,11 +230,11 @@ def _method(method, problem, batch):
         return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
     if method not in OFFERED:
         raise InputError(f"method = {method!r}: must be one of auto, {', '.join(OFFERED)}")
-    if method == "trf" and problem.limits:
-        raise InputError("method trf cannot hold limits: use slsqp (or auto), or drop them with --limit none")
-    if method == "trf" and not problem.model:
+    if method in FREELY and problem.limits:
+        raise InputError(f"method {method} cannot hold limits: use slsqp (or auto), or drop them with --limit none")
+    if method in FREELY and not problem.model:
         raise InputError(
-            f"method trf needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)}) in the objective: use slsqp"
+            f"method {method} needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)}) in the objective: use slsqp"
         )
     return method
 
