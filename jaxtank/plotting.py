@@ -259,3 +259,46 @@ def _whiskers(ax, y, values, ends):
 
 def _at(array, i):
     return None if array is None else float(np.asarray(array)[i])
+
+
+def fan(loop, bands, title):
+    """A figure of the quantiles of levels over many draws: the middle 90 and 50 % and the median, with setpoints and rims.
+
+    bands: {"t" (rows,) [s], "r" (rows, outputs), "x" (5, rows, tanks)}: quantiles 5, 25, 50, 75, 95 %.
+    """
+    tanks, rims = loop.plant.tanks, np.asarray(loop.plant.rim)
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(-(-tanks // 2), min(2, tanks), figsize=(9.6, 2.7 * -(-tanks // 2)), sharex=True, layout="constrained", squeeze=False)
+        for i, ax in enumerate(axes.ravel()[:tanks]):
+            low, first, middle, third, high = bands["x"][:, :, i]
+            ax.fill_between(bands["t"], low, high, color="#0072B2", alpha=0.2, linewidth=0, label="5 to 95 %")
+            ax.fill_between(bands["t"], first, third, color="#0072B2", alpha=0.35, linewidth=0, label="25 to 75 %")
+            ax.plot(bands["t"], middle, color="#0072B2", linewidth=1.2, label="median")
+            if i in loop.plant.outputs:
+                ax.plot(bands["t"], bands["r"][:, loop.plant.outputs.index(i)], color="black", linewidth=0.8, linestyle="--", label="setpoint")
+            if high.max() > 0.5 * rims[i]:
+                ax.axhline(rims[i], color="#D55E00", linewidth=1.0, label="rim")
+            ax.set_title(f"tank {i + 1}")
+            ax.set_ylabel(f"level [{loop.units[0]}]")
+            ax.legend(loc="best", fontsize="x-small")
+        for ax in axes[-1]:
+            ax.set_xlabel("time [s]")
+        for ax in axes.ravel()[tanks:]:
+            ax.set_visible(False)
+        figure.suptitle(title)
+    return figure
+
+
+def violations(rows, samples):
+    """A figure of the probability that each limit is broken, with its 95 % interval. rows: as `Ensemble.violations` gives them."""
+    with plt.rc_context(STYLE):
+        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
+        y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
+        ends = np.array([r["interval95"] for r in rows])
+        ax.barh(y, p, color="#56B4E9", height=0.6)
+        ax.errorbar(p, y, xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]), fmt="none", ecolor="black", capsize=3)
+        ax.set_yticks(y, [f"{r['name']} ({r['limit']:g})" for r in rows])
+        ax.invert_yaxis()
+        ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
+        ax.set_xlabel(f"probability of breaking the limit [-], {samples} draws")
+    return figure

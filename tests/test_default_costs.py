@@ -11,14 +11,16 @@ QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi"
 ROUGH = {
     # why the slope is only good to this share of the largest one
     "mirakhorli/smc-printed": (np.inf, "the law switches at every sample: its cost is a staircase in the gains (spec 4.2)"),
+    "khalid/*-constrained": (1e-3, "rows of the programme come and go, and its interior point stops at 1e-6 (spec C.2)"),
     "gouta2015/*-table1": (1e-3, "saturated for 98 % of the run (spec 9.1)"),
 }
 SHORT = {"clock.duration": 200.0}  # of 900 and 1200 s: saturated starts, both setpoints, the first pours left to their own tests
 
 
 def tolerance(name):
-    if "table1" in name:
-        return ROUGH["gouta2015/*-table1"][0]
+    for part in ("table1", "constrained"):
+        if name.endswith(part) or f"-{part}-" in name:
+            return next(share for key, (share, _) in ROUGH.items() if key.endswith(f"*-{part}"))
     return ROUGH.get(name.removesuffix("-warm"), (1e-5,))[0]
 
 
@@ -41,8 +43,12 @@ def test_slopes_of_the_default_cost(name):
     entries = {n: spec for n, spec in paper.tunable.items() if split_index(n)[1] and split_index(n)[0] in present}
     free = {n: spec for n, spec in whole.items() if not any(split_index(e)[0] == n for e in entries)}
     for n, spec in entries.items():
-        if case.loop is not None and split_index(n)[1][0] < np.size(present[split_index(n)[0]]):
+        if split_index(n)[1][0] < np.size(present[split_index(n)[0]]):
             free[n] = spec
+    if name.startswith("khalid") and case.loop.plant.pumps == 2:  # the narrow ranges of its entries are for one pump
+        free = {n: v for n, v in free.items() if n not in entries} | {n: whole[n] for n in {split_index(e)[0] for e in entries}}
+    if name.endswith("-constrained"):  # apart from the programme's own limits, where those of the pump would be a kink
+        case = rig.set_values(case, {"actuator.low": -0.5, "actuator.high": 3.5})
     problem = Problem(case, free=free, limits={})
     z = np.clip(problem.start(), 0.02, 0.98)
     found, count = problem.point(z), len(z)

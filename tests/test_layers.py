@@ -22,13 +22,15 @@ LAYERS = [
     {"rig", "plotting"},
 ]
 ABOVE = [
-    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects"},
+    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects", "parts"},
     {"objective"},
     {"screening", "solvers", "input_search", "evidence"},
     {"result"},
     {"search", "choices", "bound", "tradeoff", "sensitivity"},
+    {"ensemble"},
+    {"robust"},
     {"report"},
-    {"manual", "sensitivity_report"},
+    {"manual", "sensitivity_report", "ensemble_report"},
     {"bench", "compare"},
     {"cli"},
 ]
@@ -36,7 +38,12 @@ RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer
 RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for room in layer}
 
 # Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
-DOORS = {("jaxtank.__main__", "tuning.cli"), ("tuning.result", "tuning.report"), ("tuning.sensitivity", "tuning.sensitivity_report")}
+DOORS = {
+    ("jaxtank.__main__", "tuning.cli"),
+    ("tuning.result", "tuning.report"),
+    ("tuning.sensitivity", "tuning.sensitivity_report"),
+    ("tuning.ensemble", "tuning.ensemble_report"),
+}
 
 
 def room(module):

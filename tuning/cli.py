@@ -5,6 +5,7 @@ be met, 130 interrupted (the best point so far is written and said). Nothing hea
 """
 
 import argparse
+import functools
 import os
 import signal
 import sys
@@ -121,6 +122,41 @@ def parser():
     tune.add_argument("--starts", default="8", metavar="N", help="local searches (default 8)")
     tune.add_argument("--screening", default="64", metavar="N", help="Sobol points before them (default 64)")
     tune.add_argument("--iterations", default="60", metavar="N", help="iterations of each local search (default 60)")
+    tune.add_argument(
+        "--robust", metavar="RISK", help="on many plants at once: mean, cvar or worst of their costs, limits held on every one"
+    )
+    tune.add_argument("--samples", metavar="N", help="plants of --robust (default 64)")
+    uncertain = commands.add_parser(
+        "uncertainty", parents=[common, case, run], help="the same loop over N draws: bands, percentiles, violations"
+    )
+    uncertain.add_argument("--samples", default="1000", metavar="N", help="draws (default 1000)")
+    for command in (tune, uncertain):
+        command.add_argument(
+            "--spread", metavar="FRACTION", help="one spread for all that the case calls uncertain, as 0.1 for +-10 %%"
+        )
+        command.add_argument(
+            "--vary",
+            action="append",
+            default=[],
+            metavar="NAME=DIST",
+            help="what varies instead: uniform:5%%, normal:MEAN:SD, ...; repeatable",
+        )
+    uncertain.add_argument("--draws", default="random", metavar="KIND", help="random (default), latin or sobol")
+    uncertain.add_argument(
+        "--limit", action="append", default=[], metavar="MEASURE=VALUE", help="a limit to count violations of; repeatable"
+    )
+    uncertain.add_argument(
+        "--measure", action="append", default=[], metavar="NAME", help="a measure to keep, not the usual ones; repeatable"
+    )
+    uncertain.add_argument("--devices", default="1", metavar="N", help="devices of this machine to use (default 1)")
+    uncertain.add_argument("--shard", metavar="I/N", help="run the I-th of N shares into --out DIR; merge joins them")
+    uncertain.add_argument("--resume", metavar="DIR", help="go on where a killed run with --out DIR ended")
+    merge = commands.add_parser(
+        "merge", parents=[common, case, run], help="join the shards of an ensemble: the options as theirs, --out DIR"
+    )
+    for action in uncertain._actions:
+        if action.dest in ("samples", "spread", "vary", "draws", "limit", "measure"):
+            merge._add_action(action)
     sense = commands.add_parser(
         "sensitivity", parents=[common, case, run], help="which parameter moves which measure: local, Morris, Sobol"
     )
@@ -134,7 +170,7 @@ def parser():
         action="append",
         default=[],
         metavar="NAME=DISTRIBUTION",
-        help="what varies, as plant.drain=uniform:5%% or normal:MEAN:SD; replaces the case's own unless --spread is given; repeatable",
+        help="what varies instead, as plant.drain=uniform:5%% or normal:MEAN:SD; repeatable",
     )
     sense.add_argument(
         "--measure",
@@ -363,6 +399,86 @@ def _tradeoff(args):
     return measure, [low + (high - low) * i / (count - 1) for i in range(count)]
 
 
+def _distributions(args, case):
+    """What varies, by --vary or --spread; None for the case's own."""
+    from tuning.distributions import parse
+    from tuning.ensemble import spread_of
+
+    if args.vary and args.spread is not None:
+        raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
+    if args.vary:
+        return dict(_pair_of(text, parse) for text in args.vary)
+    if args.spread is None:
+        return None
+    share = _number("--spread", args.spread)
+    if not 0 < share < 1:
+        raise InputError(f"--spread {args.spread!r}: must be a share between 0 and 1")
+    return spread_of(case, share)
+
+
+def _pair_of(text, parse):
+    name, value = _pair("--vary", text, str)
+    return name, parse(name, value)
+
+
+def _ensemble(args, **options):
+    from tuning.ensemble import ensemble
+
+    case = _open(args)
+    return ensemble(
+        case,
+        _distributions(args, case),
+        samples=_whole("--samples", args.samples, 1, 10**8),
+        key=_seed(args),
+        draws=args.draws,
+        measures=tuple(args.measure) or None,
+        limits=_limits(args, case),
+        **options,
+    )
+
+
+def _told(found, args):
+    """Write, print and end with an Ensemble."""
+    from tuning import report
+
+    written = found.save(args.out) if args.out else []
+    print(report.dumps(found.to_json()) if args.json else repr(found))
+    _written(written, args)
+    return 0
+
+
+def _uncertainty(args):
+    devices, shard = _whole("--devices", args.devices, 1, 1024), None
+    if args.shard is not None:
+        first, slash, second = args.shard.partition("/")
+        if not slash or (not args.out and not args.resume):
+            raise InputError(f"--shard {args.shard!r}: must be I/N, with --out DIR for the shard")
+        count = _whole("--shard", second, 1, 10**6)
+        shard = (_whole("--shard", first, 1, count), count)
+    if args.resume and args.out and args.resume != args.out:
+        raise InputError("--resume and --out name different folders: a run is continued in its own")
+    args.out = args.resume or args.out
+    _out(args)
+    import jax
+
+    if devices > 1:
+        jax.config.update("jax_num_cpu_devices", devices)
+    progress = None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
+    found = _ensemble(args, devices=devices, shard=shard, folder=args.out, resume=args.resume is not None, progress=progress)
+    if found is None:
+        if not args.quiet:
+            print(f"shard {args.shard} is in {args.out}; `jaxtank merge` joins the shards when all are", file=sys.stderr)
+        return 0
+    return _told(found, args)
+
+
+def _merge(args):
+    if not args.out:
+        raise InputError("merge needs --out DIR, where the shards are")
+    _out(args)
+    return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
+
+
 def _list(args):
     from jaxtank import presets
     from tuning import report
@@ -437,15 +553,27 @@ def _tune(args):
     if args.resume and args.out and args.resume != args.out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
     folder = args.resume or args.out
-    choices = _choices(args)
-    result = search.tune(
+    choices, varied = _choices(args), _distributions(args, case)
+    if (args.samples is not None or varied is not None) and args.robust is None:
+        raise InputError("--samples, --spread and --vary of tune belong to --robust")
+    finder, more = search.tune, {"choices": choices}
+    if args.robust is not None:
+        from tuning.robust import tune_robust
+
+        if choices or args.scenario:
+            raise InputError("--robust makes scenarios of its own: no --scenario, no --choose beside it")
+        finder = functools.partial(
+            tune_robust, distributions=varied, risk=args.robust, samples=_whole("--samples", args.samples or "64", 2, 100_000)
+        )
+        scenarios, more = None, {}
+    result = finder(
         case,
-        args.method,
+        method=args.method,
         free=free,
         objective=objective,
         limits=limits,
-        scenarios=scenarios,
-        choices=choices,
+        **({} if args.robust else {"scenarios": scenarios}),
+        **more,
         batch=None if args.batch is None else _whole("--batch", args.batch, 1, 100_000),
         validation=_whole("--validation", args.validation, 0, 100_000),
         log=None if choices else folder,
@@ -610,6 +738,8 @@ COMMANDS = {
     "tune": _tune_interruptibly,
     "sensitivity": _sensitivity,
     "init": _init,
+    "uncertainty": _uncertainty,
+    "merge": _merge,
     "compare": _compare,
     "bench": _bench,
 }

@@ -26,7 +26,8 @@ class Column(NamedTuple):
     nominal: float  # value of the case's own run, NaN where it has none
     not_finite: int  # runs of the study in which it is no finite number
     felt: dict
-    reason: str  # why indices are absent, "" where they are not
+    reason: str  # why some or all indices are absent, "" where none is
+    empty: bool = False  # no parameter has an index
 
 
 def entries_of(case, names):

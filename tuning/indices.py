@@ -40,8 +40,9 @@ def sobol_indices(y, seed=0):
 
     S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance over A and B. A row with an output that
     is not finite is left out whole, so that what remains stays paired. Returns {"first", "total": (D,), "first_interval95",
-    "total_interval95": (D, 2), "kept": rows used, "variance"}; shares are NaN where y does not vary or fewer than 2 rows remain. The
-    intervals are quantiles of a bootstrap over rows; for Sobol points, more even than random ones, they are on the wide side.
+    "total_interval95": (D, 2), "kept": rows used, "sd": standard deviation of y}; shares are NaN where y does not vary or fewer than 2
+    rows remain. The intervals are quantiles of a bootstrap over rows; for Sobol points, more even than random ones, they are on the wide
+    side.
     """
     y = np.asarray(y, dtype=float)
     dimensions = y.shape[1] - 2
@@ -50,8 +51,10 @@ def sobol_indices(y, seed=0):
     ends = np.full((dimensions, 2), np.nan)
     nothing = {"first": unknown, "total": unknown, "first_interval95": ends, "total_interval95": ends, "kept": len(kept)}
     if len(kept) < 2:
-        return {**nothing, "variance": np.nan}
-    size, kept = np.abs(kept).max(), kept - kept.mean()  # an output far from 0 would spoil the first-order products
+        return {**nothing, "sd": np.nan}
+    size = np.abs(kept).max() or 1.0
+    kept = kept / size  # what is squared must not overflow
+    kept = kept - kept.mean()  # an output far from 0 would spoil the first-order products
     a, mixed, b = kept[:, :1], kept[:, 1:-1], kept[:, -1:]
     terms = np.hstack([b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)])
 
@@ -60,8 +63,8 @@ def sobol_indices(y, seed=0):
         return means[..., :-2] / np.where(variance > 0, variance, np.nan), variance
 
     point, variance = shares(terms.mean(axis=0))
-    if not variance[0] > (FLAT * size) ** 2:
-        return {**nothing, "variance": 0.0}
+    if not variance[0] > FLAT**2:
+        return {**nothing, "sd": 0.0}
     low, high = np.nanquantile(shares(bootstrap_means(terms, seed))[0], (0.025, 0.975), axis=0)
     intervals = np.stack([low, high], axis=1)
     return {
@@ -70,7 +73,7 @@ def sobol_indices(y, seed=0):
         "first_interval95": intervals[:dimensions],
         "total_interval95": intervals[dimensions:],
         "kept": len(kept),
-        "variance": float(variance[0]),
+        "sd": float(size * np.sqrt(variance[0])),
     }
 
 
@@ -95,6 +98,7 @@ def morris_points(dimensions, trajectories, seed, levels=LEVELS):
     return np.where(np.arange(dimensions + 1)[:, None] > turn[:, None, :], moved[:, None, :], base[:, None, :])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # outputs near the largest number come out as not finite
 def morris_effects(points, y):
     """(trajectories, D) elementary effects of outputs y (trajectories, D + 1) at `morris_points`: change of y over the step, per unit of
     the cube; NaN where an end of the step is not finite."""
@@ -107,6 +111,7 @@ def morris_effects(points, y):
     return effects
 
 
+@np.errstate(over="ignore", invalid="ignore")  # outputs near the largest number come out as not finite
 def morris_indices(effects):
     """Mean, mean size and standard deviation of the elementary effects (trajectories, D) of each input.
 

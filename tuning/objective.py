@@ -26,6 +26,12 @@ LOWER = {"min_level"}
 EXPLODED = 1e9
 """Size at which a cost, a margin or a slope is no longer a number to search with."""
 
+RISKS = ("mean", "cvar", "worst")
+"""What the costs of several scenarios come to: their weighted mean, the mean of the worst TAIL of them, or the worst."""
+
+TAIL = 0.05
+"""Share of the scenarios that "cvar" is the mean of [-]."""
+
 NOT_A_NUMBER = 1e6
 """Amount by which an infinite measure (never settled) is taken to break its limit, and one that does not apply to hold it."""
 
@@ -73,6 +79,8 @@ class Point(NamedTuple):
     margins: np.ndarray  # (limits,) in each measure's unit
     margin_slopes: np.ndarray  # (limits, P)
     measures: tuple  # of each scenario, {name: value}
+    lane_costs: np.ndarray = np.zeros(0)  # (scenarios,)
+    lane_slopes: np.ndarray = np.zeros((0, 0))  # (scenarios, P)
     rows: tuple = ()  # which of the problem's limits the margins are of, where not all
 
     @property
@@ -104,11 +112,14 @@ class Problem:
     free: {name: Free}; objective: {measure: weight} (a list measure counts with the sum of its entries; scenarios count with their
     weighted mean); limits as in resolve_limits, held in every scenario; scenarios: tuple of Scenario, () for the case's own run, None
     for those of the case; seed: of the sensor noise, which is the same for every evaluation (common random numbers); memo: a Memo of
-    what was evaluated before.
+    what was evaluated before; risk: what the costs of the scenarios come to, one of RISKS.
     """
 
-    def __init__(self, case, free=None, objective=None, limits=None, scenarios=None, seed=0, memo=None):
+    def __init__(self, case, free=None, objective=None, limits=None, scenarios=None, seed=0, memo=None, risk="mean"):
         self.case, self.loop, self.clock, self.seed = case, case.loop, case.clock, seed
+        if risk not in RISKS:
+            raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
+        self.risk = risk
         self.bounds = bounds(case.loop, case.free if free is None else free)
         self.objective = check_objective(case.objective if objective is None else objective)
         self.scenarios = sc.check_scenarios(case, case.scenarios if scenarios is None else scenarios, self.names)
@@ -130,6 +141,8 @@ class Problem:
         None where no term of the cost is made of squares, or the parameters are too many to carry slopes of."""
         if len(self.bounds) > FORWARD_LIMIT:
             return None
+        if self.risk != "mean":
+            return None  # the worst change from point to point: a second derivative of the mean says little
         if set(self.objective) == {ROOT} and len(self.lanes) == 1:
             return "square"
         return "cost" if any(m == ROOT or m in ms.SQUARES for m in self.objective) else None
@@ -157,8 +170,20 @@ class Problem:
         return sum(w * float(np.sum(measures[m])) for m, w in self.objective.items())
 
     def total(self, table):
-        """The cost of `table`, the measures of every scenario: the weighted mean of theirs."""
-        return sum(lane.weight * self.cost(row) for lane, row in zip(self.lanes, table))
+        """The cost of `table`, the measures of every scenario: what their costs come to by `risk`."""
+        costs = np.array([self.cost(row) for row in table])
+        return float(self.shares(costs, range(len(self.lanes))) @ costs)
+
+    def shares(self, costs, lanes):
+        """What the cost of each of `lanes` counts, given all their costs: its weight, or where it is among the worst. Sums to 1."""
+        weights = np.array([self.lanes[i].weight for i in lanes])
+        if self.risk == "mean" or not np.all(np.isfinite(costs)):
+            return weights / weights.sum()
+        order = np.argsort(-costs, kind="stable")
+        count = 1 if self.risk == "worst" else max(1, int(np.ceil(TAIL * len(costs))))
+        chosen = np.zeros(len(costs))
+        chosen[order[:count]] = weights[order[:count]]
+        return chosen / chosen.sum()
 
     def margins(self, table):
         """(limits,) margin of each limit, of the measures of every scenario."""
@@ -214,27 +239,28 @@ class Problem:
         """The fields of the Point at z after z itself, of the lanes in `groups` alone; others count nothing."""
         values = {name: np.float64(v) for name, v in self.values(z).items()}
         per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
-        count, share = len(z), sum(self.lanes[i].weight for group in groups for i in group.lanes)
-        gradient, matrix, ruined = np.zeros(count), np.zeros((count, count)), False
-        table, slopes = [None] * len(self.lanes), [None] * len(self.lanes)
+        count, ruined = len(z), False
+        table, slopes, matrices = ([None] * len(self.lanes) for _ in range(3))
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
             ruined = ruined or bool(np.any(broken))
             for j, i in enumerate(group.lanes):
-                weight = self.lanes[i].weight / share
                 table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
                 slopes[i] = {m: np.asarray(v)[j].reshape(-1, count) * per_z for m, v in rates.items()}
-                mine = sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items())
-                gradient = gradient + weight * mine
-                matrix = matrix + weight * self._curvature(np.asarray(curvature)[j] * np.outer(per_z, per_z), table[i], slopes[i])
+                matrices[i] = self._curvature(np.asarray(curvature)[j] * np.outer(per_z, per_z), table[i], slopes[i])
         mine = [limit for limit in self.limits if table[limit.lane] is not None]
         margins = np.array([limit.margin(table[limit.lane]) for limit in mine])
         margin_slopes = np.array([-limit.sign * slopes[limit.lane][limit.measure][limit.index] for limit in mine]).reshape(
             -1, count
         )
         margin_slopes[np.abs(margins) >= NOT_A_NUMBER] = 0.0
-        cost = sum(lane.weight / share * self.cost(row) for lane, row in zip(self.lanes, table) if row is not None)
-        return np.nan if ruined else cost, gradient, matrix, margins, margin_slopes, tuple(row for row in table if row is not None)
+        run = [i for i, row in enumerate(table) if row is not None]
+        costs = np.array([self.cost(table[i]) for i in run])
+        rates = np.array([sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items()) for i in run])
+        shares = self.shares(costs, run)
+        matrix = sum(s * matrices[i] for s, i in zip(shares, run))
+        cost = np.nan if ruined else float(shares @ costs)
+        return cost, shares @ rates, matrix, margins, margin_slopes, tuple(table[i] for i in run), costs, rates
 
     def _squares(self):
         """((measure, weight), ...) of the sums of squares that the Gauss-Newton matrix is made of."""

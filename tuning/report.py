@@ -123,6 +123,7 @@ def json_of(result):
         "optimality": clean(result.optimality),
         "curvature": clean(result.curvature),
         "tradeoff": clean(result.tradeoff),
+        "certificate": None if result.certificate is None else result.certificate._asdict(),
         "wall_s": result.wall_s,
         "bound": None if result.bound is None else clean(result.bound.to_json()),
         "validation": clean(result.validation),

@@ -22,7 +22,8 @@ class TuningResult:
     cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search; curvature, validation: see
     `evidence`; mirrored: the answer's mirror image, see
     `evidence.mirror_of`; choices: what each combination of discrete choices gave;
-    bound: what no law could beat, where asked. case and tuned are the Case before and after.
+    bound: what no law could beat, tradeoff: what a limit costs,
+    certificate: what is known of fresh plants, where asked. case and tuned are the Case before and after.
     """
 
     case: Any
@@ -48,6 +49,7 @@ class TuningResult:
     choices: list = dataclasses.field(default_factory=list)
     bound: Any = None
     tradeoff: Any = None
+    certificate: Any = None
 
     @property
     def success(self):

@@ -41,6 +41,7 @@ def tune(
     objective=None,
     limits=None,
     scenarios=None,
+    risk="mean",
     choices=None,
     starts=8,
     seed=0,
@@ -57,8 +58,9 @@ def tune(
     case: presets Case; method: "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "coarse-trf"
     (trf at a tenth of the samples, then at all), "lbfgs" or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight};
     limits: {measure: value}, {} for none, held in every
-    scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; choices: {static name: [values]}, each combination of
-    which is tuned, the best taken; starts: local searches, from the case's own values and the best distinct ones of `screening` Sobol
+    scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
+    mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
+    local searches, from the case's own values and the best distinct ones of `screening` Sobol
     points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
     adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; log: folder for
     the log of evaluations, with which a killed search is continued by resume=True, to the same bits; progress: called with a dict after
@@ -70,6 +72,7 @@ def tune(
         objective=objective,
         limits=limits,
         scenarios=scenarios,
+        risk=risk,
         starts=starts,
         seed=seed,
         screening=screening,
@@ -84,7 +87,7 @@ def tune(
         return tune_choices(case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
     _check_options(starts=starts, screening=screening, iterations=iterations, batch=batch, validation=validation)
-    problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed)
+    problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed, risk=risk)
     key = jax.random.key(seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
     method = _method(method, problem, batch)
@@ -320,6 +323,7 @@ def fingerprint(problem, method, options):
         "limits": repr([tuple(limit) for limit in problem.limits]),
         "scenarios": repr([(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]),
         "method": method,
+        "risk": problem.risk,
         **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation")},
         "jaxtank": jaxtank.__version__,
         "jax": jax.__version__,

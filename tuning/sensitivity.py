@@ -103,7 +103,7 @@ def sensitivity(
     """Which uncertain parameter moves which measure of a case.
 
     distributions: {dotted name: distribution}; what the case calls uncertain, uniform within its own share, where None; spread: one share
-    for all that the case calls uncertain [-], beside which `distributions` adds or replaces. method: "local": derivative at the case's
+    for all that the case calls uncertain [-], instead of `distributions`. method: "local": derivative at the case's
     own values times half-width of the distribution; "morris": elementary effects over `samples` (32) trajectories, samples (D + 1) runs;
     "sobol": first and total order from `samples` (512) base points, rounded up to a power of 2, samples (D + 2) runs. measures: names,
     those of the case's objective, rms_error_total and max_level where None; seed: of the points and of the sensor noise, which is the same
@@ -165,15 +165,16 @@ def sensitivity(
 
 
 def spread_of(case, distributions=None, spread=None):
-    """{name: distribution} of a study: `distributions`, or what the case calls uncertain, or both where `spread` is given too."""
+    """{name: distribution} of a study: `distributions`, or what the case calls uncertain, within one `spread` or its own."""
     if spread is not None and (isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
-    if distributions is not None and spread is None:
+    if distributions is not None and spread is not None:
+        raise InputError("distributions say what varies, spread how much of the case's own: give one of them")
+    if distributions is not None:
         return dict(distributions)
     if not case.uncertain:
         raise InputError(f"{case.name} names nothing uncertain: say what varies, as --vary plant.drain=uniform:5%")
-    own = {n: Uniform(relative=float(share if spread is None else spread)) for n, share in case.uncertain.items()}
-    return {**own, **(distributions or {})}
+    return {n: Uniform(relative=float(share if spread is None else spread)) for n, share in case.uncertain.items()}
 
 
 def check_measures(case, measures, method):
@@ -240,10 +241,10 @@ class Runs:
 def _column(case, names, k, nominal, y, felt):
     measure, label, unit = entries_of(case, names)[k]
     bad = int(np.sum(~np.isfinite(y)))
-    reason = ""
-    if not np.isfinite(felt["total" if "total" in felt else "mu_star"]).all():
-        reason = "too few runs in which it is finite" if bad else "it does not vary"
-    return Column(measure, label, unit, float(nominal), bad, felt, reason)
+    known, reason = np.isfinite(felt["total" if "total" in felt else "mu_star"]), ""
+    if not known.all():
+        reason = "fewer than 2 samples in which it is finite" if np.min(felt["kept"]) < 2 else "it does not vary"
+    return Column(measure, label, unit, float(nominal), bad, felt, reason, not known.any())
 
 
 def _indices(method, points, y, seed):

@@ -34,7 +34,8 @@ TITLES = {
 }
 WORDS = {
     "local": "effect: derivative at the case's own values times the half-width of the distribution (half its range; "
-    f"{NORMAL_WIDTH:g} standard deviations of a normal one)",
+    f"{NORMAL_WIDTH:g} standard deviations of a normal one); entries that are tied have an effect together and no derivative each; "
+    "no percentage of a measure that is 0",
     "morris": "mu: mean change of the measure over the whole range of the parameter, at random values of the others; mu*: mean size of it; "
     "sigma: its standard deviation (large where it interacts or is curved); intervals of Student",
     "sobol": "first: share of the variance that the parameter has alone; total: with all its interactions; intervals by bootstrap",
@@ -58,8 +59,14 @@ def notes_of(result):
             + ", ".join(f"{label} {count}" for label, count in lost.items())
             + f"; {LOST[result.method]}"
         )
+        short = [c.label for c in result.columns if not c.empty and c.reason]
+        if short:
+            found.append(f"too few finite steps for some parameters: {', '.join(short)}")
     if result.method == "sobol":
-        widest = max((np.ptp(c.felt["total_interval95"], axis=1).max() for c in result.columns if not c.reason), default=0.0)
+        fewest = min((c.felt["kept"] for c in result.columns), default=result.samples)
+        if fewest < result.samples:
+            found.append(f"base points used: {fewest} of {result.samples} where fewest")
+        widest = max((np.ptp(c.felt["total_interval95"], axis=1).max() for c in result.columns if not c.empty), default=0.0)
         if widest > WIDE:
             found.append(f"the widest interval of a total share is {widest:.2g}: more samples would narrow it")
     return found
@@ -104,7 +111,7 @@ def _column_json(result, c):
     extra = {}
     if result.method == "sobol":
         extra = {
-            "variance": report.clean(float(c.felt["variance"])),
+            "sd": report.clean(float(c.felt["sd"])),
             "sum_of_first": report.clean(float(np.sum(c.felt["first"]))),
             "base_points_used": int(c.felt["kept"]),
         }
@@ -138,7 +145,7 @@ def text(result):
     heads = HEADS[result.method]
     for c in result.columns:
         title = f"{c.label} [{c.unit}], {report.number(c.nominal)} in the case's own run"
-        if c.reason:
+        if c.empty:
             parts += [f"{title}: no indices, {c.reason}", ""]
             continue
         rows = [[result.parameters[i], *(_cell(c.felt[q][i]) for q in heads)] for i in result.order(c)[:SHOWN]]
@@ -182,7 +189,7 @@ def figures(result):
     """{"tornado" or "sobol": figure} with one panel for each measure that has indices, at most PANELS of them."""
     from jaxtank import plotting
 
-    shown = [c for c in result.columns if not c.reason][:PANELS]
+    shown = [c for c in result.columns if not c.empty][:PANELS]
     draws = []
     for c in shown:
         order = result.order(c)

@@ -80,6 +80,8 @@ class Search:
 
 def slsqp(search, z, iterations, tolerance=1e-8):
     """Sequential quadratic programming on the exact maxima. Returns True if it converged."""
+    if getattr(search.problem, "risk", "mean") == "worst" and len(search.problem.lanes) > 1:
+        return _epigraph(search, z, iterations, tolerance)
     constraints = []
     if search.problem.limits:
         constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
@@ -93,6 +95,35 @@ def slsqp(search, z, iterations, tolerance=1e-8):
         options={"maxiter": iterations, "ftol": tolerance},
     )
     # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
+    return bool(done.success) or done.status == 8
+
+
+def _epigraph(search, z, iterations, tolerance):
+    """`slsqp` of the worst scenario: t made small under cost_i <= t, which is smooth where the largest cost is not."""
+
+    def known(z):
+        point = search.point(z)
+        return point if point.finite else search.last_finite
+
+    def holds(y):
+        point = known(y[:-1])
+        return np.append(y[-1] - point.lane_costs / search.scale, search.margins(y[:-1])[0])
+
+    def slopes(y):
+        point = known(y[:-1])
+        costs = np.hstack([-point.lane_slopes / search.scale, np.ones((len(point.lane_costs), 1))])
+        rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
+        return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
+
+    done = minimize(
+        lambda y: (y[-1], np.eye(len(y))[-1]),
+        np.append(z, known(z).lane_costs.max() / search.scale),
+        jac=True,
+        method="SLSQP",
+        bounds=[(0.0, 1.0)] * len(z) + [(None, None)],
+        constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
+        options={"maxiter": iterations, "ftol": tolerance},
+    )
     return bool(done.success) or done.status == 8
 
 

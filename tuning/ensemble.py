@@ -1,0 +1,392 @@
+"""The same loop over many draws of what is uncertain: fixed-size batches, running measures only, on one device or many."""
+
+import dataclasses
+import functools
+import math
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from jaxtank import loop as lp
+from jaxtank import measures as ms
+from jaxtank.analysis import steady_flows
+from jaxtank.errors import InputError
+from jaxtank.tree import with_values
+from tuning import parts
+from tuning.distributions import Draws, Uniform
+from tuning.objective import LOWER, resolve_limits
+from tuning.scenarios import noisy
+
+LANES = 256
+"""Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
+
+NOISE = 1 << 27
+"""Bytes of sensor noise that a batch may hold: long noisy runs have smaller batches."""
+
+TAIL = 0.05
+"""Share of the draws that the conditional value at risk is the mean of [-]."""
+
+FAN_DRAWS, FAN_ROWS = 512, 240
+"""Draws and time stamps of a fan chart."""
+
+SUMMARISED = (
+    "rms_error",
+    "rms_error_total",
+    "max_error",
+    "overshoot_percent",
+    "settling_time",
+    "max_level",
+    "min_level",
+    "overflow_volume",
+    "rms_input",
+    "input_travel",
+    "saturated_fraction",
+)
+"""Measures of an ensemble unless others are named."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ensemble:
+    """What `ensemble` gives: N draws and what each came to.
+
+    values: {name: (N, ...)} drawn parameters; measures: {name: (N, ...)}; failed: (N,) True where the run left the numbers; infeasible: (N,)
+    True where some plateau of the reference has no steady state below the rims and within the pumps' limits, None where that is not
+    known in closed form; fan: {"t", "r", "x", "u": quantiles (5, rows, ...)} of the first draws, or None.
+    """
+
+    case: Any
+    distributions: dict
+    labels: list
+    values: dict
+    measures: dict
+    failed: np.ndarray
+    infeasible: np.ndarray | None
+    limits: list
+    fan: dict | None
+    wall_s: float
+    seed: int
+    method: str
+
+    @property
+    def samples(self):
+        """Number of draws N."""
+        return len(self.failed)
+
+    def summary(self):
+        """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
+        or pump where the measure has several. cvar95 and max are of the worse side: the lower one for a level's minimum."""
+        found = {}
+        for name, values in self.measures.items():
+            kept = values[~self.failed]
+            sign = -1.0 if name in LOWER else 1.0
+            if not len(kept):
+                found[name] = {k: None for k in ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")}
+                continue
+            with np.errstate(invalid="ignore"):
+                worst = sign * np.sort(sign * kept, axis=0)[-max(1, math.ceil(TAIL * len(kept))) :]
+                mean, sd = kept.mean(axis=0), kept.std(axis=0, ddof=1) if len(kept) > 1 else np.zeros(kept.shape[1:])
+                p05, p50, p95 = np.quantile(kept, (0.05, 0.5, 0.95), axis=0, method="inverted_cdf")
+                half = 1.959964 * sd / math.sqrt(len(kept))
+                found[name] = {
+                    "mean": mean,
+                    "mean_interval95": [mean - half, mean + half],
+                    "sd": sd,
+                    "p05": p05,
+                    "p50": p50,
+                    "p95": p95,
+                    "cvar95": worst.mean(axis=0),
+                    "max": sign * (sign * kept).max(axis=0),
+                }
+        return found
+
+    def violations(self):
+        """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run that failed counts as breaking it. The
+        intervals are those of Clopper and Pearson."""
+        rows = []
+        for limit in self.limits:
+            values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
+            broken = int(np.sum(self.failed | (limit.sign * (values - limit.value) > 0)))
+            rows.append(
+                {
+                    "name": limit.label,
+                    "limit": limit.value,
+                    "count": broken,
+                    "probability": broken / self.samples,
+                    "interval95": clopper_pearson(broken, self.samples),
+                }
+            )
+        return rows
+
+    def to_json(self):
+        """The JSON object of `jaxtank uncertainty --json`."""
+        from tuning.ensemble_report import json_of
+
+        return json_of(self)
+
+    def save(self, folder):
+        """Write result.json, draws.csv and the pictures to a folder."""
+        from tuning.ensemble_report import save
+
+        return save(self, folder)
+
+    def __repr__(self):
+        from tuning.ensemble_report import text
+
+        return text(self)
+
+
+def clopper_pearson(count, samples, level=0.95):
+    """[low, high]: exact interval of a probability of which `count` of `samples` independent trials speak."""
+    tail = (1.0 - level) / 2
+    low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, samples - count + 1))
+    high = 1.0 if count == samples else float(stats.beta.ppf(1.0 - tail, count + 1, samples - count))
+    return [low, high]
+
+
+def probabilities(method, dimensions, samples, seed):
+    """(samples, dimensions) points of the open unit cube: "random" (the first N are the same whatever N), "latin" or "sobol"."""
+    if method == "random":
+        return np.random.default_rng(seed).random((samples, dimensions)).clip(1e-12, 1 - 1e-12)
+    if method == "latin":
+        return stats.qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(samples)
+    if method == "sobol":
+        return stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(samples).clip(1e-12, 1 - 1e-12)
+    raise InputError(f"draws = {method!r}: must be random, latin or sobol")
+
+
+def spread_of(case, share=None):
+    """{name: Uniform}: what the case calls uncertain, each entry on its own; share: one spread for all, the case's own where None."""
+    if not case.uncertain:
+        raise InputError(f"{case.name} names nothing uncertain: say what varies")
+    return {name: Uniform(relative=own if share is None else share) for name, own in case.uncertain.items()}
+
+
+def ensemble(
+    case,
+    distributions=None,
+    samples=1000,
+    key=0,
+    *,
+    draws="random",
+    measures=None,
+    limits=None,
+    fan=True,
+    lanes=None,
+    devices=1,
+    shard=None,
+    folder=None,
+    resume=False,
+    merge=False,
+    progress=None,
+):
+    """Run a case on `samples` draws of what is uncertain.
+
+    distributions: {dotted name: distribution}, the case's own uncertain parameters where None; key: seed of draws and sensor noise (draw i
+    has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures: names, SUMMARISED where None;
+    limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in a batch; devices: local devices to use; shard:
+    (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them); folder: where finished batches are kept,
+    with which resume=True goes on; merge: run nothing, only join what lies there, and refuse
+    an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its
+    share of the batches and all get the whole. Numbers of a draw do not depend on any of it. Returns an Ensemble (None for a shard).
+    Raises InputError before anything is run.
+    """
+    began = time.perf_counter()
+    for name, value in (("samples", samples), ("key", key), ("devices", devices)):
+        if isinstance(value, bool) or not isinstance(value, int) or not (0 if name == "key" else 1) <= value <= 2**31 - 1:
+            raise InputError(f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to {2**31 - 1}")
+    distributions = spread_of(case) if distributions is None else dict(distributions)
+    space = Draws(case.loop, distributions)
+    held = resolve_limits(case, limits)
+    wanted = tuple(m for m in SUMMARISED if ms.serves(m, case.loop)) if measures is None else tuple(measures)
+    ms.check_names(wanted)
+    wanted = tuple(dict.fromkeys([*wanted, *(limit.measure for limit in held)]))
+    random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
+    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
+    if devices > jax.local_device_count():
+        raise InputError(
+            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices before jax starts)"
+        )
+    lanes = lanes or _lanes(case, random, samples)
+    p = probabilities(draws, space.dimensions, samples, key)
+    count = -(-samples // lanes)
+    store = None
+    if folder is not None:
+        manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
+        store = parts.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1)
+    mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
+    mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
+    todo = [k for k in mine if store is None or not store.has(k)]
+    if merge and todo:
+        raise InputError(
+            f"merge: {len(todo)} of {count} batches are missing in {str(folder)!r}, the first of them number {todo[0]}"
+        )
+    run = _Runner(case, wanted, key if random else None, devices)
+    batches = {}
+    for group in (todo[i : i + devices] for i in range(0, len(todo), devices)):
+        indices = [np.arange(k * lanes, (k + 1) * lanes) for k in group]
+        found = run([_rows(space, p, i) for i in indices], indices)
+        for k, batch in zip(group, found):
+            if store is not None:
+                store.put(k, batch)
+            batches[k] = batch
+        if progress is not None:
+            progress(min(samples, lanes * (len(mine) - len(todo) + len(batches))))
+    if shard is not None:
+        return None
+    for k in mine:
+        if k not in batches:
+            batches[k] = store.get(k)
+    if jax.process_count() > 1:
+        batches = _gather(batches, count)
+    whole = {name: np.concatenate([batches[k][name] for k in range(count)])[:samples] for name in batches[0]}
+    values = space.values(p)
+    return Ensemble(
+        case=case,
+        distributions=distributions,
+        labels=space.labels,
+        values=values,
+        measures={m: whole[m] for m in wanted},
+        failed=whole["failed"] > 0,
+        infeasible=_infeasible(case, values),
+        limits=held,
+        fan=_fan(case, {n: v[:FAN_DRAWS] for n, v in values.items()}, key if random else None) if fan else None,
+        wall_s=time.perf_counter() - began,
+        seed=key,
+        method=draws,
+    )
+
+
+def _lanes(case, random, samples):
+    size = case.clock.samples * case.loop.plant.tanks * 8 if random else 1
+    most = max(1, min(LANES, NOISE // size))
+    return 1 << (min(most, max(1, samples)).bit_length() - 1)
+
+
+def _rows(space, p, indices):
+    """Values of the draws at `indices`, the last draw repeated past the end."""
+    return space.values(p[np.minimum(indices, len(p) - 1)])
+
+
+class _Runner:
+    """A batch on each of `devices` at once, by the program that one device runs alone, on a thread of its own. One program partitioned over
+    the devices (shard_map) rounds the last bit differently from the program of a single device; this does not."""
+
+    def __init__(self, case, names, seed, devices):
+        self.case, self.names, self.seed = case, names, seed
+        self.devices = jax.local_devices()[:devices]
+        self.pool = ThreadPoolExecutor(devices)
+
+    def __call__(self, rows, indices):
+        """[{measure: (lanes, ...), "failed": (lanes,)}] of batches, at most one for each device."""
+        return list(self.pool.map(self._one, self.devices, rows, indices))
+
+    def _one(self, device, rows, indices):
+        values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
+        found = _run(self.case.loop, values, indices, self.seed, self.case.clock, self.names)
+        return {n: np.asarray(v) for n, v in found.items()}
+
+
+@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"))
+def _run(loop, values, indices, seed, clock, names):
+    def one(values, index):
+        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
+        measures, broken = lp.evaluate_and_flag(with_values(loop, values), clock, names, noise)
+        return {**measures, "failed": broken.astype(jnp.result_type(float))}
+
+    return jax.vmap(one)(values, indices)
+
+
+def _gather(batches, count):
+    """The batches of all processes, in order."""
+    from jax.experimental import multihost_utils
+
+    most = -(-count // jax.process_count())
+    template = next(iter(batches.values()))
+    padded = {n: np.stack([batches.get(k, template)[n] for k in _share(count, most)]) for n in template}
+    everywhere = multihost_utils.process_allgather(padded)
+    return {k: {n: v[k % jax.process_count(), k // jax.process_count()] for n, v in everywhere.items()} for k in range(count)}
+
+
+def _share(count, most):
+    return [i * jax.process_count() + jax.process_index() for i in range(most)]
+
+
+def _infeasible(case, values):
+    """(N,) True where a plateau of the reference has no steady state within rims and pumps; None where the plant has no closed form."""
+    plant = case.loop.plant
+    if plant.pipes or plant.pumps != len(plant.outputs) or not hasattr(case.loop.reference, "plateaus"):
+        return None
+    plateaus = jnp.asarray(np.array(case.loop.reference.plateaus(case.clock.duration)))
+    return np.asarray(_no_rest(case.loop, values, plateaus))
+
+
+@jax.jit
+def _no_rest(loop, values, plateaus):
+    def one(values):
+        here = with_values(loop, values)
+
+        def at(y):
+            speeds, u = steady_flows(here.plant, y)
+            levels = speeds * speeds / (2.0 * here.plant.gravity)
+            high = levels > here.plant.rim * (1.0 + 1e-12)
+            return jnp.any(speeds < 0) | jnp.any(high) | jnp.any(u < here.actuator.low) | jnp.any(u > here.actuator.high)
+
+        return jnp.any(jax.vmap(at)(plateaus))
+
+    return jax.vmap(one)(values)
+
+
+def _fan(case, values, seed):
+    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws"}: quantiles 5, 25, 50, 75, 95 % at fixed times."""
+    every, lanes = max(1, (case.clock.samples - 1) // FAN_ROWS), 64
+    size, found = len(next(iter(values.values()))), []
+    for start in range(0, size, lanes):
+        index = np.minimum(np.arange(start, start + lanes), size - 1)
+        rows = {n: v[index] for n, v in values.items()}
+        t, r, x, u = _trajectories(case.loop, rows, index.astype(np.uint32), seed, case.clock, every)
+        keep = min(lanes, size - start)
+        found.append((np.asarray(x)[:keep], np.asarray(u)[:keep]))
+    x, u = (np.concatenate(column) for column in zip(*found))
+    good = np.isfinite(x).all(axis=(1, 2))
+    if not good.any():
+        return None
+    cuts = (0.05, 0.25, 0.5, 0.75, 0.95)
+    return {
+        "t": np.asarray(t)[0],
+        "r": np.asarray(r)[0],
+        "x": np.quantile(x[good], cuts, axis=0),
+        "u": np.quantile(u[good], cuts, axis=0),
+        "draws": int(good.sum()),
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("seed", "clock", "every"))
+def _trajectories(loop, values, indices, seed, clock, every):
+    def one(values, index):
+        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
+        run = lp._simulate(with_values(loop, values), clock, noise, every)[0]
+        return run.t, run.r, run.x, run.u
+
+    return jax.vmap(one)(values, indices)
+
+
+def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
+    leaves, structure = jax.tree.flatten(case.loop)
+    return {
+        "case": case.name,
+        "loop": parts.digest([np.asarray(v) for v in leaves]),
+        "structure": parts.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
+        "clock": repr(case.clock),
+        "distributions": repr(distributions),
+        "samples": samples,
+        "key": key,
+        "draws": draws,
+        "measures": list(wanted),
+        "lanes": lanes,
+        "jax": jax.__version__,
+    }

@@ -1,0 +1,117 @@
+"""Finished batches as files: each whole or not at all, read back without trust."""
+
+import hashlib
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank.errors import InputError
+from jaxtank.files import check_folder, write_atomic
+
+MANIFEST = "manifest.json"
+LARGEST = 1 << 28
+"""Largest batch that is read [bytes], unpacked."""
+
+NAME = re.compile(r"part-(\d{6})\.npz")
+
+
+def digest(arrays):
+    """Hexadecimal digest of arrays, their shapes and types."""
+    found = hashlib.sha256()
+    for a in arrays:
+        found.update(f"{a.dtype.str}{a.shape}".encode() + np.ascontiguousarray(a).tobytes())
+    return found.hexdigest()
+
+
+class Store:
+    """The finished batches of an ensemble in a folder, with a manifest that says what they are of.
+
+    Shards of one ensemble may share a folder: the manifest is the same for all. Raises InputError for a folder that holds another
+    ensemble, and for one that holds batches where neither resume nor shared is True.
+    """
+
+    def __init__(self, folder, manifest, resume=False, shared=False):
+        check_folder(folder)
+        self.folder = Path(folder)
+        self.manifest = json.loads(json.dumps(manifest))
+        path = self.folder / MANIFEST
+        if path.exists():
+            check_same(self.manifest, read_manifest(self.folder), self.folder)
+            if not (resume or shared) and any(self.folder.glob("part-*.npz")):
+                raise InputError(f"{str(folder)!r} holds finished batches of this ensemble: --resume goes on with them")
+        elif resume and not path.exists():
+            raise InputError(f"--resume {str(folder)!r}: there is no ensemble to go on with")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            write_atomic(path, json.dumps(self.manifest, indent=1) + "\n")
+
+    def path(self, k):
+        """The file of batch k."""
+        return self.folder / f"part-{k:06d}.npz"
+
+    def has(self, k):
+        """True if batch k is finished."""
+        return self.path(k).exists()
+
+    def put(self, k, batch):
+        """Write batch k, {name: array}."""
+        out = io.BytesIO()
+        np.savez(out, **batch)
+        write_atomic(self.path(k), out.getvalue())
+
+    def get(self, k):
+        """Batch k as {name: array}. Raises InputError for a file that is not one of ours."""
+        return read_part(self.path(k), set(self.manifest["measures"]) | {"failed"})
+
+    def clear(self):
+        """Remove the batches and the manifest: the result is whole."""
+        for path in [*self.folder.glob("part-*.npz"), self.folder / MANIFEST]:
+            if NAME.fullmatch(path.name) or path.name == MANIFEST:
+                path.unlink(missing_ok=True)
+
+
+def read_part(path, names):
+    """{name: array} of a batch file; nothing is unpickled, and nothing larger than it should be is unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(info.file_size for info in archive.infolist()) > LARGEST:
+                raise InputError(f"{path.name}: unpacks to more than {LARGEST >> 20} MiB, not a batch of this program")
+            if {Path(n).stem for n in archive.namelist()} != names:
+                raise InputError(f"{path.name}: does not hold the measures of the manifest")
+        with np.load(path, allow_pickle=False) as table:
+            return {name: table[name] for name in names}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path.name}: is not a batch of this program ({' '.join(str(error).split())[:80]})") from None
+
+
+def read_manifest(folder):
+    """The manifest of a folder. Raises InputError where there is none, or it is no manifest."""
+    path = Path(folder) / MANIFEST
+    try:
+        if path.stat().st_size > 1 << 20:
+            raise InputError(f"{str(path)!r} is too large to be a manifest")
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
+    except ValueError:
+        raise InputError(f"{str(path)!r} is not a manifest") from None
+    if not isinstance(found, dict):
+        raise InputError(f"{str(path)!r} is not a manifest")
+    return found
+
+
+def check_same(mine, theirs, folder):
+    """Raise InputError, naming what differs, unless two manifests are of one ensemble."""
+    other = [k for k in mine if mine[k] != theirs.get(k)]
+    if other:
+        raise InputError(f"{str(folder)!r} holds another ensemble; what differs: {', '.join(other)}")
+
+
+def missing(folder, count):
+    """The batches of `count` that a folder does not hold."""
+    have = {int(m.group(1)) for m in (NAME.fullmatch(p.name) for p in Path(folder).glob("part-*.npz")) if m}
+    return [k for k in range(count) if k not in have]
