@@ -2,7 +2,7 @@
 
     python tests/benchmarks/tuning_table.py               # every row; an hour or two on two cores
     python tests/benchmarks/tuning_table.py 'khalid*'     # some, by name
-    python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone
+    python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone; --rows for rows alone
     python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into the README
 
 Rows and bounds are those of tuning_rows.py. Each is stored in tuning_table.json as soon as it is done, with the versions it was made with.
@@ -22,10 +22,12 @@ import jaxtank  # noqa: F401  (before jax starts)
 import tuning
 from jaxtank.files import write_atomic
 from tuning import search
+from tuning.result import constraint_rows
 
 HERE = Path(__file__).parent
 STORE, README = HERE / "tuning_table.json", HERE.parents[1] / "README.md"
 BEGIN, END = "<!-- tests/benchmarks/tuning_table.py -->", "<!-- end of tuning table -->"
+SIDES = ("before", "after")
 VERSIONS = ("jaxtank", "python", "jax", "jaxlib", "numpy", "scipy", "optax", "dtype", "xla_option")
 
 
@@ -48,8 +50,8 @@ def held_out(row, result):
             "limits_held": found["limits_held"],
         }
     problem = tuning.Problem(result.case, free=row.free, objective=row.objective, limits=row.limits, scenarios=row.held())
-    rows = {side: [{n: p[side] for n, p in result.parameters.items()}] for side in ("before", "after")}
-    points = np.array([[float(b.to_unit(rows[side][0][b.name])) for b in problem.bounds] for side in ("before", "after")])
+    rows = {side: [{n: p[side] for n, p in result.parameters.items()}] for side in SIDES}
+    points = np.array([[float(b.to_unit(rows[side][0][b.name])) for b in problem.bounds] for side in SIDES])
     costs, margins = problem.screen(points)
     return {
         "runs": len(problem.lanes),
@@ -88,8 +90,8 @@ def measure(name):
         "choices": result.choices,
         "chosen": choice[0]["values"] if choice else {},
         "objective": {**result.objective, "unit": row.unit, "target": row.target and float(row.target)},
-        "limits": worst(result.constraints),
-        "levels": {side: levels(result.measures[side]) for side in ("before", "after")},
+        "limits": {"before": worst(constraint_rows(result.problem, result.tables["before"])), "after": worst(result.constraints)},
+        "levels": {side: levels(result.measures[side]) for side in SIDES},
         "length": result.case.loop.plant.units[0],
         "held_out": held_out(row, result),
         "bound": row.bound,
@@ -149,9 +151,6 @@ def _free(row):
         units[base] = p["unit"]
     shown = []
     for base, values in arrays.items():
-        if len(values) > 4:
-            shown.append(f"{base} ({len(values)} entries)")
-            continue
         sides = [", ".join(f"{v:.3g}" for v in side) for side in zip(*values)]
         shown.append(f"{base} {sides[0]} → {sides[1]}{' ' + units[base] if units[base] not in ('', '-') else ''}")
     shown += [f"{n.removeprefix('controller.')} = {v}" for n, v in row["chosen"].items()]
@@ -159,24 +158,40 @@ def _free(row):
 
 
 def _limits(row):
-    side, limit = row["levels"], row["limits"]
-    per = 100.0 if row["length"] == "m" else 1.0
-    if limit is not None:
-        factor = 100.0 if limit["unit"] == "m" else 1.0
-        return f"passed by {factor * limit['violation']:.3f} {'cm' if limit['unit'] in ('m', 'cm') else limit['unit']}"
+    side, metres = row["levels"], row["length"] == "m"
+    if row["limits"]["after"] is not None:
+        return f"passed by {_passed(row, 'before')} → {_passed(row, 'after')}"
     if side["before"]["lost"] > 0:
-        return "rims are physics; lost {:.0f} → {:.0f} cm^3".format(*(per**3 * side[s]["lost"] for s in ("before", "after")))
-    return "none; highest {:.1f} → {:.1f} cm".format(*(per * side[s]["highest"] for s in ("before", "after")))
+        return "rims are physics; lost {:.0f} → {:.0f} cm^3".format(*(1e6**metres * side[s]["lost"] for s in SIDES))
+    return "none; highest {:.1f} → {:.1f} cm".format(*(100**metres * side[s]["highest"] for s in SIDES))
+
+
+def _passed(row, side):
+    limit = row["limits"][side]
+    factor, unit = {"m": (1e2, "cm"), "m^3": (1e6, "cm^3")}.get(limit["unit"], (1.0, limit["unit"]))
+    return f"{factor * limit['violation']:.3f} {unit}"
+
+
+def _objective(row):
+    aim, start = row["objective"], row["limits"]["before"]
+    change = f"{100 * (aim['after'] / aim['before'] - 1):+.2g} %".replace("-", "−")
+    if start is not None and start["violation"] > 0:
+        change = "the first passes a limit"
+    return f"{_pair(aim['before'], aim['after'])} {aim['unit']} ({change})"
 
 
 def _held(row):
     found = row["held_out"]
-    return _pair(found["before"], found["after"]) if found else "-"
+    if not found:
+        return "-"
+    shares = [100 * float(found["limits_held"][s]) for s in SIDES]
+    kept = "" if row["limits"]["after"] is None or min(shares) == 100 else "; limits hold in {:.0f} → {:.0f} %".format(*shares)
+    return _pair(found["before"], found["after"]) + kept
 
 
 def _bound(row, bounds):
     found = bounds.get(row["bound"])
-    return "-" if found is None else f"{found['cost']:.3g}"
+    return "-" if found is None else f"{found['cost']:.4g}"
 
 
 def markdown(stored):
@@ -184,12 +199,10 @@ def markdown(stored):
     heads = ("row", "published → tuned", "objective", "limits at the true step", "unseen plants and noise", "bound", "s")
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in stored["rows"].items():
-        aim = row["objective"]
-        change = 100 * (aim["after"] / aim["before"] - 1)
         cells = [
             name,
             _free(row),
-            f"{_pair(aim['before'], aim['after'])} {aim['unit']} ({change:+.1f} %)".replace("-", "−"),
+            _objective(row),
             _limits(row),
             _held(row),
             _bound(row, stored["bounds"]),
@@ -220,6 +233,8 @@ def main(words):
             keep("rows", name, found)
             aim = found["objective"]
             print(f"{name}: {_pair(aim['before'], aim['after'])}, {found['status']}, {found['wall_s']:.0f} s", flush=True)
+    if "--rows" in words:
+        return
     needed = picked(patterns, BOUNDS) if "--bounds" in words else {ROWS[n].bound for n in picked(patterns, ROWS)} - {None}
     for name in sorted(set(needed) - (set() if "--bounds" in words else set(load()["bounds"]))):
         found = best_inputs(name)
