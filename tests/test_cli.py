@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jaxtank
+import tuning
 from jaxtank import measures, presets, rig
 from jaxtank.records import Clock
 from jaxtank.tree import parameters
@@ -403,7 +404,10 @@ def test_scenarios_choices_trade_off_and_bound_from_the_command_line(here):
     more = ("--choose", "controller.reference_rates=false,true", "--tradeoff", "max_level=24:28:2", "--bound", "--validation", "4")
     said = done("tune", CASE, *SHORT, *SEARCH, *scenarios, *more, "--json", "--quiet", "--out", "out", "--starts", "1")
     found = said.json
-    assert [(s["name"], round(s["weight"], 6)) for s in found["scenarios"]] == [("noise", 0.666667), ("reference.ramp=40;seed=5", 0.333333)]
+    assert [(s["name"], round(s["weight"], 6)) for s in found["scenarios"]] == [
+        ("noise", 0.666667),
+        ("reference.ramp=40;seed=5", 0.333333),
+    ]
     assert [row["values"] for row in found["choices"]] == [{"controller.reference_rates": v} for v in (False, True)]
     assert [p["limit"] for p in found["tradeoff"]["points"]] == [28.0, 24.0] and found["validation"]["samples"] == 4
     assert 0 < found["bound"]["cost"] < found["objective"]["after"]
@@ -641,3 +645,80 @@ def test_a_reader_that_has_left_is_no_error():
     ran = shell("-m", "jaxtank", "list", stdout=writer)
     os.close(writer)
     assert (ran.returncode, ran.stderr) == (0, "")
+
+
+# uncertainty
+
+DRAWS = ("--samples", "24", "--vary", "plant.drain=uniform:5%", "--vary", "controller.k1=normal:0.1:0.01")
+
+
+def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_library(gouta):
+    found = done("uncertainty", CASE, *SHORT, *DRAWS, "--seed", "2", "--json", "--quiet").json
+    assert set(found) >= {"case", "samples", "failed", "measures", "violations", "provenance"} and found["samples"] == 24
+    for summary in found["measures"].values():
+        assert set(summary) >= {"mean", "sd", "p05", "p50", "p95", "cvar95", "max"}
+    assert all(set(v) >= {"name", "limit", "count", "probability", "interval95"} for v in found["violations"])
+    vary = {"plant.drain": tuning.Uniform(relative=0.05), "controller.k1": tuning.Normal(mean=0.1, sd=0.01)}
+    own = tuning.ensemble(gouta("backstepping", OVERRIDES), vary, samples=24, key=2).summary()
+    assert found["measures"]["rms_error_total"]["p95"] == own["rms_error_total"]["p95"]
+    assert found["measures"]["max_level"]["max"] == own["max_level"]["max"].tolist()
+
+
+def test_uncertainty_in_shards_is_that_of_one_run(here):
+    one = done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--json", "--out", "one").json
+    assert {p.name for p in (here / "one").iterdir()} == {"result.json", "draws.csv", "fan.png", "violations.png"}
+    for picture in (here / "one").glob("*.png"):
+        assert_picture(picture)
+    said = say("merge", CASE, *SHORT, *DRAWS, "--out", "two")
+    assert said.code == 2 and "no ensemble" in said.err
+    done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "two", "--shard", "1/1")
+    joined = done("merge", CASE, *SHORT, *DRAWS, "--out", "two", "--quiet", "--json").json
+    assert joined | {"wall_s": 0} == one | {"wall_s": 0}
+    rows = (here / "one" / "draws.csv").read_text().splitlines()
+    assert len(rows) == 25 and rows[0].startswith('"draw","failed","plant.drain[0]"')
+    assert not list((here / "two").glob("part-*")) and not (here / "two" / "manifest.json").exists()
+
+
+def test_robust_tuning_from_the_command_line():
+    options = (
+        "--robust",
+        "worst",
+        "--samples",
+        "4",
+        "--spread",
+        "0.02",
+        "--limit",
+        "max_level=33",
+        "--free",
+        "controller.k1=0.01:1",
+    )
+    found = done("tune", CASE, *SHORT, *options, *SEARCH, "--starts", "1", "--validation", "0", "--json", "--quiet").json
+    assert found["certificate"]["scenarios"] == 4 and found["certificate"]["fresh"] == 1024 and len(found["scenarios"]) == 4
+    assert all(c["margin"] >= 0 for c in found["constraints"]) and len(found["constraints"]) == 16
+
+
+@pytest.mark.parametrize(
+    "args, words",
+    [
+        (("uncertainty", CASE, "--samples", "0"), "--samples '0'"),
+        (("uncertainty", CASE, "--vary", "plant.drian=uniform:5%"), "plant.drain"),
+        (("uncertainty", CASE, "--vary", "plant.drain=beta:1"), "must be uniform:LOW:HIGH"),
+        (("uncertainty", CASE, "--vary", "plant.drain=uniform:200%"), "at least 0 cm^2"),
+        (("uncertainty", CASE, "--vary", "plant.drain=uniform:5%", "--spread", "0.1"), "give one of them"),
+        (("uncertainty", CASE, "--spread", "2"), "--spread '2'"),
+        (("uncertainty", CASE, "--draws", "halton"), "random, latin or sobol"),
+        (("uncertainty", CASE, "--measure", "rms"), "unknown measure 'rms'"),
+        (("uncertainty", CASE, "--shard", "1/2"), "--out DIR"),
+        (("uncertainty", CASE, "--shard", "3/2", "--out", "o"), "--shard '3'"),
+        (("uncertainty", CASE, "--resume", "nothing"), "no ensemble to go on with"),
+        (("uncertainty", CASE, "--devices", "0"), "--devices '0'"),
+        (("merge", CASE), "--out DIR"),
+        (("tune", CASE, "--samples", "8"), "belong to --robust"),
+        (("tune", CASE, "--robust", "best"), "risk = 'best'"),
+        (("tune", CASE, "--robust", "mean", "--scenario", "sensor.noise=0.1"), "scenarios of its own"),
+    ],
+)
+def test_bad_uncertainty_is_told_in_one_line(args, words, here):
+    said = say(*args)
+    assert said.code == 2 and said.out == "" and said.err.count("\n") == 1 and words in said.err, said.err
+    assert not list(here.iterdir())
