@@ -407,7 +407,10 @@ def _distributions(args, case):
     if args.vary and args.spread is not None:
         raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
     if args.vary:
-        return dict(_pair_of(text, parse) for text in args.vary)
+        varied = [_pair_of(text, parse) for text in args.vary]
+        if len({name for name, _ in varied}) < len(varied):
+            raise InputError("--vary: a parameter is given twice")
+        return dict(varied)
     if args.spread is None:
         return None
     share = _number("--spread", args.spread)
@@ -646,8 +649,8 @@ def _written(paths, args):
 def _sensitivity(args):
     _out(args)
     seed, case = _seed(args), _open(args)
+    varied = _distributions(args, case)
     from tuning import report, sensitivity_report
-    from tuning.distributions import parse
     from tuning.sensitivity import MOST, sensitivity
 
     terminal, told = sys.stderr.isatty(), [0]
@@ -659,16 +662,12 @@ def _sensitivity(args):
         start, end = ("\r", "") if terminal else ("", "\n")
         print(f"{start}run {done}/{total}", end=end, file=sys.stderr, flush=True)
 
-    varied = [_pair("--vary", text, str) for text in args.vary]
-    if len({name for name, _ in varied}) < len(varied):
-        raise InputError("--vary: a parameter is given twice")
     result = sensitivity(
         case,
-        {name: parse(name, text) for name, text in varied} or None,
+        varied,
         method=args.method,
         measures=args.measure or None,
         samples=None if args.samples is None else _whole("--samples", args.samples, 1, MOST),
-        spread=None if args.spread is None else _number("--spread", args.spread),
         seed=seed,
         progress=progress,
     )

@@ -13,8 +13,9 @@ from jaxtank.errors import InputError, unknown
 from jaxtank.tree import get_value
 from tuning import indices
 from tuning import scenarios as sc
-from tuning.distributions import Correlated, Draws, Uniform
+from tuning.distributions import Correlated, Draws
 from tuning.effects import Column, entries_of, local_columns
+from tuning.ensemble import spread_of
 
 METHODS = ("local", "morris", "sobol")
 
@@ -113,7 +114,7 @@ def sensitivity(
     began = time.perf_counter()
     if method not in METHODS:
         raise unknown("method", method, METHODS)
-    given = spread_of(case, distributions, spread)
+    given = what_varies(case, distributions, spread)
     draws = Draws(case.loop, given)
     if not draws.dimensions:
         raise InputError("nothing moves: a relative spread leaves zeros alone, and all values are zero")
@@ -164,17 +165,13 @@ def sensitivity(
     )
 
 
-def spread_of(case, distributions=None, spread=None):
+def what_varies(case, distributions=None, spread=None):
     """{name: distribution} of a study: `distributions`, or what the case calls uncertain, within one `spread` or its own."""
     if spread is not None and (isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
     if distributions is not None and spread is not None:
         raise InputError("distributions say what varies, spread how much of the case's own: give one of them")
-    if distributions is not None:
-        return dict(distributions)
-    if not case.uncertain:
-        raise InputError(f"{case.name} names nothing uncertain: say what varies, as --vary plant.drain=uniform:5%")
-    return {n: Uniform(relative=float(share if spread is None else spread)) for n, share in case.uncertain.items()}
+    return spread_of(case, spread) if distributions is None else dict(distributions)
 
 
 def check_measures(case, measures, method):
