@@ -133,14 +133,15 @@ def test_integral_action_beats_tuned_state_feedback_before_it_is_tuned():
     assert integral["before"] < proportional["after"]
 
 
-# least gains of spec D [%]: without limits, and with the price of overshoot that makes the rest felt
+# least gains of spec D [%]: without limits, and with the price of overshoot that makes the rest felt. Spec D prices the first rise
+# alone and has 6.3 % there; here the falls are priced too
 @SLOW
 @pytest.mark.parametrize(
     "name, least",
     [
         ("khalid-laguerre", 11.0),
-        ("khalid-clipped-priced", 6.3),
-        ("khalid-constrained-priced", 6.3),
+        ("khalid-clipped-priced", 6.1),
+        ("khalid-constrained-priced", 6.1),
         ("khalid-mimo", 31.0),
         ("khalid-mimo-constrained", 1.5),
         ("khalid-mimo-constrained-M3", 22.5),
