@@ -35,7 +35,7 @@ TITLES = {
 WORDS = {
     "local": "effect: derivative at the case's own values times the half-width of the distribution (half its range; "
     f"{NORMAL_WIDTH:g} standard deviations of a normal one); entries that are tied have an effect together and no derivative each; "
-    "no percentage of a measure that is 0",
+    "no percentage of a measure that is 0; at a kink (travel of a pump that rests, a maximum reached twice) a slope is of one side",
     "morris": "mu: mean change of the measure over the whole range of the parameter, at random values of the others; mu*: mean size of it; "
     "sigma: its standard deviation (large where it interacts or is curved); intervals of Student",
     "sobol": "first: share of the variance that the parameter has alone; total: with all its interactions; intervals by bootstrap",
@@ -82,7 +82,8 @@ def json_of(result):
         "runs": result.runs,
         "failed": result.failed,
         "distributions": {
-            n: {"kind": type(d).__name__, **report.clean(dataclasses.asdict(d))} for n, d in result.distributions.items()
+            n: {"kind": type(d).__name__, **{k: v for k, v in dataclasses.asdict(d).items() if v is not None}}
+            for n, d in result.distributions.items()
         },
         "parameters": {
             n: {
