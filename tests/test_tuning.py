@@ -14,6 +14,7 @@ from tuning import objective
 from tuning.memo import Memo
 from tuning.objective import Limit, Point, Problem
 from tuning.screening import coarse_clock, distinct_starts, screen, sobol, spectral_radius
+from tuning.search import run_measures
 from tuning.solvers import METHODS, Search, optimality
 
 LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
@@ -327,7 +328,7 @@ def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(gouta, tmp
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
     table = json.loads((tmp_path / "out" / "result.json").read_text())
     case = rig.load(tmp_path / "out" / "rig.toml")
-    values = jaxtank.evaluate(case.loop, case.clock, "rms_error_total")
+    values = run_measures(case.loop, case.clock, None)  # the same program: one of other measures may differ in the last bit
     assert float(values["rms_error_total"]) == table["objective"]["after"]
     rows = np.genfromtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", names=True, deletechars="")
     assert np.asarray(rows["h3_[cm]"]).max() <= 30.0 and rows["t_[s]"][-1] == 400.0
