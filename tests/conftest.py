@@ -1,4 +1,6 @@
-"""Everything here runs in float64; a test of float32 says so and runs in a process of its own."""
+"""Everything here runs in float64; a test of float32 says so and runs in a process of its own. What slow.txt lists is marked slow."""
+
+from pathlib import Path
 
 import jax
 import pytest
@@ -6,6 +8,17 @@ import pytest
 import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 
 jax.config.update("jax_enable_x64", True)
+
+
+SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if line and not line.startswith("#")}
+
+
+@pytest.hookimpl(tryfirst=True)  # before the marker is looked for
+def pytest_collection_modifyitems(items):
+    """Mark the tests of slow.txt."""
+    for item in items:
+        if f"{item.path.name}::{item.name}" in SLOW:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="session")

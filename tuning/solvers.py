@@ -16,6 +16,9 @@ STEEPEST = 10.0
 """Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
 
 
+STILL, LONG = 1e-9, 25
+"""Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a line search never ends by itself [-]."""
+
 ROUGHLY = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
@@ -85,17 +88,43 @@ def slsqp(search, z, iterations, tolerance=1e-8):
     constraints = []
     if search.problem.limits:
         constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
-    done = minimize(
-        search.cost,
-        z,
-        jac=True,
-        method="SLSQP",
-        bounds=[(0.0, 1.0)] * len(z),
-        constraints=constraints,
-        options={"maxiter": iterations, "ftol": tolerance},
-    )
+    try:
+        done = minimize(
+            _Watch(search),
+            z,
+            jac=True,
+            method="SLSQP",
+            bounds=[(0.0, 1.0)] * len(z),
+            constraints=constraints,
+            options={"maxiter": iterations, "ftol": tolerance},
+        )
+    except _Settled:
+        return True
     # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
     return bool(done.success) or done.status == 8
+
+
+class _Settled(Exception):
+    """The best point is as good as the cost can tell."""
+
+
+class _Watch:
+    """`Search.cost`, until points within the limits have not become better for long."""
+
+    def __init__(self, search):
+        self.search, self.least, self.since = search, np.inf, 0
+
+    def __call__(self, z):
+        found = self.search.cost(z)
+        point = self.search.point(z)
+        if point.finite:
+            held = self.search.violation(point) == 0
+            better = held and found[0] < self.least - STILL * abs(self.least if np.isfinite(self.least) else 0.0)
+            self.since = 0 if better or not np.isfinite(self.least) else self.since + 1
+            self.least = min(self.least, found[0]) if held else self.least
+        if self.since > LONG:
+            raise _Settled
+        return found
 
 
 def _epigraph(search, z, iterations, tolerance):
