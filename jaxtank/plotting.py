@@ -268,14 +268,22 @@ def fan(loop, bands, title):
     """
     tanks, rims = loop.plant.tanks, np.asarray(loop.plant.rim)
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(-(-tanks // 2), min(2, tanks), figsize=(9.6, 2.7 * -(-tanks // 2)), sharex=True, layout="constrained", squeeze=False)
+        rows, columns = -(-tanks // 2), min(2, tanks)
+        figure, axes = plt.subplots(rows, columns, figsize=(9.6, 2.7 * rows), sharex=True, layout="constrained", squeeze=False)
         for i, ax in enumerate(axes.ravel()[:tanks]):
             low, first, middle, third, high = bands["x"][:, :, i]
             ax.fill_between(bands["t"], low, high, color="#0072B2", alpha=0.2, linewidth=0, label="5 to 95 %")
             ax.fill_between(bands["t"], first, third, color="#0072B2", alpha=0.35, linewidth=0, label="25 to 75 %")
             ax.plot(bands["t"], middle, color="#0072B2", linewidth=1.2, label="median")
             if i in loop.plant.outputs:
-                ax.plot(bands["t"], bands["r"][:, loop.plant.outputs.index(i)], color="black", linewidth=0.8, linestyle="--", label="setpoint")
+                ax.plot(
+                    bands["t"],
+                    bands["r"][:, loop.plant.outputs.index(i)],
+                    color="black",
+                    linewidth=0.8,
+                    linestyle="--",
+                    label="setpoint",
+                )
             if high.max() > 0.5 * rims[i]:
                 ax.axhline(rims[i], color="#D55E00", linewidth=1.0, label="rim")
             ax.set_title(f"tank {i + 1}")

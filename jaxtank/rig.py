@@ -25,6 +25,15 @@ max_level = "rim"
 
 [objective]                  # what it makes small: measure = weight
 rms_error_total = 1.0
+
+[uncertain]                  # spread of the plant's parameters, as a share: what answers are validated on
+"plant.drain" = 0.05
+
+[[scenario]]                 # runs that `tune` judges by, instead of the case's own; scenario = [] at the top: none
+name = "noisy"
+seed = 1
+weight = 2.0
+values = { "sensor.noise" = 0.02, "reference.ramp" = 40.0 }
 """
 
 import dataclasses
@@ -42,12 +51,14 @@ from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
 from jaxtank.measures import check_names, entries
 from jaxtank.measures import unit as measure_unit
-from jaxtank.presets.base import Case, Free
+from jaxtank.presets.base import Case, Free, Scenario
 from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.signals import Ramps, ramps
 from jaxtank.tree import _short, check_value, describe, get_value, is_component, walk, with_values
 
-TABLES = ("case", "name", "values", "reference", "schedule", "limits", "free", "objective")
+TABLES = ("case", "name", "values", "reference", "schedule", "limits", "free", "objective", "uncertain", "scenario")
+KINDS = {"case": (str, "a text"), "name": (str, "a text"), "scenario": (list, "a list of tables, [[scenario]]")}
+SCENARIO_KEYS = ("name", "values", "seed", "weight")
 REFERENCE_KEYS = ("initial", "changes", "ramp", "shape", "band")
 
 
@@ -78,9 +89,9 @@ def from_table(table):
     for key, value in table.items():
         if key not in TABLES:
             raise unknown("key", key, TABLES)
-        wanted = str if key in ("case", "name") else dict
+        wanted, words = KINDS.get(key, (dict, "a table"))
         if not isinstance(value, wanted):
-            raise InputError(f"{key} = {_short(value)}: must be {'a text' if wanted is str else 'a table'}")
+            raise InputError(f"{key} = {_short(value)}: must be {words}")
     if "case" not in table:
         raise InputError('a rig file needs case = "paper/case" to start from; `jaxtank list` prints them')
     case = presets.find(table["case"])
@@ -94,7 +105,42 @@ def from_table(table):
         case = case.replace(objective=check_objective(table["objective"]))
     if "free" in table:
         case = case.replace(free={name: _free(case.loop, name, spec) for name, spec in table["free"].items()})
+    if "uncertain" in table:
+        case = case.replace(uncertain=check_uncertain(case.loop, table["uncertain"]))
+    if "scenario" in table:
+        case = case.replace(scenarios=tuple(_scenario(case, entry, i) for i, entry in enumerate(table["scenario"])))
     return check(case)
+
+
+def check_uncertain(loop, uncertain):
+    """`uncertain` as a dict, if every one is a parameter in use with a spread above 0 and below 1."""
+    for name, share in uncertain.items():
+        get_value(loop, name)
+        if not (_is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
+            raise InputError(f"uncertain {name} = {_short(share)}: must be a share between 0 and 1")
+    return {name: float(share) for name, share in uncertain.items()}
+
+
+def _scenario(case, entry, index):
+    """The Scenario of one [[scenario]] table, if it can be run."""
+    if not isinstance(entry, dict):
+        raise InputError(f"scenario {index + 1} = {_short(entry)}: must be a table")
+    for key in entry:
+        if key not in SCENARIO_KEYS:
+            raise unknown("key of [[scenario]]", key, SCENARIO_KEYS)
+    name, values = entry.get("name", f"scenario {index + 1}"), entry.get("values", {})
+    seed, weight = entry.get("seed", 0), entry.get("weight", 1.0)
+    if not isinstance(name, str) or not isinstance(values, dict):
+        raise InputError(f"scenario {index + 1}: name must be a text, and values a table")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError(f"scenario {name!r}: seed = {_short(seed)} must be a whole number from 0 to {2**31 - 1}")
+    if not _is_numeric(weight) or np.ndim(weight) or not (np.isfinite(weight) and weight > 0):
+        raise InputError(f"scenario {name!r}: weight = {_short(weight)} must be a finite number above 0")
+    try:
+        set_values(case, values)
+    except InputError as error:
+        raise type(error)(f"scenario {name!r}: {error}") from None
+    return Scenario(name, {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}, seed, float(weight))
 
 
 def check_limits(loop, limits):
@@ -195,7 +241,7 @@ def set_and_schedule(case, values, table):
 def dump(case):
     """The complete rig file of `case` as text: every leaf, every static field that a file may set, reference, limits, free, objective."""
     table = scheduling.table_of(case.loop)
-    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", ""]
+    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", *([] if case.scenarios else ["scenario = []"]), ""]
     lines += ["[schedule]", *(f"{key} = {_toml(value)}" for key, value in table.items()), ""] if table else []
     lines += ["[values]"]
     whole = ("controller.knots", "controller.variable") if table else ()
@@ -227,6 +273,11 @@ def dump(case):
     ]
     lines += ["", "[free]"] + [f"{_toml(n)} = {_toml(list(Free(*spec)))}" for n, spec in case.free.items()]
     lines += ["", "[objective]"] + [f"{m} = {_toml(float(w))}" for m, w in case.objective.items()]
+    lines += ["", "[uncertain]"] + [f"{_toml(n)} = {_toml(float(v))}" for n, v in case.uncertain.items()]
+    for s in case.scenarios:
+        inside = ", ".join(f"{_toml(n)} = {_toml(v)}" for n, v in s.values.items())
+        lines += ["", "[[scenario]]", f"name = {_toml(s.name)}", f"seed = {s.seed}", f"weight = {_toml(float(s.weight))}"]
+        lines += [f"values = {{ {inside} }}" if inside else "values = {}"]
     return "\n".join(lines) + "\n"
 
 

@@ -15,9 +15,9 @@ SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitl
 
 @pytest.hookimpl(tryfirst=True)  # before the marker is looked for
 def pytest_collection_modifyitems(items):
-    """Mark the tests of slow.txt."""
+    """Mark the tests of slow.txt: one set of parameters, or all where none is named."""
     for item in items:
-        if f"{item.path.name}::{item.name}" in SLOW:
+        if SLOW & {f"{item.path.name}::{item.name}", f"{item.path.name}::{item.originalname}"}:
             item.add_marker(pytest.mark.slow)
 
 

@@ -93,7 +93,6 @@ def test_numbers_go_through_a_log_without_loss(tmp_path):
     result = (np.nan, np.array([[0.1, -np.inf], [5e-324, -0.0]]), ({"a": np.array([1 / 3])},), np.zeros((0, 2)))
     log = Log(tmp_path, {"p": 1})
     first = log.recall("x", [np.arange(2.0)], lambda: result)
-    log.close()
     again = Log(tmp_path, {"p": 1}, resume=True).recall("x", [np.arange(2.0)], lambda: pytest.fail("run again"))
     for a, b in ((first, result), (again, result)):
         assert np.isnan(a[0]) and a[3].shape == (0, 2)

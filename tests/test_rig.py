@@ -334,3 +334,34 @@ def test_a_file_is_replaced_whole_and_leaves_no_other(gouta, tmp_path):
     rig.save(gouta("backstepping"), path)
     assert path.read_text(encoding="utf-8") == rig.dump(gouta("backstepping"))
     assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
+
+
+def test_scenarios_and_what_is_uncertain_go_through_a_file(tmp_path):
+    for name in ("mirakhorli/sfc", "calofir/backstepping", "gouta2015/ngpc"):
+        case = presets.find(name)
+        back = round_trip(case, tmp_path)
+        assert back.scenarios == case.scenarios and dict(back.uncertain) == dict(case.uncertain)
+    case = presets.find("gouta2022/chadpc").replace(scenarios=(), uncertain={"plant.drain": 0.3})
+    back = round_trip(case, tmp_path)
+    assert back.scenarios == () and back.uncertain == {"plant.drain": 0.3}
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ('scenario = "x"', "scenario = 'x': must be a list of tables"),
+        ("scenario = [3]", "scenario 1 = 3: must be a table"),
+        ("[[scenario]]\nvalue = 3", "unknown key of [[scenario]] 'value'; nearest: values"),
+        ('[[scenario]]\nvalues = { "plant.drian" = 1.0 }', "unknown parameter 'plant.drian'; nearest: plant.drain"),
+        ('[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }', "scenario 'a': sensor.noise[0] = -1 cm"),
+        ("[[scenario]]\nseed = 1.5", "seed = 1.5 must be a whole number"),
+        ("[[scenario]]\nweight = 0.0", "weight = 0.0 must be a finite number above 0"),
+        ('[uncertain]\n"plant.drain" = 2.0', "uncertain plant.drain = 2.0: must be a share between 0 and 1"),
+        ('[uncertain]\n"plant.drian" = 0.1', "unknown parameter 'plant.drian'"),
+    ],
+)
+def test_scenarios_and_spreads_that_cannot_be_used(text, words, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(HEAD + text + "\n", encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(words)):
+        rig.load(path)

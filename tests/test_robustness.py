@@ -1,5 +1,7 @@
 """gouta2015 sec. 5.3: what the laws make of coefficients that are off (spec 11), with intervals."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -34,17 +36,17 @@ def coefficients(plant, spread):
     }
 
 
+def error(case, values):
+    return lp.evaluate_and_flag(with_values(case.loop, values), case.clock, ("rms_error_total",))[0]["rms_error_total"]
+
+
 @pytest.fixture(scope="module")
 def errors(gouta):
     """{(law, spread): (N,) total RMS errors [cm]}, and those of the nominal plant as {law: number}."""
     found, nominal = {}, {}
     for law in ("ngpc", "backstepping"):
         case = gouta(law, {"reference.ramp": 30.0, "clock.dt": 0.02})
-        run = jax.jit(
-            jax.vmap(
-                lambda v: lp.evaluate_and_flag(with_values(case.loop, v), case.clock, ("rms_error_total",))[0]["rms_error_total"]
-            )  # noqa: B023
-        )
+        run = jax.jit(jax.vmap(functools.partial(error, case)))
         nominal[law] = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
         for spread in (0.05, 0.10):
             found[law, spread] = np.asarray(run(coefficients(case.loop.plant, spread)))

@@ -46,13 +46,11 @@ class Log(Memo):
         self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 1, "problem": problem}, sort_keys=True)
         whole = self._read(head) if resume else b""
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.file = open(self.path, "r+b" if whole else "wb")  # noqa: SIM115  (open for the life of the search)
-        if whole:
-            self.file.seek(len(whole))
-            self.file.truncate()
-        else:
-            self.file.write(head.encode() + b"\n")
-        self.file.flush()
+        with open(self.path, "r+b" if whole else "wb") as file:
+            if whole:
+                file.truncate(len(whole))
+            else:
+                file.write(head.encode() + b"\n")
         self.resumed = len(self.found)
 
     def _read(self, head):
@@ -84,13 +82,12 @@ class Log(Memo):
 
     def keep(self, kind, key, result):
         text = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]})
-        self.file.write(text.encode() + b"\n")
-        self.file.flush()
+        with open(self.path, "ab") as file:
+            file.write(text.encode() + b"\n")
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
 
-    def close(self):
-        """End the file; returns a Memo of what it holds, for what is asked later."""
-        self.file.close()
+    def memo(self):
+        """A Memo of what the log holds, for what is asked later and need not be kept."""
         memo = Memo()
         memo.found = self.found
         return memo

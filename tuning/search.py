@@ -181,7 +181,7 @@ def tune(
     )
     result = result.replace(message=message(result, z, felt, redone))
     if log is not None:
-        problem.memo = problem.memo.close()
+        problem.memo = problem.memo.memo()
     return result
 
 
