@@ -7,7 +7,6 @@ Every figure is of this machine in this run; compilation is apart. The C loop ru
 """
 
 import argparse
-import resource
 import statistics
 import subprocess
 import sys
@@ -41,7 +40,7 @@ def draw(case, samples, **options):
 
 
 CHILD = """
-import sys, jax, tuning, resource, time
+import re, sys, jax, tuning, time
 devices, samples, dt = int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", devices)
@@ -51,7 +50,7 @@ run = lambda n: tuning.ensemble(case, samples=n, measures=("rms_error_total", "m
 run(512)
 began = time.perf_counter()
 run(samples)
-print(time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+print(time.perf_counter() - began, int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1]) / 1024)
 """
 
 
@@ -76,17 +75,15 @@ def main():
     ns = seconds(lambda: draw(fine, 1024), rounds) / (1024 * fine.clock.samples) * 1e9
     beside = "no gcc" if c is None else f"{ns / (1e9 * c):.2f} x the scalar C loop ({1e9 * c:.1f} ns)"
     print(f"1,024 plants x {fine.clock.samples} samples: {ns:.1f} ns per step and plant, {beside}")
-    cpu = time.process_time()
-    draw(coarse, 10_000)
-    began, cpu = time.process_time(), None
-    draw(coarse, 10_000)
-    cpu = time.process_time() - began
-    print(f"10,000 plants x {coarse.clock.samples} samples: {cpu:.2f} core-seconds")
+    for words, case in (("RK4", coarse), ("midpoint", rig.set_values(coarse, {"clock.integrator": "midpoint"}))):
+        draw(case, 1024)
+        began = time.process_time()
+        draw(case, 10_000)
+        print(f"10,000 plants x {case.clock.samples} samples, {words}: {time.process_time() - began:.2f} core-seconds")
     few, many = child(1, 1_000, 1.0)[1], child(1, 100_000, 1.0)[1]
     print(f"peak memory: 1,000 plants {few:.0f} MiB, 100,000 plants {many:.0f} MiB ({many - few:+.0f})")
     one, two = (np.median([child(n, 4096, 0.1)[0] for _ in range(rounds)]) for n in (1, 2))
     print(f"4,096 plants: one device {one:.2f} s, two devices {two:.2f} s, {one / two:.2f} times")
-    print(f"this process peaked at {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
 
 if __name__ == "__main__":
