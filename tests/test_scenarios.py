@@ -143,6 +143,8 @@ def test_minibatches_come_near_the_whole(case):
     assert drawn.method == "adam" and drawn.objective["after"] < 1.03 * best
     again = tuning.tune(case, batch=2, iterations=30, **options)
     assert again.parameters == drawn.parameters
+    bounded = tuning.tune(case, batch=2, iterations=4, **{**options, "limits": {"max_level": 45.0}})
+    assert all(c["margin"] >= 0 for c in bounded.constraints)
     with pytest.raises(InputError, match="only method adam"):
         tuning.tune(case, "slsqp", batch=2, **options)
 
@@ -288,6 +290,8 @@ def test_choices_are_tried_one_by_one(case):
     assert result.message.startswith("best of 2 choices: controller.reference_rates = True")
     with pytest.raises(InputError, match=r"controller\.reference_rates"):
         tuning.tune(case, choices={"controller.reference_rat": [1]}, **options)
+    with pytest.raises(InputError, match=r"controller\.k1: is free"):
+        tuning.tune(case, choices={"controller.k1": [0.1, 0.2]}, **options)
     with pytest.raises(InputError, match="combinations"):
         tuning.tune(case, choices={"clock.substeps": list(range(1, 100))}, **options)
 

@@ -4,6 +4,8 @@ import itertools
 
 from jaxtank import rig
 from jaxtank.errors import InputError
+from jaxtank.tree import split_index
+from tuning.bounds import bounds
 
 MANY = 64
 """Combinations that are tried at most."""
@@ -21,6 +23,10 @@ def tune_choices(case, method, choices, *, log=None, resume=False, **options):
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
             raise InputError(f"choices {name}: must be a list of values to try")
+    taken = [b.name for b in bounds(case.loop, case.free if options.get("free") is None else options["free"])]
+    for name in choices:
+        if any(split_index(name)[0] == split_index(t)[0] for t in taken):
+            raise InputError(f"choices {name}: is free, and cannot be chosen as well; leave it out of one of them")
     combinations = list(itertools.product(*choices.values()))
     if len(combinations) > MANY:
         raise InputError(f"choices: {len(combinations)} combinations, must be at most {MANY}")

@@ -58,6 +58,10 @@ class Log(Memo):
             if self.path.stat().st_size > LARGEST:
                 raise InputError(f"{NAME}: larger than {LARGEST >> 20} MiB, not a log of this program")
             data = self.path.read_bytes()
+        except FileNotFoundError:
+            done = (self.path.parent / "result.json").exists()
+            why = "that run had ended, and its answer is in result.json" if done else f"there is no {NAME}"
+            raise InputError(f"--resume: {str(self.path.parent)!r} cannot be read as a search to go on with: {why}") from None
         except OSError as error:
             raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} cannot be read ({error.strerror})") from None
         lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)

@@ -144,8 +144,8 @@ def message(result, z, felt, redone):
 
 def _agreement(result):
     outcomes, words = result.starts, []
-    held = [o for o in outcomes if o["violation"] == 0.0] or outcomes
-    if not held:
+    held = [o for o in outcomes if o["violation"] == 0.0]
+    if not held:  # nothing to agree on
         return words
     best = min(o["cost"] for o in held)
     alike = [i for i, o in enumerate(outcomes) if o["violation"] == 0.0 and o["cost"] <= best * 1.001]

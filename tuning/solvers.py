@@ -281,9 +281,7 @@ def minibatches(search, z, iterations, batch, rng):
         if not point.finite:
             z = 0.5 * (z + search.last_finite.z)
             continue
-        room = (
-            np.array([max(abs(limit.value), 1.0) for limit in search.problem.limits])[point.rows] if len(point.rows) else np.ones(0)
-        )
+        room = np.array([max(abs(limit.value), 1.0) for limit in search.problem.limits])[list(point.rows)]
         push = 100.0 * np.maximum(0.0, -point.margins / room)
         g = point.gradient / search.scale - push @ (point.margin_slopes / room[:, None])
         g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
