@@ -340,3 +340,18 @@ def test_a_slice_of_the_landscape_is_drawn_where_there_are_more_parameters(gouta
     ).plot()
     assert set(figures) == {"responses", "convergence", "landscape"}
     assert "slice" in figures["landscape"].axes[0].get_title()
+
+
+def test_chatter_is_told_and_drawn(gouta):
+    """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every sample."""
+    from tuning.report import run_for_people
+    from tuning.result import message
+
+    wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})
+    assert np.abs(np.diff(run_for_people(wild).u, axis=0)).max() > 5.0  # and not the same sample of every pair
+    result = quick(gouta)
+    calm = result.measures["before"]
+    told = {"before": calm, "after": run_measures(wild.loop, wild.clock, None)}
+    z = [float(b.to_unit(p["after"])) for b, p in zip(result.problem.bounds, result.parameters.values())]
+    assert "the pumps travel" in message(result.replace(measures=told), z, [None, None], 0)
+    assert "the pumps travel" not in message(result.replace(measures={"before": calm, "after": calm}), z, [None, None], 0)

@@ -9,6 +9,9 @@ from tuning.evidence import flat_words
 BARELY = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
 
+CHATTER = 20.0
+"""How many times the pumps' travel may grow before the answer says so."""
+
 STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
 
 
@@ -126,6 +129,13 @@ def message(result, z, felt, redone):
         words.append(f"tight: {c['name']}{when} ({c['value']:.7g} of {c['limit']:.7g} {c['unit']})")
     if checked and not tight and not broken:
         words.append("no limit is tight")
+    before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
+    if after > CHATTER * before > 0:
+        unit = ms.unit("input_travel", problem.loop.units)
+        words.append(
+            f"the pumps travel {after:.4g} {unit} in all, {after / before:.0f} times as far as before: weigh it or limit it "
+            "(--objective input_travel=..., --limit input_travel=...), or take a smaller step"
+        )
     for b, v, f in zip(problem.bounds, z, felt):
         if v < 1e-6 or v > 1 - 1e-6:
             words.append(f"{b.name} ends at its {'lower' if v < 0.5 else 'upper'} bound, {b.low if v < 0.5 else b.high:g} {b.unit}")
