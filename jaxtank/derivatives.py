@@ -69,7 +69,7 @@ def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_squar
             state, acc = join(floats, rest)
             state, sample = step(here, clock, state, now)
             run = run_of(here, clock)
-            errors = ms.residuals(acc, sample, now.window, now.rest, squares)
+            errors = ms.residuals(run, acc, sample, now.window, now.rest, squares)
             floats, others = split((state, ms.update(run, acc, sample, now.window, now.since, now.rest)))
             return (floats, errors), others
 

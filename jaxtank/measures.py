@@ -181,6 +181,11 @@ def _update_deviation(run, state, sample, rest):
     return tuple(s + d * d for s, d in zip(state, _deviation(run, sample, rest)))
 
 
+def _over_rim(run, sample):
+    """Rise past the rim [cm], one per tank."""
+    return tuple(at_least(x - h, 0.0) for x, h in zip(sample.x, run.rim))
+
+
 def _changes(state, sample):
     """Changes of the inputs since the last sample; 0 at the first."""
     previous, _, first = state
@@ -208,7 +213,7 @@ ACCUMULATORS = {
     "estimate2": _sum(lambda run: run.tanks, lambda run, s: tuple((a - b) * (a - b) for a, b in zip(s.x_hat, s.x))),
     "outside": _sum(lambda run: run.pumps, _outside),
     "saturation_excess": _sum(lambda run: run.pumps, _saturation_excess),
-    "over_rim2": _sum(lambda run: run.tanks, lambda run, s: tuple(at_least(x - h, 0.0) ** 2 for x, h in zip(s.x, run.rim))),
+    "over_rim2": _sum(lambda run: run.tanks, lambda run, s: tuple(v * v for v in _over_rim(run, s))),
     "spilled": _sum(lambda run: run.tanks, lambda run, s: s.spilled),
     "max_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a > b, -jnp.inf),
     "min_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf),
@@ -224,12 +229,13 @@ ACCUMULATORS = {
 }
 
 RESIDUALS = {
-    "e2": lambda state, sample, window, rest: sample.e,
-    "past2": lambda state, sample, window, rest: _past(sample, window),
-    "deviation2": lambda state, sample, window, rest: _deviation(None, sample, rest),
-    "changes2": lambda state, sample, window, rest: _changes(state, sample),
+    "e2": lambda run, state, sample, window, rest: sample.e,
+    "past2": lambda run, state, sample, window, rest: _past(sample, window),
+    "deviation2": lambda run, state, sample, window, rest: _deviation(run, sample, rest),
+    "changes2": lambda run, state, sample, window, rest: _changes(state, sample),
+    "over_rim2": lambda run, state, sample, window, rest: _over_rim(run, sample),
 }
-"""{accumulator: (its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
+"""{accumulator: (run, its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
 
 
 def _mean(run, values):
@@ -355,6 +361,15 @@ MEASURES = {
         lambda run, acc: root_of_mean(sum(_mean(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
     ),
+    "mean_square_over_rim": Measure(
+        "cm^2",
+        "tank",
+        ("over_rim2",),
+        _per_run("over_rim2", lambda run: 1.0 / run.samples),
+        "mean square of the rise past the rim",
+        residual="over_rim2",
+        scale=lambda run: 1.0 / run.samples,
+    ),
     "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
     "overshoot_percent": Measure(
         "%", "output", ("overshoot",), _overshoot_percent, "worst overshoot of a change, in percent of it", windows=True
@@ -447,9 +462,9 @@ def update(run, states, sample, window, since=None, rest=None):
     return {a: ACCUMULATORS[a].update(run, state, sample, known.get(a, window)) for a, state in states.items()}
 
 
-def residuals(states, sample, window, rest, squares):
+def residuals(run, states, sample, window, rest, squares):
     """The residuals of one sample, a flat tuple. squares: ((measure, weight), ...), each a sum of squares (`Measure.residual`)."""
-    return tuple(v for m, _ in squares for a in [MEASURES[m].residual] for v in RESIDUALS[a](states[a], sample, window, rest))
+    return tuple(v for m, _ in squares for a in [MEASURES[m].residual] for v in RESIDUALS[a](run, states[a], sample, window, rest))
 
 
 def residual_weights(run, squares):

@@ -69,19 +69,23 @@ def open_case(name):
 
 def load(path):
     """The Case of a rig file. Raises InputError, naming the file, for anything in it that is unknown, misshapen or out of range."""
-    text = read_text(path, "rig file")
+    return loads(read_text(path, "rig file"), f"rig file {str(path)!r}")
+
+
+def loads(text, words):
+    """The Case of the text of a rig file, called `words` in errors."""
     try:
         table = tomllib.loads(text)
     except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
-        raise InputError(f"rig file {str(path)!r} is not TOML: {' '.join(str(error).split())}") from None
+        raise InputError(f"{words} is not TOML: {' '.join(str(error).split())}") from None
     except RecursionError:
-        raise InputError(f"rig file {str(path)!r} is not TOML that can be read: it is nested too deeply") from None
+        raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
     try:
         return from_table(table)
     except InputError as error:
-        raise type(error)(f"rig file {str(path)!r}: {error}") from None
+        raise type(error)(f"{words}: {error}") from None
     except RecursionError:
-        raise InputError(f"rig file {str(path)!r}: a value is nested too deeply") from None
+        raise InputError(f"{words}: a value is nested too deeply") from None
 
 
 def from_table(table):

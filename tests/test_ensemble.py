@@ -18,7 +18,7 @@ import tuning
 from jaxtank import rig
 from jaxtank.errors import InputError
 from jaxtank.tree import with_values
-from tuning import parts, robust
+from tuning import parts, robust, shards
 from tuning.distributions import Draws, parse
 from tuning.ensemble import clopper_pearson, probabilities
 
@@ -144,6 +144,36 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
     for path, _ in runs:
         with np.load(path) as found:
             assert all(np.array_equal(found[m], whole.measures[m], equal_nan=True) for m in whole.measures)
+
+
+def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
+    tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 1), limits={"max_level": 31.0})
+    there, options = shards.restore(tmp_path)
+    assert options["distributions"] == TWO and options["limits"] == {"max_level": 31.0}
+    assert same(tuning.ensemble(there, **options, fan=False, folder=tmp_path, resume=True, merge=True), whole)
+    path = tmp_path / "manifest.json"
+    said = json.loads(path.read_text())
+    for change, words in (
+        ({"told": None}, "does not say"),
+        ({"told": {"rig": None, "limits": {}}}, "no rig file describes"),
+        ({"told": {"rig": "x = ", "limits": {}}}, "is not TOML"),
+        ({"samples": "50"}, "does not say"),
+        ({"lanes": 0}, "not one of this program"),
+        ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
+        (
+            {"distributions": {"plant.drain": {"kind": "Uniform", "low": "a", "high": 1.0, "relative": None, "tied": False}}},
+            "not a distribution",
+        ),
+    ):
+        path.write_text(json.dumps(said | change))
+        with pytest.raises(InputError, match=words):
+            shards.restore(tmp_path)
+    every = {
+        "a": tuning.LogUniform(factor=2.0),
+        "b": tuning.Discrete(values=(1.0, 2.0)),
+        "c": tuning.Correlated(names=("d", "e"), covariance=((1.0, 0.5), (0.5, 1.0))),
+    }
+    assert shards.from_json(json.loads(json.dumps(shards.to_json(every)))) == every
 
 
 # statistics

@@ -27,6 +27,7 @@ ABOVE = [
     {"screening", "solvers", "input_search", "evidence"},
     {"result"},
     {"search", "choices", "bound", "tradeoff"},
+    {"shards"},
     {"ensemble", "sensitivity"},
     {"robust"},
     {"report"},

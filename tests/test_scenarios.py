@@ -176,7 +176,7 @@ def test_validation_is_of_runs_the_search_never_saw(case):
     base = np.array([problem.lanes[i % 2].case.loop.plant.drain for i in range(6)])
     assert len(np.unique(drains[:, :2])) == 12 and 0.05 < np.abs(drains[:, :2] / base[:, :2] - 1).max() <= 0.1
     own, tuned = {"controller.k": 0.03, "controller.k1": 0.088}, {"controller.k": 0.3, "controller.k1": 0.2}
-    found = evidence.validate(problem, own, tuned, 6, 0)
+    found, cloud = evidence.validate(problem, own, tuned, 6, 0)
     costs = []
     for lane in lanes:
         costs.append(
@@ -193,7 +193,8 @@ def test_validation_is_of_runs_the_search_never_saw(case):
     assert found["objective"]["before"]["mean"] == pytest.approx(costs[:, 0].mean(), rel=1e-9)
     assert found["objective"]["after"]["p50"] == pytest.approx(np.median(costs[:, 1]), rel=1e-9)
     assert found["better_share"] == np.mean(costs[:, 1] < costs[:, 0]) and found["failed"] == 0
-    assert found == evidence.validate(problem, own, tuned, 6, 0) != evidence.validate(problem, own, tuned, 6, 1)
+    np.testing.assert_allclose(cloud["objective"], costs, rtol=1e-9)
+    assert found == evidence.validate(problem, own, tuned, 6, 0)[0] != evidence.validate(problem, own, tuned, 6, 1)[0]
 
 
 class Quadratic:

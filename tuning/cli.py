@@ -126,6 +126,12 @@ def parser():
         "--robust", metavar="RISK", help="on many plants at once: mean, cvar or worst of their costs, limits held on every one"
     )
     tune.add_argument("--samples", metavar="N", help="plants of --robust (default 64)")
+    tune.add_argument("--fresh", metavar="N", help="plants that its answer is run on afterwards (default 1024)")
+    tune.add_argument(
+        "--back-off",
+        metavar="SHARE",
+        help="share of each limit that --robust keeps off it, as 0.03; fresh plants are judged without",
+    )
     uncertain = commands.add_parser(
         "uncertainty", parents=[common, case, run], help="the same loop over N draws: bands, percentiles, violations"
     )
@@ -151,11 +157,10 @@ def parser():
     uncertain.add_argument("--devices", default="1", metavar="N", help="devices of this machine to use (default 1)")
     uncertain.add_argument("--shard", metavar="I/N", help="run the I-th of N shares into --out DIR; merge joins them")
     uncertain.add_argument("--resume", metavar="DIR", help="go on where a killed run with --out DIR ended")
-    merge = commands.add_parser(
-        "merge", parents=[common, case, run], help="join the shards of an ensemble: the options as theirs, --out DIR"
-    )
+    merge = commands.add_parser("merge", parents=[common, run], help="join the shards of an ensemble in a folder")
+    merge.add_argument("case", metavar="DIR", help="where the shards are; or their case, with their options and --out DIR")
     for action in uncertain._actions:
-        if action.dest in ("samples", "spread", "vary", "draws", "limit", "measure"):
+        if action.dest in ("values", "schedule", "dt", "samples", "spread", "vary", "draws", "limit", "measure"):
             merge._add_action(action)
     sense = commands.add_parser(
         "sensitivity", parents=[common, case, run], help="which parameter moves which measure: local, Morris, Sobol"
@@ -401,13 +406,12 @@ def _tradeoff(args):
 
 def _distributions(args, case):
     """What varies, by --vary or --spread; None for the case's own."""
-    from tuning.distributions import parse
     from tuning.ensemble import spread_of
 
     if args.vary and args.spread is not None:
         raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
     if args.vary:
-        varied = [_pair_of(text, parse) for text in args.vary]
+        varied = [_pair_of(text, case) for text in args.vary]
         if len({name for name, _ in varied}) < len(varied):
             raise InputError("--vary: a parameter is given twice")
         return dict(varied)
@@ -419,9 +423,17 @@ def _distributions(args, case):
     return spread_of(case, share)
 
 
-def _pair_of(text, parse):
+def _pair_of(text, case):
+    """(name, distribution) of one --vary, if every draw of it is a value that the case may have."""
+    from tuning.distributions import Draws, parse
+
     name, value = _pair("--vary", text, str)
-    return name, parse(name, value)
+    try:
+        found = parse(name, value)
+        Draws(case.loop, {name: found})
+    except InputError as error:
+        raise InputError(f"--vary {text}: {error}") from None
+    return name, found
 
 
 def _ensemble(args, **options):
@@ -453,11 +465,9 @@ def _told(found, args):
 def _uncertainty(args):
     devices, shard = _whole("--devices", args.devices, 1, 1024), None
     if args.shard is not None:
-        first, slash, second = args.shard.partition("/")
-        if not slash or (not args.out and not args.resume):
-            raise InputError(f"--shard {args.shard!r}: must be I/N, with --out DIR for the shard")
-        count = _whole("--shard", second, 1, 10**6)
-        shard = (_whole("--shard", first, 1, count), count)
+        shard = _shard(args.shard)
+        if not args.out and not args.resume:
+            raise InputError(f"--shard {args.shard!r}: needs --out DIR, where the shares meet")
     if args.resume and args.out and args.resume != args.out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
     args.out = args.resume or args.out
@@ -475,11 +485,40 @@ def _uncertainty(args):
     return _told(found, args)
 
 
+def _shard(text):
+    """(i, n) of --shard I/N."""
+    try:
+        i, n = (int(part) for part in text.split("/"))
+    except ValueError:
+        raise InputError(f"--shard {text!r}: must be I/N, as 1/4 for the first of four shares") from None
+    if not 1 <= n <= 10**6:
+        raise InputError(f"--shard {text!r}: there may be 1 to 1000000 shares")
+    if not 1 <= i <= n:
+        raise InputError(f"--shard {text!r}: with {n} shares they are 1/{n} to {n}/{n}")
+    return i, n
+
+
 def _merge(args):
-    if not args.out:
-        raise InputError("merge needs --out DIR, where the shards are")
-    _out(args)
-    return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
+    """Of a folder alone, by what its manifest says; of a case with the options of its shards and --out DIR."""
+    if args.out:
+        _out(args)
+        return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
+    if not os.path.isdir(args.case):
+        raise InputError(f"merge {args.case!r}: is no folder; give the one that the shards were written to (their --out DIR)")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from tuning.ensemble import ensemble
+    from tuning.shards import restore
+
+    given = [a for a in ("values", "schedule", "dt", "spread", "vary", "measure") if getattr(args, a)]
+    if given or args.samples != "1000" or args.draws != "random" or args.seed != "0":
+        raise InputError(f"merge {args.case!r}: the folder says what its shards are of; leave the other options out (but --limit)")
+    case, options = restore(args.case)
+    if args.limit:
+        options["limits"] = _limits(args, case.replace(limits=options["limits"]))
+    args.out = args.case
+    return _told(ensemble(case, folder=args.out, resume=True, merge=True, **options), args)
 
 
 def _list(args):
@@ -557,8 +596,9 @@ def _tune(args):
         raise InputError("--resume and --out name different folders: a run is continued in its own")
     folder = args.resume or args.out
     choices, varied = _choices(args), _distributions(args, case)
-    if (args.samples is not None or varied is not None) and args.robust is None:
-        raise InputError("--samples, --spread and --vary of tune belong to --robust")
+    only = (args.samples, args.fresh, args.back_off)
+    if (varied is not None or any(v is not None for v in only)) and args.robust is None:
+        raise InputError("--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust")
     finder, more = search.tune, {"choices": choices}
     if args.robust is not None:
         from tuning.robust import tune_robust
@@ -566,7 +606,12 @@ def _tune(args):
         if choices or args.scenario:
             raise InputError("--robust makes scenarios of its own: no --scenario, no --choose beside it")
         finder = functools.partial(
-            tune_robust, distributions=varied, risk=args.robust, samples=_whole("--samples", args.samples or "64", 2, 100_000)
+            tune_robust,
+            distributions=varied,
+            risk=args.robust,
+            samples=_whole("--samples", args.samples or "64", 2, 100_000),
+            fresh=_whole("--fresh", args.fresh or "1024", 1, 100_000),
+            back_off=_number("--back-off", args.back_off or "0"),
         )
         scenarios, more = None, {}
     result = finder(

@@ -17,7 +17,7 @@ from jaxtank import measures as ms
 from jaxtank.analysis import steady_flows
 from jaxtank.errors import InputError
 from jaxtank.tree import with_values
-from tuning import parts
+from tuning import parts, shards
 from tuning.distributions import Draws, Uniform
 from tuning.objective import LOWER, resolve_limits
 from tuning.scenarios import noisy
@@ -196,6 +196,8 @@ def ensemble(
     Raises InputError before anything is run.
     """
     began = time.perf_counter()
+    if shard is not None and not (isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]):
+        raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
     for name, value in (("samples", samples), ("key", key), ("devices", devices)):
         if isinstance(value, bool) or not isinstance(value, int) or not (0 if name == "key" else 1) <= value <= 2**31 - 1:
             raise InputError(f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to {2**31 - 1}")
@@ -217,6 +219,7 @@ def ensemble(
     store = None
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
+        manifest["told"] = shards.told(case, case.limits if limits is None else limits)
         store = parts.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1)
     mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
     mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
@@ -382,7 +385,7 @@ def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
         "loop": parts.digest([np.asarray(v) for v in leaves]),
         "structure": parts.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
         "clock": repr(case.clock),
-        "distributions": repr(distributions),
+        "distributions": shards.to_json(distributions),
         "samples": samples,
         "key": key,
         "draws": draws,

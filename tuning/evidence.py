@@ -153,40 +153,65 @@ def perturbed(problem, samples, seed):
 def validate(problem, before, after, samples, seed):
     """How the values `before` and `after` do on `samples` runs that the search never saw (see `perturbed`).
 
-    Returns {"samples", "spread" {name: share}, "noise", "failed", "objective" {"before"/"after": {"mean", "p05", "p50", "p95"}},
-    "better_share": of the runs in which the tuned values cost less, "limits_held" {"before"/"after": share of the runs in which every
-    limit holds}}.
+    Returns what `summary_of` does.
     """
     lanes = perturbed(problem, samples, seed)
     points = {n: np.array([before[n], after[n]]) for n in problem.names}
     costs, held, broken = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool), np.zeros(samples, dtype=bool)
+    levels, names = np.zeros((samples, 2, problem.loop.plant.tanks)), tuple(dict.fromkeys([*problem.needed, "max_level"]))
     for group in sc.groups_of(lanes):
-        measures, flags = sc.values_of(group, problem.needed, points)
+        measures, flags = sc.values_of(group, names, points)
         measures, flags = {m: np.asarray(v) for m, v in measures.items()}, np.asarray(flags)
         for j, i in enumerate(group.lanes):
             mine = [limit for limit in problem.limits if limit.lane == i % len(problem.lanes)]
             broken[i] = flags[:, j].any()
             for side in (0, 1):
                 row = {m: v[side, j] for m, v in measures.items()}
-                costs[i, side] = problem.cost(row)
+                costs[i, side], levels[i, side] = problem.cost(row), row["max_level"]
                 held[i, side] = all(limit.margin(row) >= 0 for limit in mine)
-    good = ~broken & np.isfinite(costs).all(axis=1)
+    noise, spread = any(lane.key is not None for lane in lanes), {n: float(s) for n, s in problem.case.uncertain.items()}
+    return summary_of(problem, costs, held, levels, broken, spread, noise)
+
+
+def summary_of(problem, costs, held, levels, broken, spread, noise):
+    """What runs before and after tuning, on the same draws, come to: (summary, cloud).
+
+    costs: (samples, 2) before and after; held: (samples, 2) True where every limit holds; levels: (samples, 2, tanks) highest [cm];
+    broken: (samples,) True where a run left the numbers; spread: {name: share}; noise: True if the runs have noise of their own. The
+    summary: {"samples", "spread", "noise", "failed", "objective" {"before"/"after": {"mean", "p05", "p50", "p95"}}, "better_share": of
+    the runs in which the tuned values cost less, "limits_held" {"before"/"after": share of the runs in which every limit holds},
+    "comparable": share of the runs in which both hold them, "better_share_of_comparable"}. The cloud, of the runs
+    that did not fail: {"objective" (runs, 2), "level" (runs, 2) of the tank that comes highest, "limit" [cm] or None, "past": True where
+    the tanks' limits differ and "level" is how far the worst is past its own, "held" (runs, 2)}.
+    """
+    samples, good = len(costs), ~broken & np.isfinite(costs).all(axis=1)
+    both = good & held.all(axis=1)
 
     def summary(column):
         quantiles = np.quantile(column, (0.05, 0.5, 0.95)) if column.size else [np.nan] * 3
         return dict(zip(("mean", "p05", "p50", "p95"), map(float, (column.mean() if column.size else np.nan, *quantiles))))
 
-    return {
+    found = {
         "samples": samples,
-        "spread": {n: float(s) for n, s in problem.case.uncertain.items()},
-        "noise": any(lane.key is not None for lane in lanes),
+        "spread": spread,
+        "noise": noise,
         "failed": int((~good).sum()),
         "objective": {name: summary(costs[good, side]) for side, name in enumerate(("before", "after"))},
         "better_share": float(np.mean(costs[good, 1] < costs[good, 0])) if good.any() else None,
         "limits_held": {
             name: float(np.mean(held[good, side])) if good.any() else None for side, name in enumerate(("before", "after"))
         },
+        "comparable": float(np.mean(both[good])) if good.any() else None,
+        "better_share_of_comparable": float(np.mean(costs[both, 1] < costs[both, 0])) if both.any() else None,
     }
+    limits = {limit.index: limit.value for limit in problem.limits if limit.measure == "max_level"}
+    levels = levels[good][:, :, sorted(limits) if limits else slice(None)]
+    one = next(iter(limits.values())) if len(set(limits.values())) == 1 else None
+    if len(set(limits.values())) > 1:  # tanks with limits of their own: how far past its limit the worst is
+        levels = levels - np.array([limits[i] for i in sorted(limits)])
+    level = levels.max(axis=2) if levels.size else np.zeros((0, 2))
+    past = len(set(limits.values())) > 1
+    return found, {"objective": costs[good], "level": level, "limit": 0.0 if past else one, "past": past, "held": held[good]}
 
 
 def changed(case, values):

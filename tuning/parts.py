@@ -105,8 +105,9 @@ def read_manifest(folder):
 
 
 def check_same(mine, theirs, folder):
-    """Raise InputError, naming what differs, unless two manifests are of one ensemble."""
-    other = [k for k in mine if mine[k] != theirs.get(k)]
+    """Raise InputError, naming what differs, unless two manifests are of one ensemble. "told" is for people and `merge`: the limits in it
+    decide nothing that is in a batch."""
+    other = [k for k in mine if k != "told" and mine[k] != theirs.get(k)]
     if other:
         raise InputError(f"{str(folder)!r} holds another ensemble; what differs: {', '.join(other)}")
 

@@ -250,7 +250,7 @@ def _validation_table(result):
     found = result.validation
     if not found:
         return []
-    spread = ", ".join(f"{n} +-{100 * s:g} %" for n, s in found["spread"].items()) or "the plant as it is"
+    spread = ", ".join(n if s is None else f"{n} +-{100 * s:g} %" for n, s in found["spread"].items()) or "the plant as it is"
     noise = ", fresh noise" if found["noise"] else ""
     rows = [
         [
@@ -265,8 +265,18 @@ def _validation_table(result):
         return [f"held-out runs: all {found['samples']} failed", ""]
     head = [f"on {found['samples']} held-out runs", "mean objective", "5 %", "median", "95 %", "all limits held in"]
     failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
-    share = f"tuned is better in {100 * found['better_share']:.0f} % of them; perturbed: {spread}{noise}{failed}"
+    share = f"{_better(found)}; perturbed: {spread}{noise}{failed}"
     return [table(rows, head), share, ""]
+
+
+def _better(found):
+    """In how many held-out runs tuning gained: a lower cost than that of a run which breaks a limit is no gain, and a higher no loss."""
+    if found["comparable"] == 1.0:
+        return f"tuned is better in {100 * found['better_share']:.0f} % of them"
+    part = f"before and after both hold every limit in {100 * found['comparable']:.3g} % of them"
+    if found["better_share_of_comparable"] is None:
+        return f"{part}, so their objectives are not to be compared"
+    return f"{part}, and of those tuned is better in {100 * found['better_share_of_comparable']:.0f} %"
 
 
 def _choice_table(result):

@@ -23,7 +23,7 @@ class TuningResult:
     objective [%]; measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
     that the search was judged by; constraints: one dict per limit and scenario with value, margin, tank and time; history: (start,
     cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search; curvature, validation: see
-    `evidence`; mirrored: the answer's mirror image, see
+    `evidence`; cloud: cost and highest level of every run of the validation, see `evidence.summary_of`; mirrored: the answer's mirror image, see
     `evidence.mirror_of`; choices: what each combination of discrete choices gave;
     bound: what no law could beat, tradeoff: what a limit costs,
     certificate: what is known of fresh plants, where asked. case and tuned are the Case before and after.
@@ -53,6 +53,7 @@ class TuningResult:
     bound: Any = None
     tradeoff: Any = None
     certificate: Any = None
+    cloud: dict | None = None
 
     @property
     def success(self):

@@ -5,18 +5,23 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from jaxtank.errors import InputError
 from jaxtank.presets.base import Scenario
+from jaxtank.rig import check_limits
 from jaxtank.tree import split_index
 from tuning.distributions import Draws
-from tuning.ensemble import ensemble, probabilities, spread_of
-from tuning.evidence import HELD_OUT
-from tuning.search import tune
+from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of
+from tuning.evidence import HELD_OUT, summary_of, validate
+from tuning.objective import LOWER, Problem
+from tuning.search import own_values, tune
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
+
+TOLERANCE = 1e-4
+"""Change of the objective, as a share of its first value, at which a search over drawn plants has arrived: their mean is itself known to a
+few percent only [-]."""
 
 
 class Certificate(NamedTuple):
@@ -67,30 +72,92 @@ def scenario_bound(scenarios, support, beta=CONFIDENCE):
     return 1.0 - math.exp(log / (scenarios - support))
 
 
-def tune_robust(case, distributions: Mapping[str, Any] | None = None, risk="mean", samples=64, fresh=1024, seed=0, **options):
+def tune_robust(
+    case,
+    distributions: Mapping[str, Any] | None = None,
+    risk="mean",
+    samples=64,
+    fresh=1024,
+    seed=0,
+    back_off=0.0,
+    tolerance=TOLERANCE,
+    validation=64,
+    **options,
+):
     """`tune` on `samples` plants drawn from `distributions` (the case's own spread where None), every limit held on every plant.
 
-    risk: "mean", "cvar" or "worst" of their costs; fresh: plants drawn afterwards, with seeds of their own, that the answer is run on;
-    options: as in `tune`. Returns a TuningResult with a Certificate. Raises InputError as `tune` and `ensemble` do.
+    risk: "mean", "cvar" or "worst" of their costs; fresh: plants drawn afterwards, with seeds of their own, on which the values before and
+    after are run; back_off: share of each limit [-] that the search keeps off it, while fresh plants are judged by the limit itself: a
+    limit that one of N plants holds in place is broken by about one fresh plant in N + 1; validation: runs of a case that has scenarios of
+    its own, 0 for none (any other is validated by the fresh plants); tolerance and other options: as in `tune`. Returns a TuningResult
+    with a Certificate. Raises InputError as `tune` and `ensemble` do.
     """
     for name, value, low in (("samples", samples, 2), ("fresh", fresh, 1)):
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= 100_000:
             raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
+    if isinstance(back_off, bool) or not isinstance(back_off, (int, float)) or not 0.0 <= back_off < 1.0:
+        raise InputError(f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1")
     distributions = spread_of(case) if distributions is None else dict(distributions)
-    result = tune(case, scenarios=scenarios_of(case, distributions, samples, seed), risk=risk, seed=seed, **options)
-    seen = ensemble(result.tuned, distributions, samples=fresh, key=HELD_OUT + seed, limits=options.get("limits"), fan=False)
-    rows = np.array(
-        [limit.sign * (seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index] - limit.value) > 0 for limit in seen.limits]
-    )
-    broken = int(np.sum(seen.failed | rows.any(axis=0))) if len(rows) else int(seen.failed.sum())
+    limits = check_limits(case.loop, case.limits if options.get("limits") is None else options["limits"])
+    options["limits"] = _kept_off(case, limits, back_off)
+    plants = scenarios_of(case, distributions, samples, seed)
+    result = tune(case, scenarios=plants, risk=risk, seed=seed, tolerance=tolerance, validation=0, **options)
+    judge = Problem(case, options.get("free"), options.get("objective"), limits, None, seed)
+    if case.scenarios:  # what is certified is the case's own run, what the answer is judged by is its scenarios
+        broken = int(_run(result.tuned, distributions, limits, (), fresh, seed)[1].sum())
+        found = (None, None)
+        if validation and result.status != "interrupted":
+            values = {n: p["after"] for n, p in result.parameters.items()}
+            found = validate(judge, own_values(judge), values, validation, seed)
+    else:
+        *found, broken = _on_fresh(result, judge, distributions, limits, fresh, seed)
     support = _support(result)
-    interval = [float(v) for v in stats.binomtest(broken, fresh).proportion_ci(0.95, "exact")]
+    interval = clopper_pearson(broken, fresh)
     certificate = Certificate(samples, support, scenario_bound(samples, support), fresh, broken, interval)
     words = (
         f"on {fresh} fresh plants a limit was broken {broken} times (95 % interval {interval[0]:.2g} to {interval[1]:.2g}); the scenario "
         f"theory bounds the probability by {certificate.bound:.2g} (N {samples}, support {support}, confidence 1 - 1e-6)"
     )
-    return result.replace(certificate=certificate, message=f"{words}; {result.message}")
+    if back_off:
+        words += f"; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
+    elif broken and support:
+        words += (
+            f"; {support} of {samples} plants at a limit leave about {100 * support / (samples + 1):.2g} % of fresh ones past it: "
+            "more plants or a back-off (--back-off 0.03) bring that down"
+        )
+    return result.replace(certificate=certificate, validation=found[0], cloud=found[1], message=f"{words}; {result.message}")
+
+
+def _kept_off(case, limits, share):
+    """`limits` with `share` of each taken off, the rim being that of the plant."""
+    if not share:
+        return limits
+    rim = np.asarray(case.loop.plant.rim).tolist()
+    values = {m: np.asarray(rim if isinstance(v, str) else v, dtype=float) for m, v in limits.items()}
+    return {m: (v + (share if m in LOWER else -share) * np.abs(v)).tolist() for m, v in values.items()}
+
+
+def _run(case, distributions, limits, names, fresh, seed):
+    """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit or leaves the numbers)."""
+    seen = ensemble(case, distributions, samples=fresh, key=HELD_OUT + seed, measures=names, limits=limits, fan=False)
+    past = [
+        limit.sign * (seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index] - limit.value) > 0 for limit in seen.limits
+    ]
+    return seen, seen.failed | np.any(past, axis=0) if past else seen.failed
+
+
+def _on_fresh(result, judge, distributions, limits, fresh, seed):
+    """(summary, cloud, how many break a limit after tuning): fresh plants before and after tuning, the same draws on both sides."""
+    names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
+    sides = [_run(case, distributions, limits, names, fresh, seed) for case in (result.case, result.tuned)]
+    costs = [sum(w * seen.measures[m].reshape(fresh, -1).sum(axis=1) for m, w in judge.objective.items()) for seen, _ in sides]
+    held = np.stack([~past for _, past in sides], axis=1)
+    levels = np.stack([seen.measures["max_level"] for seen, _ in sides], axis=1)
+    failed = sides[0][0].failed | sides[1][0].failed
+    spread = {n: getattr(d, "relative", None) for n, d in distributions.items()}
+    noise = judge.lanes[0].key is not None
+    found = summary_of(judge, np.stack(costs, axis=1), held, levels, failed, spread, noise)
+    return *found, int((~held[:, 1]).sum())
 
 
 def _support(result):

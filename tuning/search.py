@@ -49,6 +49,7 @@ def tune(
     iterations=60,
     batch=None,
     validation=64,
+    tolerance=None,
     log=None,
     resume=False,
     progress=None,
@@ -62,7 +63,9 @@ def tune(
     mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
     local searches, from the case's own values and the best distinct ones of `screening` Sobol
     points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
-    adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; log: folder for
+    adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
+    objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
+    log: folder for
     the log of evaluations, with which a killed search is continued by resume=True, to the same bits; progress: called with a dict after
     every evaluation. Ctrl-C ends the search with the best point so far. Returns a TuningResult. Raises InputError for anything it
     cannot use, before anything is run.
@@ -79,6 +82,7 @@ def tune(
         iterations=iterations,
         batch=batch,
         validation=validation,
+        tolerance=tolerance,
         progress=progress,
     )
     if choices:
@@ -87,6 +91,8 @@ def tune(
         return tune_choices(case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
     _check_options(starts=starts, screening=screening, iterations=iterations, batch=batch, validation=validation)
+    if tolerance is not None and not (isinstance(tolerance, float) and 0.0 < tolerance < 1.0):
+        raise InputError(f"tolerance = {tolerance!r}: must be a number between 0 and 1")
     problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed, risk=risk)
     key = jax.random.key(seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
@@ -102,6 +108,7 @@ def tune(
     try:
         reference = problem.point(first)
         search = Search(problem, reference, report)
+        search.tolerance = tolerance or search.tolerance
         search.take(reference)
         zs, costs, margins, redone = screen(problem, screening, seed)
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)
@@ -116,7 +123,8 @@ def tune(
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             _find_feasible(search, zs, margins, iterations)
-        if method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
+        arrived = tolerance is not None and _status(outcomes, True, search, False) == "converged"
+        if method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None and not arrived:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
         if search.best is not None and search.violation(search.best) == 0:
             curved = evidence.curvature(problem, search, search.best)
@@ -138,9 +146,9 @@ def tune(
     status = "interrupted" if interrupted else _status(outcomes, holds, search, polished)
     assert status in STATUSES
     mirrored = None if interrupted or best is None else evidence.mirror_of(problem, outcomes, values)
-    validated = None
+    validated, cloud = None, None
     if validation and not interrupted and (case.uncertain or any(lane.key is not None for lane in problem.lanes)):
-        validated = evidence.validate(problem, own_values(problem), values, validation, seed)
+        validated, cloud = evidence.validate(problem, own_values(problem), values, validation, seed)
     result = TuningResult(
         case=case,
         tuned=tuned,
@@ -176,6 +184,7 @@ def tune(
         curvature=curved,
         mirrored=mirrored,
         validation=validated,
+        cloud=cloud,
         provenance=provenance(case, seed),
         problem=problem,
     )
@@ -324,7 +333,7 @@ def fingerprint(problem, method, options):
         "scenarios": repr([(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]),
         "method": method,
         "risk": problem.risk,
-        **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation")},
+        **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation", "tolerance")},
         "jaxtank": jaxtank.__version__,
         "jax": jax.__version__,
         "xla_option": repr(KEY in os.environ.get("XLA_FLAGS", "")),

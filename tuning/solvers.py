@@ -28,6 +28,7 @@ class Search:
 
     def __init__(self, problem, reference, report):
         self.problem, self.report = problem, report
+        self.tolerance = 1e-8
         self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
         self.room = np.array([max(abs(limit.value), 1.0) for limit in problem.limits])
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
@@ -81,8 +82,9 @@ class Search:
         return good.margins / self.room - self.backoff, good.margin_slopes / self.room[:, None]
 
 
-def slsqp(search, z, iterations, tolerance=1e-8):
+def slsqp(search, z, iterations, tolerance=None):
     """Sequential quadratic programming on the exact maxima. Returns True if it converged."""
+    tolerance = search.tolerance if tolerance is None else tolerance
     if getattr(search.problem, "risk", "mean") == "worst" and len(search.problem.lanes) > 1:
         return _epigraph(search, z, iterations, tolerance)
     constraints = []

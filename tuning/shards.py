@@ -1,0 +1,76 @@
+"""What the shards of an ensemble are of, as JSON in their manifest: enough to join them without saying it again."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxtank import rig
+from jaxtank.errors import InputError
+from tuning import distributions as ds
+from tuning import parts
+
+KINDS = {c.__name__: c for c in (ds.Uniform, ds.LogUniform, ds.Normal, ds.Discrete, ds.Correlated)}
+WORDS = {"samples": int, "key": int, "lanes": int, "draws": str, "measures": list, "distributions": dict}
+
+
+def told(case, limits):
+    """What the manifest says of a case and its limits: {"rig": text of a rig file, or None where no file describes it, "limits": dict}."""
+    try:
+        text = rig.dump(case)
+    except InputError:
+        text = None
+    return {"rig": text, "limits": {m: v if isinstance(v, str) else np.asarray(v).tolist() for m, v in limits.items()}}
+
+
+def to_json(distributions):
+    """{name: {"kind", fields}} of {name: distribution}."""
+    return {
+        n: {"kind": type(d).__name__, **{k: np.asarray(v).tolist() if np.ndim(v) else v for k, v in dataclasses.asdict(d).items()}}
+        for n, d in distributions.items()
+    }
+
+
+def from_json(found):
+    """{name: distribution} of what `to_json` gives. Raises InputError for anything else."""
+    built = {}
+    for name, fields in found.items():
+        kind = KINDS.get(fields.get("kind")) if isinstance(fields, dict) else None
+        if kind is None or set(fields) != {"kind", *(f.name for f in dataclasses.fields(kind))}:
+            raise InputError(f"manifest: {name} is not a distribution of this program")
+        built[name] = kind(**{k: _tuples(v) for k, v in fields.items() if k != "kind"})
+        try:
+            built[name].check(name)
+        except (TypeError, ValueError, AttributeError):
+            raise InputError(f"manifest: {name} is not a distribution of this program") from None
+    return built
+
+
+def _tuples(value):
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+
+
+def restore(folder):
+    """(Case, options of `ensemble`) of the shards in a folder. Raises InputError where the manifest does not say them.
+
+    Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit for bit, that of the shards
+    (`ensemble` compares their digests).
+    """
+    manifest = parts.read_manifest(folder)
+    bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
+    asked = manifest.get("told")
+    if bad or not isinstance(asked, dict) or not isinstance(asked.get("limits"), dict):
+        raise InputError(
+            f"{str(folder)!r}: the manifest does not say what its shards are of; give the case and the options as theirs"
+        )
+    if not isinstance(asked.get("rig"), str):
+        raise InputError(f"{str(folder)!r}: no rig file describes the case of these shards; merge them from Python")
+    case = rig.loads(asked["rig"], f"manifest of {str(folder)!r}")
+    options = {n: manifest[n] for n in ("samples", "key", "lanes", "draws")}
+    if options["lanes"] < 1 or options["samples"] > 10**8:
+        raise InputError(f"{str(folder)!r}: the manifest is not one of this program")
+    return case, {
+        **options,
+        "measures": tuple(manifest["measures"]),
+        "limits": asked["limits"],
+        "distributions": from_json(manifest["distributions"]),
+    }
