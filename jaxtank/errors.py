@@ -11,6 +11,10 @@ class EquilibriumError(InputError):
     """No steady state has the outputs asked for. The message names the tank or pump in the way."""
 
 
+class DataError(InputError):
+    """A log cannot be used. The message is one line and names file, line and column; the command line ends with exit code 5."""
+
+
 class NonFiniteError(ArithmeticError):
     """A run produced NaN or infinity. The message gives the time, the tank and the parameters of the run."""
 

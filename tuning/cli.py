@@ -1,7 +1,7 @@
 """The command `jaxtank`. Results on stdout, progress and errors on stderr.
 
 Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing written), 3 not converged, 4 limits cannot
-be met, 130 interrupted (the best point so far is written and said). Nothing heavy is imported before the arguments are read.
+be met, 5 bad data file, 130 interrupted (the best point so far is written and said). Nothing heavy is imported before the arguments are read.
 """
 
 import argparse
@@ -11,7 +11,17 @@ import signal
 import sys
 import threading
 
-from jaxtank.errors import InputError, NonFiniteError, nearest
+from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
+from tuning import identify_command
+from tuning.arguments import check_out as _out
+from tuning.arguments import number as _number
+from tuning.arguments import open_case as _open
+from tuning.arguments import pair as _pair
+from tuning.arguments import parse_value
+from tuning.arguments import plain_number as _plain_number
+from tuning.arguments import seed as _seed
+from tuning.arguments import span as _range
+from tuning.arguments import whole as _whole
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -184,6 +194,7 @@ def parser():
         metavar="NAME",
         help="a measure to look at (default: those of the objective, rms_error_total, max_level); repeatable",
     )
+    identify_command.add(commands, [common, case, run])
     commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
     compare = commands.add_parser(
         "compare", parents=[common], help="published numbers beside measured ones, and why they differ; PAPER or all"
@@ -217,7 +228,7 @@ def main(argv=None):
         return COMMANDS[args.command](args)
     except (InputError, NonFiniteError) as error:
         print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
-        return 2
+        return 5 if isinstance(error, DataError) else 2
     except KeyboardInterrupt:
         print("jaxtank: interrupted", file=sys.stderr, flush=True)
         if argv is None:
@@ -241,104 +252,6 @@ def main(argv=None):
 
 def _one_line(error):
     return " ".join(str(error).split())
-
-
-def _open(args):
-    """The checked case of the command line, in float64."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from jaxtank import rig
-
-    case = rig.open_case(args.case)
-    values = dict(_pair("--set", text, parse_value) for text in args.values)
-    if args.dt is not None:
-        values["clock.dt"] = _number("--dt", args.dt)
-    return rig.check(rig.set_and_schedule(case, values, _schedule(args.schedule)))
-
-
-def _schedule(texts):
-    """The table of a rig file's [schedule] for the options --schedule."""
-    found = [_pair("--schedule", text, lambda v: v) for text in texts]
-    if len({rule for _, rule in found}) > 1:
-        raise InputError(f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains")
-    for name, rule in found:
-        variable, colon, knots = rule.partition(":")
-        if not colon:
-            raise InputError(f"--schedule {name}={rule!r}: must be NAME=VARIABLE:K1,K2,...")
-        return {"gains": [n for n, _ in found], "variable": variable.strip(), "knots": parse_value(f"[{knots}]")}
-    return {}
-
-
-def _pair(option, text, read):
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
-        raise InputError(f"{option} {text!r}: must be NAME=VALUE")
-    return name.strip(), read(value.strip())
-
-
-def parse_value(text):
-    """A number, a truth value, a list of numbers ("1,2" or "[1,2]"), or the text itself."""
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
-    parts = [p for p in inner.split(",") if p.strip()]
-    try:
-        found = [_plain_number(p) for p in parts]
-    except ValueError:
-        return text
-    return found if len(found) != 1 or inner is not text else found[0]
-
-
-def _plain_number(text):
-    """An int where it is written as one, else a float; underscores are not numbers."""
-    if "_" in text:
-        raise ValueError(text)
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
-
-
-def _number(option, text):
-    try:
-        return float(_plain_number(text))
-    except ValueError:
-        raise InputError(f"{option} {text!r}: must be a number") from None
-
-
-def _whole(option, text, low, high):
-    try:
-        value = int(text)
-    except ValueError:
-        value = None
-    if value is None or not low <= value <= high:
-        raise InputError(f"{option} {text!r}: must be a whole number from {low} to {high}")
-    return value
-
-
-def _seed(args):
-    return _whole("--seed", args.seed, 0, 2**31 - 1)
-
-
-def _out(args):
-    if args.out is not None and not args.out.strip():
-        raise InputError("--out '': must name a folder")
-    if args.out is not None:
-        from jaxtank.files import check_folder
-
-        check_folder(args.out)
-
-
-def _range(text):
-    parts = text.split(":")
-    try:
-        low, high = (float(_plain_number(p)) for p in parts[:2])
-    except ValueError:
-        raise InputError(f"--free range {text!r}: must be NAME=LOW:HIGH with two numbers") from None
-    if len(parts) > 3 or (len(parts) == 3 and parts[2] not in ("log", "linear")):
-        raise InputError(f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
-    return (low, high, parts[2] if len(parts) == 3 else "log" if low > 0 else "linear")
 
 
 def _limits(args, case):
@@ -781,6 +694,7 @@ COMMANDS = {
     "simulate": _simulate,
     "tune": _tune_interruptibly,
     "sensitivity": _sensitivity,
+    "identify": identify_command.run,
     "init": _init,
     "uncertainty": _uncertainty,
     "merge": _merge,

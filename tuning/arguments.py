@@ -1,0 +1,101 @@
+"""What the words of a command line mean: numbers, ranges, NAME=VALUE, the case they describe."""
+
+from jaxtank.errors import InputError
+
+
+def open_case(args):
+    """The checked case of the command line, in float64."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxtank import rig
+
+    case = rig.open_case(args.case)
+    values = dict(pair("--set", text, parse_value) for text in args.values)
+    if args.dt is not None:
+        values["clock.dt"] = number("--dt", args.dt)
+    return rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
+
+
+def schedule(texts):
+    """The table of a rig file's [schedule] for the options --schedule."""
+    found = [pair("--schedule", text, lambda v: v) for text in texts]
+    if len({rule for _, rule in found}) > 1:
+        raise InputError(f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains")
+    for name, rule in found:
+        variable, colon, knots = rule.partition(":")
+        if not colon:
+            raise InputError(f"--schedule {name}={rule!r}: must be NAME=VARIABLE:K1,K2,...")
+        return {"gains": [n for n, _ in found], "variable": variable.strip(), "knots": parse_value(f"[{knots}]")}
+    return {}
+
+
+def pair(option, text, read):
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise InputError(f"{option} {text!r}: must be NAME=VALUE")
+    return name.strip(), read(value.strip())
+
+
+def parse_value(text):
+    """A number, a truth value, a list of numbers ("1,2" or "[1,2]"), or the text itself."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    parts = [p for p in inner.split(",") if p.strip()]
+    try:
+        found = [plain_number(p) for p in parts]
+    except ValueError:
+        return text
+    return found if len(found) != 1 or inner is not text else found[0]
+
+
+def plain_number(text):
+    """An int where it is written as one, else a float; underscores are not numbers."""
+    if "_" in text:
+        raise ValueError(text)
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
+
+
+def number(option, text):
+    try:
+        return float(plain_number(text))
+    except ValueError:
+        raise InputError(f"{option} {text!r}: must be a number") from None
+
+
+def whole(option, text, low, high):
+    try:
+        value = int(text)
+    except ValueError:
+        value = None
+    if value is None or not low <= value <= high:
+        raise InputError(f"{option} {text!r}: must be a whole number from {low} to {high}")
+    return value
+
+
+def seed(args):
+    return whole("--seed", args.seed, 0, 2**31 - 1)
+
+
+def check_out(args):
+    if args.out is not None and not args.out.strip():
+        raise InputError("--out '': must name a folder")
+    if args.out is not None:
+        from jaxtank.files import check_folder
+
+        check_folder(args.out)
+
+
+def span(text):
+    parts = text.split(":")
+    try:
+        low, high = (float(plain_number(p)) for p in parts[:2])
+    except ValueError:
+        raise InputError(f"--free range {text!r}: must be NAME=LOW:HIGH with two numbers") from None
+    if len(parts) > 3 or (len(parts) == 3 and parts[2] not in ("log", "linear")):
+        raise InputError(f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
+    return (low, high, parts[2] if len(parts) == 3 else "log" if low > 0 else "linear")

@@ -1,0 +1,148 @@
+"""The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make. Imports nothing heavy before it runs."""
+
+import sys
+
+from jaxtank.errors import InputError
+from tuning import arguments
+
+STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5}
+
+
+def add(commands, parents):
+    """Add the command to the parser's `commands`."""
+    one = commands.add_parser(
+        "identify", parents=parents, help="plant parameters from a log, with intervals; --out DIR writes a rig to tune"
+    )
+    one.add_argument(
+        "--data", action="append", default=[], metavar="CSV", help="a log; repeatable: several experiments with a start each"
+    )
+    one.add_argument(
+        "--free",
+        action="append",
+        default=[],
+        metavar="NAME=LOW:HIGH",
+        help="what to estimate, of plant, sensor, actuator, disturbance (default: pump gains, splits, orifices, pipes); repeatable",
+    )
+    one.add_argument(
+        "--column",
+        action="append",
+        default=[],
+        metavar="SLOT=HEADER[;UNIT]",
+        help="which column is t, pump1, .., h1, .., where its header does not say so; repeatable",
+    )
+    one.add_argument("--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,")
+    one.add_argument("--gap", default="1.5", metavar="X", help="longest step between samples, in median steps (default 1.5)")
+    one.add_argument("--start", default="free", metavar="HOW", help="first levels: free (default), measured, or case")
+    one.add_argument("--starts", default="8", metavar="N", help="searches (default 8)")
+    one.add_argument("--iterations", default="100", metavar="N", help="evaluations of each search (default 100)")
+    one.add_argument(
+        "--hold-back", default="0.25", metavar="SHARE", help="end of the log to predict before all is fitted: share, or samples"
+    )
+    one.add_argument(
+        "--noise", metavar="SD", help="standard deviation of the readings, one or one per channel (default: from the log)"
+    )
+    one.add_argument("--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber")
+    one.add_argument("--profile", action="store_true", help="also: profile likelihood of the parameter known worst")
+    one.add_argument("--plan", action="store_true", help="no log: compare experiments by the standard deviations they would leave")
+    one.add_argument("--duration", default="300", metavar="S", help="of a planned experiment [s] (default 300)")
+    one.add_argument("--measure", metavar="H1,H2", help="tanks that are measured in a planned experiment (default all)")
+
+
+def run(args):
+    """Run the command; returns the exit code."""
+    arguments.check_out(args)
+    seed, case = arguments.seed(args), arguments.open_case(args)
+    free = dict(arguments.pair("--free", text, arguments.span) for text in args.free) or None
+    if args.plan:
+        return plan(args, case, free)
+    if not args.data:
+        raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
+    from tuning import report
+    from tuning.identify import identify
+    from tuning.log_file import read_log
+
+    columns = dict(case.log) | dict(arguments.pair("--column", text, _column) for text in args.column)
+    logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
+    hold = arguments.number("--hold-back", args.hold_back)
+    if not 0 <= hold < min(one.samples for one in logs):
+        raise InputError(f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of samples of the log")
+    noise = None
+    if args.noise is not None:
+        noise = [arguments.number("--noise", text) for text in args.noise.split(",")]
+        if min(noise) <= 0:
+            raise InputError(f"--noise {args.noise!r}: must be above 0")
+        noise = noise[0] if len(noise) == 1 else noise
+    gap = arguments.number("--gap", args.gap)
+    if not gap >= 1:
+        raise InputError(f"--gap {args.gap!r}: must be at least 1")
+    if not args.quiet:
+        print(f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)} samples", file=sys.stderr, flush=True)
+    found = identify(
+        case,
+        logs,
+        free,
+        start=args.start,
+        starts=arguments.whole("--starts", args.starts, 1, 1000),
+        seed=seed,
+        hold_back=hold if hold < 1 else int(hold),
+        noise=noise,
+        loss=args.loss,
+        profile=args.profile,
+        iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
+        gap=gap,
+    )
+    written = found.save(args.out) if args.out else []
+    print(report.dumps(found.to_json()) if args.json else repr(found))
+    if written and not args.quiet:
+        print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)
+    if found.status == "not_identifiable":
+        words = "; ".join(d["words"] for d in found.directions)
+        print(f"jaxtank: {', '.join(args.data)}: cannot tell apart {words}: no rig is written", file=sys.stderr)
+    elif args.out and not args.quiet:
+        print(f"go on with: jaxtank tune {args.out.rstrip('/')}/rig.toml --robust cvar", file=sys.stderr)
+    return STATUS[found.status]
+
+
+def _column(text):
+    header, semicolon, unit = text.rpartition(";")
+    return (header.strip(), unit.strip()) if semicolon else text
+
+
+def plan(args, case, free):
+    """Compare experiments; returns the exit code."""
+    import numpy as np
+
+    from tuning import report
+    from tuning.experiments import compare_experiments
+
+    duration, dt = arguments.number("--duration", args.duration), 0.0
+    if not 0 < duration < 1e7:
+        raise InputError(f"--duration {args.duration!r}: must be above 0 s")
+    dt = duration / 300
+    tanks = None
+    if args.measure:
+        names = [f"h{i + 1}" for i in range(case.loop.plant.tanks)]
+        for word in args.measure.split(","):
+            if word.strip() not in names:
+                raise InputError(f"--measure {word!r}: must be among {', '.join(names)}")
+        tanks = sorted({names.index(w.strip()) for w in args.measure.split(",")})
+    length = case.loop.units[0]
+    own = float(np.max(np.asarray(case.loop.sensor.noise)))
+    noise = arguments.number("--noise", args.noise) if args.noise else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
+    if not noise > 0:
+        raise InputError(f"--noise {args.noise!r}: must be above 0")
+    found = compare_experiments(case, free, noise=noise, duration=duration, dt=dt, levels=tanks, start="known")
+    if args.json:
+        print(report.dumps(report.clean({"case": case.name, "noise": noise, "duration": duration, "dt": dt, "experiments": found})))
+        return 0
+    names = list(next(iter(found.values()))["sd"])
+    rows = []
+    for words, row in found.items():
+        sds = ["open" if row["sd"][n] is None else f"{row['sd'][n]:.2g}" for n in names]
+        rows.append([words, *sds, "-" if row["condition"] is None else f"{row['condition']:.3g}"])
+    measured = "every level" if tanks is None else ", ".join(f"h{i + 1}" for i in tanks)
+    print(
+        f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with noise of {noise:g} {length} would leave\n"
+    )
+    print(report.table(rows, ["experiment", *names, "condition"]))
+    return 0
