@@ -29,6 +29,14 @@ rms_error_total = 1.0
 [uncertain]                  # spread of the plant's parameters, as a share: what answers are validated on
 "plant.drain" = 0.05
 
+[covariance]                 # of parameters that vary together, as `identify` writes it
+names = ["plant.drain[0]", "plant.drain[1]"]
+matrix = [[1e-6, 0.0], [0.0, 1e-6]]
+
+[log]                        # columns of a log of this rig, with their units: a header, or [header, unit]
+pump1 = ["pump speed", "V"]
+h1 = "level 1 [mm]"
+
 [[scenario]]                 # runs that `tune` judges by, instead of the case's own; scenario = [] at the top: none
 name = "noisy"
 seed = 1
@@ -45,7 +53,7 @@ import jax
 import numpy as np
 
 from jaxtank import loop as lp
-from jaxtank import presets, scheduling
+from jaxtank import presets, record_tables, scheduling
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
@@ -54,9 +62,22 @@ from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Case, Free, Scenario
 from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.signals import Ramps, ramps
-from jaxtank.tree import _short, check_value, describe, get_value, is_component, walk, with_values
+from jaxtank.tree import _short, check_value, describe, get_value, is_component, split_index, walk, with_values
 
-TABLES = ("case", "name", "values", "reference", "schedule", "limits", "free", "objective", "uncertain", "scenario")
+TABLES = (
+    "case",
+    "name",
+    "values",
+    "reference",
+    "schedule",
+    "limits",
+    "free",
+    "objective",
+    "uncertain",
+    "covariance",
+    "log",
+    "scenario",
+)
 KINDS = {"case": (str, "a text"), "name": (str, "a text"), "scenario": (list, "a list of tables, [[scenario]]")}
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 REFERENCE_KEYS = ("initial", "changes", "ramp", "shape", "band")
@@ -111,6 +132,10 @@ def from_table(table):
         case = case.replace(free={name: _free(case.loop, name, spec) for name, spec in table["free"].items()})
     if "uncertain" in table:
         case = case.replace(uncertain=check_uncertain(case.loop, table["uncertain"]))
+    if "covariance" in table:
+        case = case.replace(covariance=record_tables.check_covariance(case.loop, table["covariance"]))
+    if "log" in table:
+        case = case.replace(log=record_tables.check_log(case.loop.plant, table["log"]))
     if "scenario" in table:
         case = case.replace(scenarios=tuple(_scenario(case, entry, i) for i, entry in enumerate(table["scenario"])))
     return check(case)
@@ -123,6 +148,27 @@ def check_uncertain(loop, uncertain):
         if not (_is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
             raise InputError(f"uncertain {name} = {_short(share)}: must be a share between 0 and 1")
     return {name: float(share) for name, share in uncertain.items()}
+
+
+def has(loop, name):
+    """Whether a loop has the leaf `name`, an entry of it for "name[i]"."""
+    try:
+        get_value(loop, name)
+    except InputError:
+        return False
+    return True
+
+
+def uncovered(loop, name, share, covered):
+    """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry where that is part of an array; a
+    share of nothing is left out."""
+    if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
+        return {name: share}
+    if "[" in name:
+        return {} if name in covered else {name: share}
+    value = np.asarray(get_value(loop, name))
+    entries = [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(value.shape) if value[i] != 0] if value.shape else []
+    return {n: share for n in entries if n not in covered}
 
 
 def _scenario(case, entry, index):
@@ -278,6 +324,7 @@ def dump(case):
     lines += ["", "[free]"] + [f"{_toml(n)} = {_toml(list(Free(*spec)))}" for n, spec in case.free.items()]
     lines += ["", "[objective]"] + [f"{m} = {_toml(float(w))}" for m, w in case.objective.items()]
     lines += ["", "[uncertain]"] + [f"{_toml(n)} = {_toml(float(v))}" for n, v in case.uncertain.items()]
+    lines += record_tables.lines(case, _toml)
     for s in case.scenarios:
         inside = ", ".join(f"{_toml(n)} = {_toml(v)}" for n, v in s.values.items())
         lines += ["", "[[scenario]]", f"name = {_toml(s.name)}", f"seed = {s.seed}", f"weight = {_toml(float(s.weight))}"]
@@ -442,4 +489,4 @@ def _toml(value):
     return repr(value)
 
 
-__all__ = ["Case", "check", "dump", "from_table", "load", "open_case", "save", "set_and_schedule", "set_values"]
+__all__ = ["Case", "check", "dump", "from_table", "has", "load", "open_case", "save", "set_and_schedule", "set_values", "uncovered"]

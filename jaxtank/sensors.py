@@ -12,13 +12,14 @@ from jaxtank.tree import component, leaf, static
 class LevelSensor:
     """One level sensor per tank: noise, then an ADC where `bits` is not 0.
 
-        y = h + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale], rounded to full_scale / 2^bits
+        y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale], rounded to full_scale / 2^bits
 
     The ADC's slope is that of the line through its staircase (numerics.quantise).
     """
 
     gain: np.ndarray = leaf("cm/volt", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
+    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain")
     full_scale: np.ndarray = leaf("volt", "range of the ADC", low=0.0, strict=True)
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
@@ -31,7 +32,8 @@ class LevelSensor:
 
     def read(self, x, xi):
         """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or None."""
-        y = x if xi is None else tuple(x[i] + self.noise[i] * xi[i] for i in range(len(x)))
+        y = x if self.offset is None else tuple(h + self.offset[i] for i, h in enumerate(x))
+        y = y if xi is None else tuple(y[i] + self.noise[i] * xi[i] for i in range(len(x)))
         if self.bits == 0:
             return y
         step = self.full_scale / 2**self.bits

@@ -111,8 +111,8 @@ class Discrete:
 class Correlated:
     """Several scalars that vary together: normal with a covariance, as an identification gives it, or by its Cholesky factor.
 
-    names: (n,) dotted names of scalars or entries; covariance: (n, n) in their units; cut: as in Normal, of each independent part. Its key
-    in a dict of distributions is free to choose.
+    names: (n,) dotted names of scalars or entries; covariance: (n, n) in their units; cut: as in Normal, of each independent part. What would
+    leave the range that a parameter allows is held at its end. Its key in a dict of distributions is free to choose.
     """
 
     names: tuple
@@ -157,7 +157,7 @@ class Draws:
     def __init__(self, loop, distributions):
         if not distributions:
             raise InputError("nothing is uncertain: name at least one parameter")
-        self.parts, self.dimensions, self.labels = [], 0, []
+        self.parts, self.dimensions, self.labels, self.ends = [], 0, [], {}
         taken = []
         for name, distribution in distributions.items():
             distribution.check(name)
@@ -178,6 +178,8 @@ class Draws:
                 count = 1 if whole else int(_moves(distribution, nominal).sum())
                 where = [] if whole else np.argwhere(_moves(distribution, nominal))
                 labels = [name] if whole else [f"{name}[{','.join(map(str, i))}]" for i in where]
+            if correlated:
+                self.ends[name] = [_ends(describe(loop, one)) for one in distribution.names]
             self.parts.append((name, distribution, nominal, slice(self.dimensions, self.dimensions + count)))
             self.dimensions += count
             self.labels += labels
@@ -195,7 +197,8 @@ class Draws:
                 tail = ndtr(-distribution.cut)
                 mean = nominal if distribution.mean is None else np.asarray(distribution.mean)
                 drawn = mean + ndtri(tail + (1.0 - 2.0 * tail) * mine) @ distribution.factor().T
-                found.update({one: drawn[:, i] for i, one in enumerate(distribution.names)})
+                ends = self.ends[name]
+                found.update({one: np.clip(drawn[:, i], *ends[i]) for i, one in enumerate(distribution.names)})
                 continue
             if nominal.ndim == 0 or distribution.tied:
                 shaped = mine.reshape(-1, *([1] * nominal.ndim)) + np.zeros(nominal.shape)
@@ -204,6 +207,11 @@ class Draws:
                 shaped[:, _moves(distribution, nominal)] = mine
             found[name] = distribution.quantile(shaped, nominal)
         return found
+
+
+def _ends(meta):
+    """(low, high) of a parameter's own range."""
+    return -math.inf if meta["low"] is None else meta["low"], math.inf if meta["high"] is None else meta["high"]
 
 
 def _moves(distribution, nominal):

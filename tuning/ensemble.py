@@ -18,7 +18,7 @@ from jaxtank.analysis import steady_flows
 from jaxtank.errors import InputError
 from jaxtank.tree import with_values
 from tuning import parts, shards
-from tuning.distributions import Draws, Uniform
+from tuning.distributions import Correlated, Draws, Uniform
 from tuning.objective import LOWER, resolve_limits
 from tuning.scenarios import noisy
 
@@ -160,10 +160,16 @@ def probabilities(method, dimensions, samples, seed):
 
 
 def spread_of(case, share=None):
-    """{name: Uniform}: what the case calls uncertain, each entry on its own; share: one spread for all, the case's own where None."""
-    if not case.uncertain:
+    """{name: distribution}: what the case calls uncertain, uniform, each entry on its own, and what was identified together by its
+    covariance; share: one uniform spread for all of it, instead."""
+    if not case.uncertain and case.covariance is None:
         raise InputError(f"{case.name} names nothing uncertain: say what varies")
-    return {name: Uniform(relative=own if share is None else share) for name, own in case.uncertain.items()}
+    found = {name: Uniform(relative=own if share is None else share) for name, own in case.uncertain.items()}
+    if case.covariance is not None:
+        names, matrix = case.covariance
+        together = {"identified": Correlated(names=names, covariance=matrix)}
+        found |= together if share is None else {name: Uniform(relative=share) for name in names}
+    return found
 
 
 def ensemble(

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.tree import get_value, with_values
 from tuning import scenarios as sc
+from tuning.distributions import Correlated, Draws
 
 STEP = 1e-4
 """Step of the differences of the gradient, in the unit cube [-]."""
@@ -137,7 +138,7 @@ def table_of(problem, values):
 
 def perturbed(problem, samples, seed):
     """Lanes that the search never saw: its scenarios in turn, with every uncertain parameter of the plant off by its own factor, uniform
-    within the case's spread, and fresh sensor noise."""
+    within the case's spread, what was identified together drawn from its covariance, and fresh sensor noise."""
     rng, lanes = np.random.default_rng([HELD_OUT, seed]), []
     for i in range(samples):
         lane = problem.lanes[i % len(problem.lanes)]
@@ -145,6 +146,12 @@ def perturbed(problem, samples, seed):
         for name, spread in problem.case.uncertain.items():
             value = np.asarray(get_value(loop, name))
             loop = with_values(loop, {name: value * (1.0 + spread * rng.uniform(-1.0, 1.0, value.shape))})
+        if problem.case.covariance is not None:
+            names, matrix = problem.case.covariance
+            drawn = Draws(loop, {"identified": Correlated(names=names, covariance=matrix)}).values(
+                rng.uniform(size=(1, len(names)))
+            )
+            loop = with_values(loop, {name: value[0] for name, value in drawn.items()})
         key = None if lane.key is None else jax.random.fold_in(jax.random.key(HELD_OUT + seed), i)
         lanes.append(lane._replace(case=lane.case.replace(loop=loop), key=key, name=f"held-out {i + 1}", weight=1.0 / samples))
     return lanes

@@ -21,13 +21,16 @@ from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.screening import coarse_clock, distinct_starts, screen
-from tuning.solvers import METHODS, Search, minibatches, optimality, restore, slsqp
+from tuning.solvers import METHODS, SETTLED, Search, minibatches, optimality, restore, slsqp
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
 
 FREELY = ("trf", "coarse-trf")
 """Those that do not look at limits."""
+
+RENEWED = 3
+"""How often a search with a tolerance of its own is begun again from where it stopped short."""
 
 MANY = 4
 """Number of parameters from which "auto" tries Gauss-Newton before it looks at limits."""
@@ -123,8 +126,9 @@ def tune(
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             _find_feasible(search, zs, margins, iterations)
-        arrived = tolerance is not None and _status(outcomes, True, search, False) == "converged"
-        if method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None and not arrived:
+        if tolerance is not None and search.best is not None:
+            polished = _settled(search, outcomes, iterations)
+        elif method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
         if search.best is not None and search.violation(search.best) == 0:
             curved = evidence.curvature(problem, search, search.best)
@@ -147,7 +151,11 @@ def tune(
     assert status in STATUSES
     mirrored = None if interrupted or best is None else evidence.mirror_of(problem, outcomes, values)
     validated, cloud = None, None
-    if validation and not interrupted and (case.uncertain or any(lane.key is not None for lane in problem.lanes)):
+    if (
+        validation
+        and not interrupted
+        and (case.uncertain or case.covariance or any(lane.key is not None for lane in problem.lanes))
+    ):
         validated, cloud = evidence.validate(problem, own_values(problem), values, validation, seed)
     result = TuningResult(
         case=case,
@@ -192,6 +200,18 @@ def tune(
     if log is not None:
         problem.memo = problem.memo.memo()
     return result
+
+
+def _settled(search, outcomes, iterations):
+    """True once the best point is one that first-order conditions hold at: a search with a wide tolerance also ends where a step of its line
+    search happened to be short, and is begun again from there, a few times."""
+    if _status(outcomes, True, search, False) == "converged" and optimality(search, search.best)[1] < SETTLED:
+        return True
+    for _ in range(RENEWED):
+        done = slsqp(search, search.best.z, iterations)
+        if done and optimality(search, search.best)[1] < SETTLED:
+            return True
+    return False
 
 
 def _find_feasible(search, zs, margins, iterations):

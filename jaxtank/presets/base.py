@@ -62,7 +62,9 @@ class Case:
     `tune` tunes unless told otherwise; objective: {measure: weight}, what it makes small; reachable: whether every plateau of the
     reference must have a steady state within the pumps' direction (False where the paper asks for one that has none); scenarios: what
     `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange roles, where the law has such;
-    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on.
+    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on; covariance: (names (n,), covariance (n, n) in
+    their units) of parameters that were identified together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its
+    header}, where a log of this rig names them otherwise.
     """
 
     name: str
@@ -76,6 +78,8 @@ class Case:
     scenarios: tuple[Scenario, ...] = ()
     mirror: Mirror | None = None
     uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    covariance: tuple | None = None
+    log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def replace(self, **changes):
         """A copy with the named fields changed."""

@@ -138,6 +138,7 @@ def preset():
             limits={"max_level": "rim"},
             free={p: TUNABLE[p] for p in free},
             objective={"rms_error_total": 1.0},
+            log={"t": "t_s", "pump1": "pump_V", "h2": "lower_tank_V"},
         )
         for name, (words, law, free) in laws.items()
     }

@@ -1,0 +1,59 @@
+"""The tables of a rig file that tie it to a record: [log], its columns; [covariance], how well its parameters were identified."""
+
+import numpy as np
+
+from jaxtank.errors import InputError, unknown
+from jaxtank.tree import _short, describe, get_value
+
+
+def check_log(plant, table):
+    """{slot: header or (header, unit)} of a [log] table; InputError for a slot that the plant does not have."""
+    slots = ["t", *(f"pump{j + 1}" for j in range(plant.pumps)), *(f"h{i + 1}" for i in range(plant.tanks))]
+    found = {}
+    for slot, spec in table.items():
+        if slot not in slots:
+            raise unknown("key of [log]", slot, slots)
+        pair = [spec] if isinstance(spec, str) else spec
+        if not (isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2 and all(isinstance(v, str) and v.strip() for v in pair)):
+            raise InputError(f"log {slot} = {_short(spec)}: must be a column's header, or [header, unit]")
+        found[slot] = pair[0] if len(pair) == 1 else tuple(pair)
+    return found
+
+
+def check_covariance(loop, table):
+    """(names, rows) of a [covariance] table; InputError unless it is a covariance of scalars of the loop."""
+    for key in table:
+        if key not in ("names", "matrix"):
+            raise unknown("key of [covariance]", key, ("names", "matrix"))
+    names, matrix = table.get("names"), table.get("matrix")
+    if not (isinstance(names, list) and names and all(isinstance(n, str) for n in names)):
+        raise InputError("covariance.names: must be a list of parameters")
+    if len(set(names)) < len(names):
+        raise InputError("covariance.names: one is given twice")
+    for name in names:
+        if describe(loop, name)["kind"] == "static" or np.ndim(get_value(loop, name)) != 0:
+            raise InputError(f"covariance {name}: must be a number, an array's entry by name[i]")
+    try:
+        rows = np.asarray(matrix, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        rows = np.zeros(0)
+    good = rows.shape == (len(names),) * 2 and np.all(np.isfinite(rows)) and np.allclose(rows, rows.T, rtol=1e-9, atol=0)
+    sd = np.sqrt(np.abs(np.diag(rows))) if good else np.zeros(1)
+    if not good or np.any(np.diag(rows) <= 0) or np.linalg.eigvalsh(rows / np.outer(sd, sd))[0] <= 0:
+        raise InputError(
+            f"covariance.matrix: must be a symmetric, positive definite {len(names)} by {len(names)} matrix of finite numbers"
+        )
+    return tuple(names), tuple(tuple(map(float, row)) for row in rows)
+
+
+def lines(case, toml):
+    """The lines of both tables in a rig file; toml: how a value is written."""
+    out = []
+    if case.covariance is not None:
+        names, rows = case.covariance
+        out += ["", "[covariance]", f"names = {toml(list(names))}", "matrix = ["]
+        out += [f"  {toml(list(map(float, row)))}," for row in rows] + ["]"]
+    if case.log:
+        out += ["", "[log]"]
+        out += [f"{slot} = {toml(spec if isinstance(spec, str) else list(spec))}" for slot, spec in case.log.items()]
+    return out

@@ -1,0 +1,141 @@
+"""What a fit moves: logarithms of positive parameters, branch gains of a pump that feeds two tanks, the rest as shares of its range."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxtank.signals import Constant
+from jaxtank.tree import get_value, split_index
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """The coordinates p of the scalars to be estimated, as a hashable description.
+
+    items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low + p (high - low); ("branch", gain, split,
+    (low, high) of both branches): p = (log c1, log c2), c1 = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows
+    are linear (mirakhorli, spec 9), gain k = c1 + c2, split s = c1 / (c1 + c2).
+    """
+
+    items: tuple
+
+    @property
+    def names(self):
+        """(size,) dotted name of the value that belongs to each coordinate: of a branch, gain then split."""
+        return tuple(n for kind, *rest in self.items for n in (rest[:2] if kind == "branch" else rest[:1]))
+
+    @property
+    def size(self):
+        """Number of coordinates [-]."""
+        return len(self.names)
+
+    @property
+    def box(self):
+        """(low (size,), high (size,)) of the coordinates."""
+        pairs = []
+        for kind, *rest in self.items:
+            if kind == "branch":
+                pairs += [tuple(np.log(b)) for b in rest[2]]
+            else:
+                pairs.append((0.0, 1.0) if kind == "linear" else (np.log(rest[1]), np.log(rest[2])))
+        return tuple(np.array(side, dtype=float) for side in zip(*pairs)) if pairs else (np.zeros(0), np.zeros(0))
+
+    def values(self, p):
+        """{name: value} at coordinates p (size,), of numpy or jax."""
+        exp = np.exp if isinstance(p, np.ndarray) else _jnp().exp
+        found, i = {}, 0
+        for kind, *rest in self.items:
+            if kind == "log":
+                found[rest[0]] = exp(p[i])
+            elif kind == "linear":
+                found[rest[0]] = rest[1] + p[i] * (rest[2] - rest[1])
+            else:
+                first, second = exp(p[i]), exp(p[i + 1])
+                found[rest[0]], found[rest[1]] = first + second, first / (first + second)
+                i += 1
+            i += 1
+        return found
+
+    def point(self, values):
+        """(size,) coordinates of {name: value}, pushed into the box."""
+        p = []
+        for kind, *rest in self.items:
+            if kind == "log":
+                p.append(np.log(max(values[rest[0]], 1e-300)))
+            elif kind == "linear":
+                p.append((values[rest[0]] - rest[1]) / (rest[2] - rest[1]))
+            else:
+                gain, split = values[rest[0]], np.clip(values[rest[1]], 1e-9, 1 - 1e-9)
+                p += [np.log(gain * split), np.log(gain * (1 - split))]
+        return np.clip(np.array(p, dtype=float), *self.box)
+
+    def slopes(self, p):
+        """(size, size) derivative of the values, in the order of `names`, by the coordinates."""
+        out, i = np.zeros((self.size, self.size)), 0
+        for kind, *rest in self.items:
+            if kind == "log":
+                out[i, i] = np.exp(p[i])
+            elif kind == "linear":
+                out[i, i] = rest[2] - rest[1]
+            else:
+                first, second = np.exp(p[i]), np.exp(p[i + 1])
+                share = first / (first + second)
+                out[i, i : i + 2] = first, second
+                out[i + 1, i : i + 2] = share * (1 - share), -share * (1 - share)
+                i += 1
+            i += 1
+        return out
+
+
+def coordinates(bounds):
+    """The Coordinates of a list of tuning.bounds.Bound: a pump's gain and split, where both are free, by their branch gains."""
+    by_name = {b.name: b for b in bounds}
+    items, done = [], set()
+    for b in bounds:
+        if b.name in done:
+            continue
+        base, index = split_index(b.name)
+        split = f"plant.split[{index[0]}]" if base == "plant.pump_gain" and index else None
+        if split in by_name:
+            s = by_name[split]
+            low, high = max(s.low, 1e-6), min(s.high, 1 - 1e-6)
+            items.append(("branch", b.name, split, ((b.low * low, b.high * high), (b.low * (1 - high), b.high * (1 - low)))))
+            done |= {b.name, split}
+        elif base == "plant.split" and f"plant.pump_gain[{index[0]}]" in by_name:
+            continue  # comes with its gain
+        else:
+            items.append((b.scale, b.name, b.low, b.high))
+            done.add(b.name)
+    return Coordinates(tuple(items))
+
+
+def usual(loop):
+    """{name: (low, high, scale)}: what an identification takes for unknown where nothing is said. Areas are measured with a ruler; pump gains,
+    splits between two tanks, open orifices, pipes and what a lower tank catches of an overflow are not."""
+    plant, found = loop.plant, {}
+    for name in ("pump_gain", "drain", "orifice", "pipe"):
+        values = np.asarray(getattr(plant, name, ()))
+        for i, value in enumerate(np.ravel(values)):
+            if value > 0:
+                found[f"plant.{name}[{i}]"] = (float(value) / 10, float(value) * 10, "log")
+    for j, (_, second) in enumerate(getattr(plant, "feeds", ())):
+        if second is not None:
+            found[f"plant.split[{j}]"] = (0.02, 0.98, "linear")
+    if getattr(plant, "overflow", False):
+        found |= {f"plant.caught[{k}]": (0.0, 1.0, "linear") for k in range(len(plant.spills))}
+    if isinstance(loop.disturbance, Constant):
+        for i, value in enumerate(np.asarray(loop.disturbance.level)):
+            if value != 0:
+                found[f"disturbance.level[{i}]"] = (-10 * abs(float(value)), 10 * abs(float(value)), "linear")
+    return found
+
+
+def nominal(loop, names):
+    """{name: value} of a loop as floats."""
+    return {name: float(np.asarray(get_value(loop, name))) for name in names}
+
+
+def _jnp():
+    import jax.numpy as jnp
+
+    return jnp

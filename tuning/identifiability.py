@@ -1,0 +1,319 @@
+"""How far a fit is to be believed: residuals, intervals, what the data cannot tell apart, and what experiment would."""
+
+import math
+
+import numpy as np
+from scipy.stats import t as student
+
+from jaxtank.tree import describe, get_value
+from tuning import playback as pb
+
+VAGUE = 0.5
+"""Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range), at which nothing is known of it."""
+ROUND_OFF = 1e-9
+"""Singular value, as a share of the largest, below which a direction is one of round-off."""
+PART = 0.1
+"""Share of a direction at which a parameter is named as part of it."""
+LAGS = 60
+
+
+def quality(estimation, fit):
+    """{"rmse", "nrmse_percent", "residual_autocorrelation"}, lists with one entry per channel; rmse in the channel's unit, percent as MATLAB's
+    `compare`: 100 (1 - |y - y^| / |y - mean y|), autocorrelation at one sample."""
+    residuals = residuals_of(estimation, fit)
+    told = {"rmse": [], "nrmse_percent": [], "residual_autocorrelation": []}
+    for c in range(residuals.shape[-1]):
+        r, y = residuals[..., c], np.where(estimation.mask[..., c], estimation.record.y[..., c], np.nan)
+        told["rmse"].append(float(np.sqrt(np.nanmean(r**2))))
+        told["nrmse_percent"].append(percent(r, y))
+        told["residual_autocorrelation"].append(float(autocorrelation(r, 1)[1]))
+    return told
+
+
+def percent(residual, y):
+    """100 (1 - |residual| / |y - its mean|); None for a reading that never changes. Arrays with NaN where there is no reading."""
+    spread = np.sqrt(np.nansum((y - np.nanmean(y)) ** 2))
+    return float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread)) if spread > 0 else None
+
+
+def residuals_of(estimation, fit):
+    """(logs, samples, channels) measured less simulated, NaN where there is no reading."""
+    y = estimation.predicted(estimation.unknowns(fit))
+    return np.where(estimation.mask, estimation.record.y - y, np.nan)
+
+
+def autocorrelation(residual, lags=LAGS):
+    """(lags + 1,) of residuals (logs, samples), NaN passed over; 0 where nothing is left to correlate."""
+    lags = min(lags, residual.shape[-1] - 2)
+    total = np.nanmean(residual**2)
+    found = [1.0]
+    for k in range(1, lags + 1):
+        products = residual[..., k:] * residual[..., :-k]
+        found.append(float(np.nanmean(products) / total) if total > 0 and np.isfinite(products).any() else 0.0)
+    return np.array(found)
+
+
+class Spread:
+    """Standard deviations of a Fit from J'J; directions that the data leave open are taken out first.
+
+    Where residuals are correlated from sample to sample, as those of a model that is not quite the rig's, the covariance is the
+    sandwich (J'J)^-1 S (J'J)^-1 with S of Newey and West (Econometrica 55, 1987, 703): `widened` says how much it widens the intervals.
+    """
+
+    def __init__(self, estimation, fit, told):
+        self.estimation, self.fit = estimation, fit
+        z = estimation.unknowns(fit)
+        low, high = estimation.box
+        edge = 1e-6 * (high - low)
+        self.at_bound = (z < low + edge) | (z > high - edge)
+        # a tank that starts empty is at the end of its range for a good reason
+        self.moving = np.flatnonzero(~self.at_bound)
+        self.freedom = max(fit.residual.size - self.moving.size, 1)
+        self.scale = float(fit.residual @ fit.residual) / self.freedom
+        jacobian = fit.jacobian[:, self.moving]
+        _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+        self.singular, self.axes = s, vt
+        with np.errstate(divide="ignore"):
+            sd = np.sqrt(max(self.scale, 0.0)) / s
+        self.open = (sd > VAGUE) | (s < ROUND_OFF * s.max(initial=0.0))
+        self.sd_of_axes = sd
+        kept = ~self.open
+        inverse = (vt[kept].T / s[kept] ** 2) @ vt[kept]
+        self.white = inverse * self.scale
+        self.widened = 1.0
+        self.covariance = self.white
+        n = fit.residual.size
+        if max(map(abs, told["residual_autocorrelation"]), default=0.0) > 3 / math.sqrt(n / len(estimation.record.channels)):
+            middle = self._scores()
+            sandwich = inverse @ middle @ inverse * n / self.freedom
+            ratio = np.sqrt(np.maximum(np.diag(sandwich), 0) / np.maximum(np.diag(self.white), 1e-300))
+            if ratio.size and np.median(ratio) > 1:
+                self.covariance, self.widened = sandwich, float(np.median(ratio))
+        # an unknown is vague if an open direction carries it further than the rest of the data would let it go
+        own = np.sqrt(np.maximum(np.diag(self.covariance), 0))
+        self.vague = np.zeros(estimation.size, dtype=bool)
+        for axis, reach in zip(self.axes[self.open], np.minimum(sd[self.open], 1.0)):
+            self.vague[self.moving[np.abs(axis) * reach > np.maximum(0.5 * own, 1e-6)]] = True
+
+    def _scores(self):
+        """Newey and West's S of the weighted residuals: products of scores up to the lag at which the residuals have forgotten."""
+        estimation, shape = self.estimation, self.estimation.mask.shape
+        residual = np.full(shape, np.nan)
+        residual[estimation.mask] = self.fit.residual
+        longest = shape[1] // 5
+        acf = np.mean([np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])], axis=0)
+        forgotten = np.flatnonzero(acf < 0.1)
+        lags = int(min(2 * forgotten[0] if forgotten.size else longest, longest))
+        score = np.zeros((*shape, self.moving.size))
+        score[estimation.mask] = self.fit.jacobian[:, self.moving] * self.fit.residual[:, None]
+        score = score.sum(axis=2)
+        total = np.einsum("eki,ekj->ij", score, score)
+        for lag in range(1, lags + 1):
+            one = np.einsum("eki,ekj->ij", score[:, lag:], score[:, :-lag])
+            total += (1 - lag / (lags + 1)) * (one + one.T)
+        return total
+
+    def _values(self):
+        """(covariance of the values of the shared parameters, of the levels), full size, zero where something is fixed."""
+        size = self.estimation.size
+        full = np.zeros((size, size))
+        full[np.ix_(self.moving, self.moving)] = self.covariance
+        shared = self.estimation.coordinates.size
+        turn = np.eye(size)
+        turn[:shared, :shared] = self.estimation.coordinates.slopes(self.fit.p)
+        turn[range(shared, size), range(shared, size)] = self.estimation.level_scale
+        return turn @ full @ turn.T
+
+    @property
+    def quantile(self):
+        """Two-sided 95 % point of Student's distribution."""
+        return float(student.ppf(0.975, self.freedom))
+
+    def _hidden(self):
+        """(unknowns,) whose values have no interval: part of an open direction, or at a bound; of a branch pair, both."""
+        hidden = self.vague | self.at_bound
+        i = 0
+        for kind, *_ in self.estimation.coordinates.items:
+            if kind == "branch":
+                hidden[i : i + 2] = hidden[i : i + 2].any()
+                i += 1
+            i += 1
+        return hidden
+
+    def parameters(self):
+        """{name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}."""
+        est = self.estimation
+        values, sd, hidden = est.coordinates.values(self.fit.p), np.sqrt(np.diag(self._values())), self._hidden()
+        found = {}
+        for i, name in enumerate(est.coordinates.names):
+            b = next(b for b in est.bounds if b.name == name)
+            value, half = float(values[name]), self.quantile * float(sd[i])
+            found[name] = {
+                "before": float(np.asarray(get_value(est.case.loop, name))),
+                "value": value,
+                "unit": b.unit,
+                "lower": b.low,
+                "upper": b.high,
+                "sd": None if hidden[i] else float(sd[i]),
+                "interval95": None if hidden[i] else within(describe(est.case.loop, name), value - half, value + half),
+                "identifiable": (not self.vague[i] and not hidden[i]) or bool(self.at_bound[i] and not self.vague[i]),
+                "at_bound": bool(self.at_bound[i]),
+            }
+        return {b.name: found[b.name] for b in est.bounds}
+
+    def levels(self):
+        """Of each log, of each tank: {"value", "interval95"}; None for an interval of what was not estimated."""
+        est = self.estimation
+        levels = est.levels(est.unknowns(self.fit))
+        sd, hidden, shared = np.sqrt(np.diag(self._values())), self._hidden(), est.coordinates.size
+        rows = []
+        for e in range(len(est.logs)):
+            row = []
+            for tank in range(levels.shape[1]):
+                half = None
+                if tank in est.tanks:
+                    i = shared + e * len(est.tanks) + est.tanks.index(tank)
+                    half = None if hidden[i] else self.quantile * float(sd[i])
+                value = float(levels[e, tank])
+                row.append({"value": value, "interval95": None if half is None else [max(value - half, 0.0), value + half]})
+            rows.append(row)
+        return rows
+
+    def covariance_of_values(self):
+        """(names, (n, n)) of the parameters that have an interval, in their own units."""
+        shared = self.estimation.coordinates.size
+        seen = np.flatnonzero(~self._hidden()[:shared])
+        return tuple(self.estimation.coordinates.names[i] for i in seen), self._values()[np.ix_(seen, seen)]
+
+    def correlation(self):
+        """(names, (n, n)) correlation of the same."""
+        names, matrix = self.covariance_of_values()
+        sd = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        return names, matrix / np.outer(sd, sd)
+
+    def directions(self):
+        """What the data leave open: [{"words", "parameters" {name: factor or change}, "sd"}], the vaguest first."""
+        est, told = self.estimation, []
+        z = est.unknowns(self.fit)
+        for axis, sd in zip(self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]):
+            whole = np.zeros(est.size)
+            whole[self.moving] = axis
+            step = math.log(1.1) / max(np.abs(whole).max(), 1e-300)
+            if whole[np.argmax(np.abs(whole))] < 0:
+                step = -step
+            part = np.abs(whole) > PART
+            moved = {}
+            here, there = (
+                est.coordinates.values(z[: est.coordinates.size]),
+                est.coordinates.values((z + step * whole)[: est.coordinates.size]),
+            )
+            touched = self._touched(part)
+            for i, name in enumerate(est.names):
+                if not touched[i]:
+                    continue
+                moved[name] = float(there[name] / here[name]) if here.get(name) else float(step * whole[i])
+            words = " with ".join(f"{n} x {v:.3g}" if n in here else f"{n} {v:+.2g}" for n, v in moved.items())
+            told.append({"words": words, "parameters": moved, "sd": float(sd) if np.isfinite(sd) else None})
+        return told
+
+    def _touched(self, part):
+        touched, i = part.copy(), 0
+        for kind, *_ in self.estimation.coordinates.items:
+            if kind == "branch":
+                touched[i : i + 2] = part[i : i + 2].any()
+                i += 1
+            i += 1
+        return touched
+
+    def worst(self):
+        """Index of the shared coordinate with the largest standard deviation, among those that are not open."""
+        sd = np.zeros(self.estimation.size)
+        sd[self.moving] = np.sqrt(np.maximum(np.diag(self.covariance), 0))
+        sd[self.vague | self.at_bound] = 0
+        return int(np.argmax(sd[: self.estimation.coordinates.size]))
+
+
+def within(meta, low, high):
+    """[low, high] less what the parameter's own range rules out."""
+    floor, top = meta["low"], meta["high"]
+    return [low if floor is None else max(low, floor), high if top is None else min(high, top)]
+
+
+def held_back(estimation, partial, fit, kept):
+    """How a fit to the first `kept` samples of each log does on the rest: {"samples", "fitted" quality, "held_back" quality}, both simulated in
+    one run from the first sample on."""
+    y = partial.at(partial.unknowns(fit)), partial.levels(partial.unknowns(fit))
+    told = np.asarray(
+        pb.play(
+            y[0], estimation.record.dt, estimation.record.u, y[1], channels=estimation.record.channels, substeps=partial.substeps
+        )
+    )
+    residual = np.where(estimation.mask, estimation.record.y - told, np.nan)
+    found = {"samples": [int(n) for n in kept], "fitted": {}, "held_back": {}}
+    for side in ("fitted", "held_back"):
+        rows = {"rmse": [], "nrmse_percent": []}
+        for c in range(residual.shape[-1]):
+            r, measured = residual[..., c].copy(), np.where(estimation.mask[..., c], estimation.record.y[..., c], np.nan)
+            for e, n in enumerate(kept):
+                hidden = slice(n, None) if side == "fitted" else slice(0, n)
+                r[e, hidden], measured[e, hidden] = np.nan, np.nan
+            rows["rmse"].append(float(np.sqrt(np.nanmean(r**2))) if np.isfinite(r).any() else None)
+            rows["nrmse_percent"].append(percent(r, measured) if np.isfinite(r).any() else None)
+        found[side] = rows
+    return found
+
+
+def remedies(estimation, fit, spread):
+    """Words: which experiment would tell what these data leave open, found by asking the model for its sensitivities there."""
+    from tuning import experiments as ex
+
+    z = estimation.unknowns(fit)
+    found = []
+    for words, logs in ex.alternatives(estimation, z):
+        sd = ex.open_directions(estimation, z, logs, np.sqrt(max(spread.scale, 1e-12)))
+        if sd is not None and sd < VAGUE:
+            found.append(f"{words} (largest standard deviation of a direction {100 * sd:.2g} %)")
+    names = [n for n in estimation.coordinates.names for d in spread.directions() if n in d["parameters"]]
+    if names:
+        found.append(f"measure one of them by itself, as {names[0]}, and leave it out of --free")
+    return found
+
+
+def profile(estimation, fit, spread, loss="linear", points=11, reach=3.0):
+    """Profile likelihood of the parameter that is known worst: it is set, all others are fitted again.
+
+    Returns {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio, "interval95": where it passes 3.84, interpolated, None at
+    a side where it does not}.
+    """
+    i = spread.worst()
+    name = estimation.coordinates.names[i]
+    z = estimation.unknowns(fit)
+    sd = np.zeros(estimation.size)
+    sd[spread.moving] = np.sqrt(np.maximum(np.diag(spread.covariance), 0))
+    grid = np.clip(z[i] + np.linspace(-reach, reach, points) * sd[i], estimation.box[0][i], estimation.box[1][i])
+    inflate = max(spread.widened, 1.0) ** 2 * max(spread.scale, 1e-300)
+    grid = np.unique(grid)  # a bound cuts it short
+    points, middle = len(grid), int(np.argmin(np.abs(grid - z[i])))
+    rise, values = np.zeros(points), np.zeros(points)
+    for side in (range(middle, points), range(middle, -1, -1)):
+        here = z.copy()
+        for j in side:
+            one = estimation.solve(here, loss, fixed={i: grid[j]})
+            here = estimation.unknowns(one)
+            rise[j] = max(2 * (one.cost - fit.cost) / inflate, 0.0)
+            values[j] = float(estimation.coordinates.values(one.p)[name])
+    threshold = 3.841458820694124
+    ends = []
+    for side in (range(middle, -1, -1), range(middle, points)):
+        order = list(side)
+        crossing = next(((a, b) for a, b in zip(order, order[1:]) if rise[b] >= threshold), None)
+        if crossing is None:
+            ends.append(None)
+            continue
+        a, b = crossing
+        share = (math.sqrt(threshold) - math.sqrt(rise[a])) / (math.sqrt(rise[b]) - math.sqrt(rise[a]))
+        ends.append(float(values[a] + share * (values[b] - values[a])))
+    unit = next(b.unit for b in estimation.bounds if b.name == name)
+    if ends[0] is not None and ends[1] is not None:
+        ends = sorted(ends)
+    return {"name": name, "unit": unit, "values": values.tolist(), "rise": rise.tolist(), "interval95": ends}

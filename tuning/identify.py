@@ -1,0 +1,468 @@
+"""Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the answer is to be believed."""
+
+import dataclasses
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import qmc
+
+from jaxtank import rig as rigs
+from jaxtank.errors import DataError, InputError
+from jaxtank.plants.base import Plant
+from jaxtank.tree import with_values
+from tuning import identifiability as idf
+from tuning import logs as lg
+from tuning import playback as pb
+from tuning.bounds import bounds
+from tuning.coordinates import coordinates, nominal, usual
+
+ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
+STARTS = ("free", "measured", "case")
+LOSSES = ("linear", "soft_l1", "huber")
+LARGEST = 1e60
+"""Slope of a reading, in standard deviations per unit of a coordinate, above which the integration has broken down."""
+
+AGREE = 1.001
+"""Two searches whose sums of squares differ by less than this factor have ended in the same place."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit:
+    """Where a search ended."""
+
+    p: np.ndarray  # (shared,) coordinates
+    own: np.ndarray  # (logs, free levels) levels at the start of each log
+    cost: float  # half the weighted sum of squares (of the loss) [-]
+    residual: np.ndarray  # (rows,) weighted
+    jacobian: np.ndarray  # (rows, unknowns) of the weighted residual
+    evaluations: int
+    status: int  # of scipy: above 0 where it has converged
+
+    @property
+    def vector(self):
+        """(unknowns,) p, then the levels of every log."""
+        return np.concatenate([self.p, self.own.ravel()])
+
+
+class Estimation:
+    """What is unknown, what was measured, and the residual between: the problem that `identify` solves.
+
+    case: the rig; logs: of one rig; free: {name: (low, high[, scale])} or None; start: "free" levels at the first sample of each log,
+    "measured" (the readings there are exact) or "case" (they are those of the case); tanks that no log measures start from the case's
+    levels unless they are free; noise: (channels,) standard deviation that weighs each channel, estimated from the record where None.
+    """
+
+    def __init__(self, case, logs, free=None, start="free", noise=None, substeps=None):
+        self.case, self.logs = case, logs
+        loop = case.loop
+        spec = usual(loop) if free is None else {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
+        for name in spec:
+            if not name.startswith(ESTIMATED):
+                raise InputError(
+                    f"free {name}: an identification estimates what begins with {', '.join(ESTIMATED)}; levels with --start"
+                )
+        self.bounds = bounds(loop, spec)
+        self.coordinates = coordinates(self.bounds)
+        self.rig, self.record = pb.rig_of(loop), pb.record(logs, float(loop.actuator.delay))
+        self.start = start
+        if start not in STARTS:
+            raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
+        self.first = self._first_levels()
+        self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
+        self.noise = (
+            noise_of(logs, self.record)
+            if noise is None
+            else np.broadcast_to(np.asarray(noise, dtype=float), (len(self.record.channels),))
+        )
+        self.mask = np.isfinite(self.record.y)
+        self.size = self.coordinates.size + self.first[:, list(self.tanks)].size
+        if self.mask.sum() <= self.size:
+            raise DataError(f"{self.mask.sum()} readings cannot tell {self.size} unknowns: give a longer log, or free fewer")
+        low, high = self.coordinates.box
+        rim = np.asarray(loop.plant.rim)[list(self.tanks)]
+        top = np.maximum(
+            rim * (1.0 if getattr(loop.plant, "overflow", False) else 1.5), self.first[:, list(self.tanks)].max(axis=0, initial=0.0)
+        )
+        self.level_scale = np.tile(rim, len(logs))
+        self.box = (
+            np.concatenate([low, np.zeros(self.level_scale.size)]),
+            np.concatenate([high, np.tile(top, len(logs)) / self.level_scale]),
+        )
+        self.passes = 0
+        middle = self.at(self.origin())
+        self.substeps = (
+            pb.substeps_for(middle, self.record, self.levels(self.origin()), 0.1 * self.noise)
+            if substeps is None
+            else int(substeps)
+        )
+
+    @property
+    def names(self):
+        """(unknowns,) words for every unknown: parameters, then levels at the start."""
+        logs = len(self.logs)
+        where = [f"h{i + 1}(0)" + (f" of log {e + 1}" if logs > 1 else "") for e in range(logs) for i in self.tanks]
+        return (*self.coordinates.names, *where)
+
+    def _first_levels(self):
+        x0 = np.tile(np.asarray(self.case.loop.x0, dtype=float), (len(self.logs), 1))
+        if self.start == "case":
+            return x0
+        sensor = self.rig.sensor
+        for e in range(len(self.logs)):
+            for c, (tank, in_volts) in enumerate(self.record.channels):
+                seen = self.record.y[e, :, c][np.isfinite(self.record.y[e, :, c])]
+                if seen.size:
+                    level = float(seen[0]) * (float(sensor.gain[tank]) if in_volts else 1.0)
+                    x0[e, tank] = max(level - (0.0 if sensor.offset is None else float(sensor.offset[tank])), 0.0)
+        return x0
+
+    def origin(self):
+        """(unknowns,) the case's own values, levels as measured."""
+        p = self.coordinates.point(nominal(self.case.loop, self.coordinates.names))
+        return np.clip(np.concatenate([p, self.first[:, list(self.tanks)].ravel() / self.level_scale]), *self.box)
+
+    def parts(self, z):
+        """(p (shared,), own (logs, free levels) in the rig's unit) of an unknown vector z."""
+        own = (z[self.coordinates.size :] * self.level_scale).reshape(len(self.logs), len(self.tanks))
+        return z[: self.coordinates.size], own
+
+    def at(self, z):
+        """The Rig at z."""
+        return with_values(self.rig, self.coordinates.values(self.parts(z)[0]))
+
+    def levels(self, z):
+        """(logs, tanks) levels at the first sample of each log, at z."""
+        own = self.first.copy()
+        own[:, list(self.tanks)] = self.parts(z)[1]
+        return own
+
+    def predicted(self, z):
+        """(logs, samples, channels) readings at z."""
+        return np.asarray(
+            pb.play(
+                self.at(z), self.record.dt, self.record.u, self.levels(z), channels=self.record.channels, substeps=self.substeps
+            )
+        )
+
+    def pass_at(self, z):
+        """(residual (rows,), jacobian (rows, unknowns)), weighted by the noise; rows are the readings that there are."""
+        p, own = self.parts(z)
+        rig = self.rig
+        if not self.tanks and np.any(self.first != self.first[0]):
+            own, tanks, keep = self.first, tuple(range(self.first.shape[1])), 0
+        else:
+            tanks, keep = self.tanks, len(self.tanks)
+            rig = rig if self.tanks else dataclasses.replace(rig, x0=self.first[0])
+        y, slopes = pb.passes(
+            rig,
+            self.record.dt,
+            self.record.u,
+            p,
+            own,
+            coordinates=self.coordinates,
+            tanks=tanks,
+            channels=self.record.channels,
+            substeps=self.substeps,
+        )
+        y, slopes = np.asarray(y), np.asarray(slopes)
+        self.passes += 1
+        shared, logs = self.coordinates.size, len(self.logs)
+        jacobian = np.zeros((*y.shape, self.size))
+        jacobian[..., :shared] = slopes[..., :shared]
+        for e in range(logs):
+            jacobian[e, ..., shared + e * keep : shared + (e + 1) * keep] = slopes[e, ..., shared : shared + keep]
+        jacobian[..., shared:] *= self.level_scale
+        residual = (y - np.where(self.mask, self.record.y, 0.0)) / self.noise
+        residual, jacobian = residual[self.mask], (jacobian / self.noise[:, None])[self.mask]
+        if not np.all(np.abs(jacobian) < LARGEST):  # also where it is not a number: the search turns back from there
+            residual, jacobian = np.full_like(residual, np.nan), np.zeros_like(jacobian)
+        return residual, jacobian
+
+    def solve(self, z, loss="linear", iterations=100, fixed=None, tolerance=1e-14):
+        """The Fit from the start z. fixed: {index: value} of unknowns that stay, in coordinates; tolerance: gain of an iteration, as a share
+        of the cost, at which it ends."""
+        moving = np.array([i for i in range(self.size) if i not in (fixed or {})])
+        whole, kept = z.copy(), {}
+        for i, value in (fixed or {}).items():
+            whole[i] = value
+
+        def both(v):
+            if kept.get("v") is None or not np.array_equal(kept["v"], v):
+                whole[moving] = v
+                kept["v"], kept["at"] = v.copy(), self.pass_at(whole)
+            return kept["at"]
+
+        low, high = self.box[0][moving], self.box[1][moving]
+        before = self.passes
+        if not np.all(np.isfinite(both(np.clip(whole[moving], low, high))[0])):
+            p, own = self.parts(whole)
+            empty = np.zeros((0, self.size))
+            return Fit(
+                p=p.copy(), own=own, cost=np.inf, residual=empty[:, 0], jacobian=empty, evaluations=self.passes - before, status=-1
+            )
+        found = least_squares(
+            lambda v: both(v)[0],
+            np.clip(whole[moving], low, high),
+            lambda v: both(v)[1][:, moving],
+            bounds=(low - 1e-12, high + 1e-12),
+            x_scale=1.0,
+            loss=loss,
+            f_scale=3.0,
+            xtol=min(1e-8, 1e2 * tolerance),
+            ftol=tolerance,
+            gtol=min(1e-8, 1e2 * tolerance),
+            max_nfev=iterations,
+        )
+        whole[moving] = found.x
+        residual, jacobian = self.pass_at(whole)
+        p, own = self.parts(whole)
+        return Fit(
+            p=p.copy(),
+            own=own,
+            cost=float(found.cost),
+            residual=residual,
+            jacobian=jacobian,
+            evaluations=self.passes - before,
+            status=found.status,
+        )
+
+    def unknowns(self, fit):
+        """(unknowns,) the vector that `solve` and `pass_at` take, of a Fit."""
+        return np.concatenate([fit.p, fit.own.ravel() / self.level_scale])
+
+    def begin(self, count, seed):
+        """(count, unknowns) starts: the case's own values, then Sobol points of the box; measured levels stay as measured."""
+        origin = self.origin()
+        starts = np.tile(origin, (count, 1))
+        measured = {tank for tank, _ in self.record.channels}
+        vary = [i for i in range(self.coordinates.size)]
+        vary += [
+            self.coordinates.size + i
+            for i in range(self.size - self.coordinates.size)
+            if self.tanks[i % len(self.tanks)] not in measured
+        ]
+        if count > 1 and vary:
+            points = qmc.Sobol(len(vary), rng=np.random.default_rng(seed)).random_base2((count - 1).bit_length())[: count - 1]
+            low, high = self.box[0][vary], self.box[1][vary]
+            starts[1:, vary] = low + points * (high - low)
+        return starts
+
+
+def noise_of(logs, rec):
+    """(channels,) standard deviation of the noise in a record, from its second differences, where a level is smooth: median deviation, so
+    that steps do not count. At least a thousandth of what the channel ranges over: below that, weights would be those of round-off."""
+    found = []
+    for c in range(len(rec.channels)):
+        bends, spans = [], []
+        for e in range(len(logs)):
+            y = rec.y[e, :, c][np.isfinite(rec.y[e, :, c])]
+            bends.append(np.abs(np.diff(y, 2)) / np.sqrt(6.0))
+            spans.append(np.ptp(y) if y.size else 0.0)
+        bends = np.concatenate(bends)
+        found.append(max(1.4826 * float(np.median(bends)) if bends.size else 0.0, 1e-3 * max(spans), 1e-12))
+    return np.array(found)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Identification:
+    """What `identify` found. See `jaxtank identify --json` for the same as a table; `save(folder)`, `plot()`."""
+
+    case: Any  # the case that was given
+    estimation: Estimation
+    fit: Fit
+    status: str  # converged, not_converged, not_identifiable
+    parameters: dict  # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}
+    levels: list  # of each log, of each tank: {"value", "interval95"}
+    covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
+    quality: dict  # {"rmse", "nrmse_percent", "residual_autocorrelation"}: per channel; and {"widened", "noise"}
+    directions: list  # what the data cannot tell apart: {"words", "parameters" {name: factor}, "sd"}
+    remedies: list  # words: what experiment would tell it
+    starts: list  # {"cost", "evaluations", "agrees"}
+    validation: dict | None
+    profile: dict | None
+    wall_s: float
+    seed: int
+
+    @property
+    def identified(self):
+        """The case with the estimated plant in it, in the law's and the observer's models too, with covariance and noise."""
+        return identified(self)
+
+    @property
+    def message(self):
+        """In words: how it ended."""
+        from tuning import identify_report
+
+        return identify_report.message(self)
+
+    def __repr__(self):
+        from tuning import identify_report
+
+        return identify_report.text(self)
+
+    def to_json(self):
+        """The JSON object of `jaxtank identify --json`."""
+        from tuning import identify_report
+
+        return identify_report.json_of(self)
+
+    def plot(self):
+        """{name: matplotlib Figure}."""
+        from tuning import identify_report
+
+        return identify_report.figures(self)
+
+    def save(self, folder):
+        """Write rig.toml (where every parameter is identified), result.json, fit.csv and pictures; returns the paths."""
+        from tuning import identify_report
+
+        return identify_report.save(self, folder)
+
+
+def identify(
+    case,
+    log,
+    free=None,
+    *,
+    start="free",
+    starts=8,
+    seed=0,
+    hold_back=0.25,
+    noise=None,
+    loss="linear",
+    substeps=None,
+    profile=False,
+    iterations=100,
+    gap=1.5,
+):
+    """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
+
+        min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2
+
+    case: a Case, or a plant for one with ideal pumps and sensors; log: a `tuning.Log` (see tuning.log, tuning.read_log), or a list of them, each
+    with its own start; free: {name: (low, high)} or (low, high, "log" or "linear"), of plant, sensor, actuator or a constant disturbance;
+    None: pump gains, splits, orifices and pipes; start: levels at the first sample of each log: "free" (estimated, too), "measured" or
+    "case"; starts: searches, the first from the case's own values, the others from Sobol points of the ranges; hold_back: share of
+    each log (below 1), or number of samples, at its end on which a fit to the rest is judged before all is fitted; noise: standard
+    deviation of each channel in its unit, from the record where None; loss: "linear", "soft_l1" or "huber" (beyond 3 standard deviations);
+    substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
+    gap: longest step between samples, in median steps.
+
+    Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
+    """
+    began = time.perf_counter()
+    if not jax.config.jax_enable_x64:
+        raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
+    case = bare(case) if isinstance(case, Plant) else case
+    logs = [log] if isinstance(log, lg.Log) else list(log)
+    if not logs:
+        raise InputError("no log is given")
+    if loss not in LOSSES:
+        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    for one in logs:
+        lg.check_gaps(one, gap)
+        lg.check_fits(one, case.loop)
+    kept = [_kept(one, hold_back) for one in logs]
+    options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
+    partial = Estimation(case, [one.part(0, n) for one, n in zip(logs, kept)], **options)
+    fits = [partial.solve(z, loss, iterations, tolerance=1e-8) for z in partial.begin(starts, seed)]
+    ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
+    if not ranked:
+        raise DataError(f"{logs[0].name}: no search ended with finite readings")
+    best, estimation, validation = partial.solve(partial.unknowns(ranked[0]), loss, iterations), partial, None
+    if any(n < one.samples for n, one in zip(kept, logs)):
+        estimation = Estimation(case, logs, **(options | {"substeps": partial.substeps, "noise": partial.noise}))
+        validation = idf.held_back(estimation, partial, best, kept)
+        best = estimation.solve(partial.unknowns(best), loss, iterations)
+    quality = idf.quality(estimation, best)
+    spread = idf.Spread(estimation, best, quality)
+    parameters, levels = spread.parameters(), spread.levels()
+    directions = spread.directions()
+    status = "converged" if best.status > 0 else "not_converged"
+    if directions:
+        status = "not_identifiable"
+    return Identification(
+        case=case,
+        estimation=estimation,
+        fit=best,
+        status=status,
+        parameters=parameters,
+        levels=levels,
+        covariance=spread.covariance_of_values(),
+        quality=quality | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
+        directions=directions,
+        remedies=idf.remedies(estimation, best, spread) if directions else [],
+        starts=[
+            {"cost": f.cost, "evaluations": f.evaluations, "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12)} for f in fits
+        ],
+        validation=validation,
+        profile=idf.profile(estimation, best, spread, loss) if profile else None,
+        wall_s=time.perf_counter() - began,
+        seed=seed,
+    )
+
+
+def _kept(one, hold_back):
+    """Number of samples of a Log that the first fit sees."""
+    if not (isinstance(hold_back, (int, float)) and not isinstance(hold_back, bool) and 0 <= hold_back < one.samples):
+        raise InputError(
+            f"hold_back = {hold_back!r}: must be a share from 0 to below 1, or a number of samples below {one.samples}"
+        )
+    kept = one.samples - (round(hold_back * one.samples) if hold_back < 1 else int(hold_back))
+    return max(kept, 2)
+
+
+def bare(plant):
+    """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
+    from jaxtank.actuators import PumpBank
+    from jaxtank.controllers import OpenLoop
+    from jaxtank.loop import ClosedLoop
+    from jaxtank.observers import Direct
+    from jaxtank.presets.base import Case
+    from jaxtank.records import Clock
+    from jaxtank.sensors import LevelSensor
+    from jaxtank.signals import Constant
+    from jaxtank.tree import number
+
+    n, m = plant.tanks, plant.pumps
+    still = number(np.zeros(m))
+    loop = ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))),
+        observer=Direct(),
+        controller=OpenLoop(signal=Constant(level=still)),
+        actuator=PumpBank(low=still, high=number(np.full(m, np.inf)), stop=still, pulse=number(np.ones(m)), initial=still),
+        reference=Constant(level=number(np.zeros(len(plant.outputs)))),
+        x0=number(np.zeros(n)),
+    )
+    return Case(name="plant", title="a plant without a law", loop=loop, clock=Clock(), limits={}, free={}, objective={})
+
+
+def identified(result):
+    """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of law and observer; what its uncertainty
+    is made of; noise of the residuals where they are white, else of the record from sample to sample."""
+    case = result.case
+    values = {n: p["value"] for n, p in result.parameters.items()}
+    loop = case.loop
+    for name, value in values.items():
+        loop = with_values(loop, {name: value})
+        for holder in ("controller", "observer"):
+            model = getattr(getattr(loop, holder), "model", None)
+            inner = f"{holder}.model.{name.removeprefix('plant.')}"
+            if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
+                loop = with_values(loop, {inner: value})
+    noise = np.array(loop.sensor.noise, dtype=float)
+    for (tank, volts), rmse, seen in zip(result.estimation.record.channels, result.quality["rmse"], result.quality["noise"]):
+        white = result.quality["widened"] <= 1.05
+        noise[tank] = (rmse if white else min(rmse, seen)) * (float(loop.sensor.gain[tank]) if volts else 1.0)
+    loop = with_values(loop, {"sensor.noise": noise})
+    names, matrix = result.covariance
+    covered = set(names)
+    uncertain = {}
+    for name, share in case.uncertain.items():
+        uncertain |= rigs.uncovered(loop, name, share, covered)
+    covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
+    return case.replace(name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance)

@@ -1,0 +1,226 @@
+"""What an identification says: tables, JSON, pictures, the rig that goes on to `tune`."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank import rig as rigs
+from jaxtank.files import check_folder
+from tuning import identifiability as idf
+from tuning import report, search
+
+FEW = 0.5
+"""Share of the starts that must agree for the answer not to say that few did."""
+
+
+def channel_names(found):
+    """[(name, unit)] of the channels."""
+    length = found.case.loop.units[0]
+    return [(f"h{tank + 1}", "V" if volts else length) for tank, volts in found.estimation.record.channels]
+
+
+def message(found):
+    """How it ended, in words."""
+    words, names = [], channel_names(found)
+    if found.status == "not_converged":
+        words.append("the best search had not converged when its iterations ended: more of them with --iterations")
+    for d in found.directions:
+        words.append(f"the data cannot tell apart: {d['words']} changes no reading that could be seen")
+    agree = sum(s["agrees"] for s in found.starts)
+    words.append(f"{agree} of {len(found.starts)} starts ended in the same place")
+    q = found.quality
+    for (name, unit), rmse, share, rho in zip(names, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]):
+        fit = "" if share is None else f", fit {share:.1f} %"
+        words.append(f"{name}: residual {rmse:.3g} {unit} RMS{fit}, correlation from sample to sample {rho:.2f}")
+    if q["widened"] > 1.05:
+        words.append(
+            f"residuals are correlated, so that the model and not the noise limits the fit: intervals are widened {q['widened']:.1f} times for it"
+        )
+    for n, p in found.parameters.items():
+        if p["at_bound"]:
+            words.append(f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval")
+    return "; ".join(words)
+
+
+def _table(found):
+    rows = []
+    for n, p in found.parameters.items():
+        interval = (
+            f"{p['interval95'][0]:.5g} .. {p['interval95'][1]:.5g}"
+            if p["interval95"]
+            else "none: " + ("at a bound" if p["at_bound"] else "not identifiable")
+        )
+        sd = f"{100 * p['sd'] / abs(p['value']):.2g} %" if p["sd"] is not None and p["value"] else "-"
+        rows.append([n, p["unit"], f"{p['before']:.5g}", f"{p['value']:.5g}", interval, sd])
+    return report.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
+
+
+def text(found):
+    """The result as a page of text."""
+    est = found.estimation
+    readings = int(est.mask.sum())
+    steps = np.concatenate([np.diff(one.t) for one in est.logs])
+    even = np.ptp(steps) < 1e-6 * steps.mean()
+    pace = f"every {np.median(steps):g} s" if even else f"{steps.min():g} to {steps.max():g} s apart"
+    missing = sum(one.y.size for one in est.logs) - readings
+    lines = [
+        f"{found.case.name}: {found.status.replace('_', ' ')}",
+        f"{', '.join(one.name for one in est.logs)}: {sum(one.samples for one in est.logs)} samples {pace}, {readings} readings"
+        + (f" ({missing} missing)" if missing else "")
+        + f", {est.size} unknowns, {est.substeps} Runge-Kutta step{'s' if est.substeps > 1 else ''} a sample",
+        "",
+        _table(found),
+        "",
+        _levels(found),
+        "",
+        "\n".join(f"- {w}" for w in message(found).split("; ")),
+    ]
+    if found.validation:
+        lines += ["", _validation(found)]
+    if found.remedies:
+        lines += ["", "What would tell them apart:"] + [f"- {w}" for w in found.remedies]
+    if found.profile:
+        p = found.profile
+        unit = "" if p["unit"] == "-" else f" {p['unit']}"
+        ends = [
+            f"{e:.5g}{unit}" if e is not None else f"beyond the {side} one tried"
+            for e, side in zip(p["interval95"], ("lowest", "highest"))
+        ]
+        lines += ["", f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"]
+    lines += ["", f"{found.wall_s:.1f} s, {sum(s['evaluations'] for s in found.starts)} passes"]
+    return "\n".join(lines)
+
+
+def _levels(found):
+    unit, rows = found.case.loop.units[0], []
+    for e, row in enumerate(found.levels):
+        said = []
+        for i, level in enumerate(row):
+            ends = level["interval95"]
+            said.append(f"h{i + 1} {level['value']:.4g}" + (f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""))
+        rows.append(f"levels at the first sample{f' of log {e + 1}' if len(found.levels) > 1 else ''} [{unit}]: " + ", ".join(said))
+    return "\n".join(rows)
+
+
+def _validation(found):
+    v, rows = found.validation, []
+    for c, (name, unit) in enumerate(channel_names(found)):
+        for side, words in (("fitted", "fitted to"), ("held_back", "held back")):
+            rmse, share = v[side]["rmse"][c], v[side]["nrmse_percent"][c]
+            rows.append([name, words, "-" if rmse is None else f"{rmse:.4g} {unit}", "-" if share is None else f"{share:.1f} %"])
+    head = f"fit to the first {', '.join(map(str, v['samples']))} samples, the rest predicted from the same start"
+    return head + "\n" + report.table(rows, ["reading", "part", "RMS", "fit"])
+
+
+def json_of(found):
+    """The JSON object of `jaxtank identify --json`."""
+    names, correlation = correlation_of(found)
+    quality, est = found.quality, found.estimation
+    return {
+        "case": found.case.name,
+        "status": found.status,
+        "success": found.status == "converged",
+        "message": message(found),
+        "parameters": {n: report.clean(p) for n, p in found.parameters.items()},
+        "fit": report.clean({k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}),
+        "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in zip(channel_names(found), quality["noise"])],
+        "intervals_widened": quality["widened"],
+        "initial_levels": [[report.clean(v) for v in row] for row in found.levels],
+        "covariance": {"names": list(found.covariance[0]), "matrix": np.asarray(found.covariance[1]).tolist()},
+        "correlation": {"names": list(names), "matrix": correlation.tolist()},
+        "free_combinations": report.clean(found.directions),
+        "remedies": found.remedies,
+        "validation": report.clean(found.validation),
+        "profile": report.clean(found.profile),
+        "starts": report.clean(found.starts),
+        "data": [{"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())} for one in est.logs],
+        "substeps": est.substeps,
+        "wall_s": found.wall_s,
+        "provenance": search.provenance(found.case, found.seed),
+    }
+
+
+def correlation_of(found):
+    """(names, (n, n)) correlation of the estimates that have an interval."""
+    names, matrix = found.covariance
+    sd = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return names, np.asarray(matrix) / np.outer(sd, sd)
+
+
+def figures(found):
+    """{"fit" or "fit_1" ..: readings and inputs of each log; "residuals", "correlation", "profile"}: matplotlib Figures."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, record_plots
+
+    est, made = found.estimation, {}
+    told = est.predicted(est.unknowns(found.fit))
+    names = channel_names(found)
+    with plt.rc_context(plotting.STYLE):
+        for e, one in enumerate(est.logs):
+            count = len(names) + 1
+            figure, axes = plt.subplots(count, 1, figsize=(7.0, 1.0 + 1.7 * count), sharex=True, layout="constrained")
+            for c, (name, unit) in enumerate(names):
+                held = None
+                if found.validation and found.validation["samples"][e] < one.samples:
+                    held = one.t[found.validation["samples"][e]]
+                record_plots.measured(
+                    axes[c], one.t, est.record.y[e, : one.samples, c], told[e, : one.samples, c], name, unit, held
+                )
+                if c == 0:
+                    axes[c].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3)
+            record_plots.inputs(axes[-1], one.t, one.u, found.case.loop.units[1])
+            if one.u.shape[1] > 1:
+                axes[-1].legend(loc="upper right", ncols=one.u.shape[1])
+            figure.suptitle(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig", fontsize=9)
+            made["fit" if len(est.logs) == 1 else f"fit_{e + 1}"] = figure
+        left = idf.residuals_of(est, found.fit)
+        figure, axes = plt.subplots(len(names), 2, figsize=(8.4, 0.6 + 2.0 * len(names)), squeeze=False, layout="constrained")
+        for c, (name, unit) in enumerate(names):
+            one = est.logs[0]
+            record_plots.residual(axes[c, 0], one.t, left[0, : one.samples, c], name, unit, found.quality["noise"][c])
+            acf = idf.autocorrelation(left[..., c])
+            record_plots.autocorrelation(axes[c, 1], acf, int(np.isfinite(left[..., c]).sum()), name)
+        made["residuals"] = figure
+        kept, matrix = correlation_of(found)
+        if len(kept) > 1:
+            side = 2.6 + 0.42 * len(kept)
+            figure, ax = plt.subplots(figsize=(side + 1.0, side), layout="constrained")
+            record_plots.correlation(ax, kept, matrix)
+            made["correlation"] = figure
+        if found.profile:
+            figure, ax = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
+            record_plots.profile(ax, found.profile)
+            made["profile"] = figure
+    return made
+
+
+def fit_csv(found):
+    """Every log's readings beside the simulated ones, as text; the first column tells the log."""
+    est = found.estimation
+    told = est.predicted(est.unknowns(found.fit))
+    names = channel_names(found)
+    out = io.StringIO()
+    heads = ["log", "t [s]", *(f"pump{j + 1} [{found.case.loop.units[1]}]" for j in range(est.record.u.shape[2]))]
+    for name, unit in names:
+        heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
+    out.write(",".join(heads) + "\n")
+    for e, one in enumerate(est.logs):
+        for k in range(one.samples):
+            cells = [str(e + 1), f"{one.t[k]:.10g}", *(f"{v:.10g}" for v in one.u[k])]
+            for c in range(len(names)):
+                y = est.record.y[e, k, c]
+                cells += ["" if np.isnan(y) else f"{y:.10g}", f"{told[e, k, c]:.10g}"]
+            out.write(",".join(cells) + "\n")
+    return out.getvalue()
+
+
+def save(found, folder):
+    """Write result.json, fit.csv, pictures and, where every parameter is identified, rig.toml to `folder`; returns their paths."""
+    check_folder(folder)
+    files = {"result.json": report.dumps(json_of(found)), "fit.csv": fit_csv(found)}
+    if found.status != "not_identifiable":
+        files["rig.toml"] = rigs.dump(found.identified)
+    files |= {f"{name}.png": report._png(figure) for name, figure in figures(found).items()}
+    return report.write_files(Path(folder), files)
