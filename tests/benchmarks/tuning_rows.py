@@ -155,6 +155,10 @@ def two_tank():
 PLAIN = {"mean_square_error": 1e4, "mean_square_travel": 20.0}  # J of spec D [cm^2]
 # with its price of overshoot, 10 times that of the error: a mean over the plateaus after a rise, which are half of the run
 PRICED = {**PLAIN, "mean_square_overshoot": 2e5}
+# two pumps: spec D runs 300 samples and takes the mean over both pumps, not their sum, of the travel (its starting values 6.040, 7.842 and
+# 6.484 are then met to 4 digits)
+HALF = {"clock.duration": 598.0}
+PLAIN_TWO, PRICED_TWO = ({**terms, "mean_square_travel": 10.0} for terms in (PLAIN, PRICED))
 FLAT = {n: khalid.TUNABLE[n] for n in ("controller.r_w", "controller.a")}
 
 
@@ -171,6 +175,7 @@ def delayed():
 def metres():
     """{name: Row} of calofir and khalid. A programme at every sample is slow: fewer starts."""
     few = {"starts": 2, "screening": 8, "iterations": 15, "validation": 16}
+    more = {**few, "starts": 4, "screening": 32, "iterations": 30}  # minima nearly as good as each other
     one, two = "khalid/laguerre", "khalid/laguerre-mimo"
     rows = {
         "laguerre": Row(one, free=FLAT, objective=PLAIN, choices={"controller.N": [1, 2, 4, 8]}, target="7.887", bound="khalid"),
@@ -179,13 +184,13 @@ def metres():
         "clipped": Row(one, loop=clipped, objective=PLAIN, target="12.644", bound="khalid-clipped"),
         "clipped-priced": Row(one, loop=clipped, objective=PRICED, bound="khalid-clipped-priced"),
         "constrained-priced": Row(f"{one}-constrained", objective=PRICED, options=few, bound="khalid-clipped-priced"),
-        "mimo": Row(two, objective=PLAIN, target="4.147", bound="khalid-mimo"),
-        "mimo-priced": Row(two, objective=PRICED, bound="khalid-mimo-priced"),
+        "mimo": Row(two, HALF, objective=PLAIN_TWO, target="4.147", bound="khalid-mimo"),
+        "mimo-priced": Row(two, HALF, objective=PRICED_TWO, bound="khalid-mimo-priced"),
         "mimo-constrained": Row(
-            f"{two}-constrained", objective=PLAIN, options=few, target="7.719", bound="khalid-mimo-constrained"
+            f"{two}-constrained", HALF, objective=PLAIN_TWO, options=more, target="7.719", bound="khalid-mimo-constrained"
         ),
         "mimo-constrained-M3": Row(
-            f"{two}-constrained", loop=delayed, objective=PLAIN, options=few, target="11.12", bound="khalid-mimo-M3"
+            f"{two}-constrained", HALF, loop=delayed, objective=PLAIN_TWO, options=more, target="11.12", bound="khalid-mimo-M3"
         ),
     }
     return {
@@ -210,8 +215,8 @@ BOUNDS = {
     "khalid-priced": Bound("khalid/laguerre", objective=PRICED),
     "khalid-clipped": Bound("khalid/laguerre", objective=PLAIN, loop=clipped),
     "khalid-clipped-priced": Bound("khalid/laguerre", objective=PRICED, loop=clipped),
-    "khalid-mimo": Bound("khalid/laguerre-mimo", objective=PLAIN),
-    "khalid-mimo-constrained": Bound("khalid/laguerre-mimo-constrained", objective=PLAIN),
-    "khalid-mimo-priced": Bound("khalid/laguerre-mimo", objective=PRICED),
-    "khalid-mimo-M3": Bound("khalid/laguerre-mimo-constrained", objective=PLAIN, loop=delayed),
+    "khalid-mimo": Bound("khalid/laguerre-mimo", HALF, objective=PLAIN_TWO),
+    "khalid-mimo-constrained": Bound("khalid/laguerre-mimo-constrained", HALF, objective=PLAIN_TWO),
+    "khalid-mimo-priced": Bound("khalid/laguerre-mimo", HALF, objective=PRICED_TWO),
+    "khalid-mimo-M3": Bound("khalid/laguerre-mimo-constrained", HALF, objective=PLAIN_TWO, loop=delayed),
 }
