@@ -382,7 +382,7 @@ def identify(
     parameters, levels = spread.parameters(), spread.levels()
     directions = spread.directions()
     status = "converged" if best.status > 0 else "not_converged"
-    if directions:
+    if not all(p["identifiable"] for p in parameters.values()):  # a level at the start that is not told costs nothing but its interval
         status = "not_identifiable"
     return Identification(
         case=case,
@@ -394,7 +394,7 @@ def identify(
         covariance=spread.covariance_of_values(),
         quality=quality | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
         directions=directions,
-        remedies=idf.remedies(estimation, best, spread) if directions else [],
+        remedies=idf.remedies(estimation, best, spread) if status == "not_identifiable" else [],
         starts=[
             {"cost": f.cost, "evaluations": f.evaluations, "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12)} for f in fits
         ],

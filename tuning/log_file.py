@@ -9,15 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import DataError, InputError, nearest
-from tuning.logs import log
+from tuning.logs import FLOWS, LENGTHS, VOLTS, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
 TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
-LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254}
-VOLTS = {"V": 1.0, "mV": 1e-3}
-FLOWS = {"m^3/s": 1.0, "cm^3/s": 1e-6, "l/min": 1e-3 / 60, "l/s": 1e-3, "ml/s": 1e-6, "l/h": 1e-3 / 3600}
 SHARES = {"-": 1.0, "1": 1.0, "%": 0.01}
 KNOWN = {**TIMES, **LENGTHS, **VOLTS, **FLOWS, **SHARES}
 NAMES = {
@@ -46,8 +43,14 @@ def read_log(path, loop, columns=None, decimal="."):
     wanted = _columns(header, path.name, first, loop, columns or {})
     lines, table = [], []
     for line, cells in rows:
+        while len(cells) > len(header) and not cells[-1].strip():  # a separator at the end of the line
+            cells.pop()
         if len(cells) != len(header):
-            hint = ": decimal commas need another separator, as ';' with --decimal ," if len(cells) > len(header) else ""
+            hint = (
+                ": a comma within a number? Cells need another separator then, as ';' with --decimal ,"
+                if len(cells) > len(header)
+                else ""
+            )
             raise DataError(f"{path.name}, line {line}: {len(cells)} cells under {len(header)} column names{hint}")
         if len(table) >= MOST_ROWS:
             raise DataError(f"{path.name}: more than {MOST_ROWS} samples")
@@ -66,14 +69,17 @@ def read_log(path, loop, columns=None, decimal="."):
         in_volts=[wanted[i].in_volts for i in levels],
         name=path.name,
         lines=lines,
+        headers=tuple(w.header for w in wanted),
+        units=tuple(w.unit for w in wanted),
     )
 
 
 class _Column:
     """A column of the file: where it stands, what it is, what to multiply it with."""
 
-    def __init__(self, index, kind, number, header, factor, in_volts=False):
-        self.index, self.kind, self.number, self.header, self.factor, self.in_volts = index, kind, number, header, factor, in_volts
+    def __init__(self, index, kind, number, header, unit, factor, in_volts=False):
+        self.index, self.kind, self.number, self.header, self.unit = index, kind, number, header, unit
+        self.factor, self.in_volts = factor, in_volts
 
 
 def _text(path):
@@ -99,7 +105,11 @@ def _rows(text, name):
     delimiter = max((";", "\t", ","), key=lambda d: (first.count(d), d == ","))
     reader = csv.reader(io.StringIO(text), delimiter=delimiter)
     try:
+        end = 0
         for cells in reader:
+            start, end = end + 1, reader.line_num
+            if end > start:
+                raise DataError(f"{name}, line {start}: a quotation mark opens and does not close on that line")
             if cells and any(c.strip() for c in cells) and not cells[0].lstrip().startswith("#"):
                 yield reader.line_num, cells
     except csv.Error as error:
@@ -118,7 +128,7 @@ def _number(cell, decimal, name, line, column):
     if decimal == "," and "." in text:
         raise DataError(f"{where}: {text!r} has a point, where the decimal sign is a comma")
     try:
-        if "_" in text:
+        if "_" in text or not text.isascii():
             raise ValueError(text)
         value = float(text.replace(",", ".") if decimal == "," else text)
     except ValueError:
@@ -131,6 +141,10 @@ def _number(cell, decimal, name, line, column):
     if not math.isfinite(value):
         raise DataError(f"{where}: {text!r} is not finite; leave a missing reading empty")
     return value
+
+
+def _is_number(cell):
+    return re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?", cell) is not None
 
 
 def split_header(header):
@@ -147,9 +161,10 @@ def _columns(header, name, line, loop, given):
     plant, (length, drive) = loop.plant, loop.units
     slots = {"t": ("time", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
     slots |= {f"h{i + 1}": ("level", i) for i in range(plant.tanks)}
-    if len(set(header)) < len(header):
-        twice = next(h for h in header if header.count(h) > 1)
-        raise DataError(f"{name}, line {line}: two columns are called {twice!r}")
+    if all(_is_number(cell) for cell in header):
+        raise DataError(
+            f"{name}, line {line}: has numbers where the columns' names should be: begin with a header, as 't [s],pump1 [{drive}],h1 [{length}]'"
+        )
     found, taken = [], {}
     for slot, spec in given.items():
         if slot not in slots:
@@ -178,8 +193,10 @@ def _columns(header, name, line, loop, given):
                 )
             continue
         index, unit = taken[slot]
+        if header.count(header[index]) > 1:
+            raise DataError(f"{name}, line {line}: two columns are called {header[index]!r}")
         factor, in_volts = _factor(kind, unit, length, drive, f"{name}, line {line}, column {header[index]!r}")
-        found.append(_Column(index, kind, number, header[index], factor, in_volts))
+        found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
     if not any(c.kind == "level" for c in found):
         raise DataError(
             f"{name}, line {line}: no column for a level among {', '.join(map(repr, header))}; name it with --column h1=HEADER"
