@@ -2,6 +2,7 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
     "#D55E00",
@@ -295,6 +296,43 @@ def fan(loop, bands, title):
             ax.set_visible(False)
         figure.suptitle(title)
     return figure
+
+
+def cloud(ax, pairs, held, name, unit, limit=None):
+    """One dot for each run: `name` [unit] before tuning across, after tuning up, on the same plant and noise; below the diagonal it fell.
+
+    pairs: (runs, 2) before and after; held: (runs, 2) True where every limit holds; limit: [unit], drawn on both axes. Blue dots hold every
+    limit on both sides, orange squares broke one before, pink crosses break one after.
+    """
+    pairs, held = np.asarray(pairs, dtype=float), np.asarray(held)
+    sorts = (
+        (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "broke a limit before"),
+        (held[:, 0] & held[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
+        (~held[:, 1], "x", FORBIDDEN, 22, "breaks a limit after"),
+    )
+    for mine, marker, colour, size, words in sorts:
+        if mine.any():
+            look = {"s": size, "marker": marker, "color": colour, "alpha": 1.0 if marker == "x" else 0.55, "linewidths": 0.9}
+            ax.scatter(*pairs[mine].T, **look, label=f"{words} ({mine.sum()} of {len(pairs)})", rasterized=True)
+    # a limit far above all runs would only squeeze them into a corner
+    limit = limit if limit is not None and (limit <= 0 or np.max(pairs) > 0.6 * limit) else None
+    shown = pairs if limit is None else np.append(pairs.ravel(), limit)
+    low, high = float(np.min(shown)), float(np.max(shown))
+    low, high = (low / 1.1, high * 1.1) if high > 8 * low > 0 else (low - 0.05 * (high - low), high + 0.05 * (high - low))
+    ax.plot([low, high], [low, high], color=REFERENCE, linewidth=0.9, linestyle="--", label="no change")
+    if limit is not None:
+        ax.axvline(limit, color=FORBIDDEN, linewidth=1.0)
+        ax.axhline(limit, color=FORBIDDEN, linewidth=1.0, label=f"limit {limit:g} {unit}")
+    ax.set(xlabel=f"{name} before [{unit}]", ylabel=f"{name} after [{unit}]")
+    if low > 0 and high > 8 * low:
+        ax.set(xscale="log", yscale="log")
+        for axis in (ax.xaxis, ax.yaxis):  # 0.2, 0.5, 1 ...: powers of ten alone would leave a decade without a number
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+            axis.set_minor_formatter(NullFormatter())
+    ax.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+    ax.set_axisbelow(True)
+    return ax
 
 
 def violations(rows, samples):

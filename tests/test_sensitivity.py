@@ -406,6 +406,24 @@ def test_bad_command(args, tmp_path):
     assert err.startswith("jaxtank: ") and err.count("\n") == 1 and "Traceback" not in err
 
 
+def test_a_cloud_shows_who_broke_a_limit_and_when():
+    pairs = np.array([[1.0, 0.5], [2.0, 1.0], [3.0, 3.5], [2.5, 1.5]])
+    held = np.array([[True, True], [False, True], [False, False], [False, True]])
+    ax = plotting.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("highest level before [cm]", "highest level after [cm]")
+    drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
+    assert drawn == {
+        "broke a limit before (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
+        "holds every limit, before and after (1 of 4)": [[1.0, 0.5]],
+        "breaks a limit after (1 of 4)": [[3.0, 3.5]],
+    }
+    labels = [line.get_label() for line in ax.lines]
+    assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
+    far = plotting.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
+    assert far.get_xscale() == "log" and not any("limit" in line.get_label() for line in far.lines)
+    plt.close("all")
+
+
 def test_pictures():
     figure, axes = plt.subplots(1, 3)
     names = [f"p{i}" for i in range(20)]

@@ -54,7 +54,8 @@ def curvature(problem, search, point):
         if not (up.finite and down.finite):
             return None
         columns.append((up.gradient - down.gradient) / (up.z - down.z)[i] / search.scale)
-    held = [s for m, s, room in zip(point.margins, point.margin_slopes, search.room) if m / room < 1e-4]
+    near = point.margins / search.room - search.backoff < 1e-4
+    held = list(point.margin_slopes[near])
     held += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6]
     basis = np.eye(count)
     if held:

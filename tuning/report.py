@@ -232,7 +232,14 @@ def scenario_rows(result):
     return rows
 
 
+COSTLIEST = 5
+"""Scenarios that a table shows of many: all of a dozen, else the costliest."""
+
+
 def _scenario_table(result):
+    scenarios = scenario_rows(result)
+    many = len(scenarios) > 12
+    worst = sorted(scenarios, key=lambda s: -np.inf if s["objective"]["after"] is None else -s["objective"]["after"])
     rows = [
         [
             s["name"],
@@ -240,10 +247,12 @@ def _scenario_table(result):
             *(number(s["objective"][k]) if s["objective"][k] is not None else "-" for k in ("before", "after")),
             "yes" if s["limits_held"]["after"] else "no",
         ]
-        for s in scenario_rows(result)
+        for s in (worst[:COSTLIEST] if many else scenarios)
     ]
     head = ["scenario", "weight", "objective before", "after", "limits held after"]
-    return [table(rows, head), ""] if rows else []
+    held = sum(s["limits_held"]["after"] for s in scenarios)
+    more = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios; limits held after in {held}"] if many else []
+    return [table(rows, head), *more, ""] if rows else []
 
 
 def _validation_table(result):
@@ -396,6 +405,8 @@ def figures(result, runs=None):
     )
     drawn = {"responses": plotting.responses(result.tuned.loop, runs, title, limits)}
     with plt.rc_context(plotting.STYLE):
+        if result.cloud is not None and len(result.cloud["objective"]):
+            drawn["clouds"] = _clouds(plt, result, unit)
         if result.history:
             figure, ax = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
             plotting.convergence(ax, result.history, unit, bool(result.problem.limits))
@@ -404,6 +415,21 @@ def figures(result, runs=None):
         _landscape(ax, result, unit)
         drawn["landscape"] = figure
     return drawn
+
+
+def _clouds(plt, result, unit):
+    """The runs that the search never saw, before against after: the objective, and the level that comes nearest to its limit."""
+    from jaxtank import plotting
+
+    found, length = result.cloud, result.tuned.loop.units[0]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 4.9), layout="constrained")
+    plotting.cloud(left, found["objective"], found["held"], "objective", unit)
+    name = "highest level over its limit" if found["past"] else "highest level"
+    plotting.cloud(right, found["level"], found["held"], name, length, found["limit"])
+    handles, labels = right.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.suptitle(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw", fontsize=10)
+    return figure
 
 
 def _landscape(ax, result, unit):

@@ -110,8 +110,7 @@ def tune(
     report = _reporter(progress, problem, starts)
     try:
         reference = problem.point(first)
-        search = Search(problem, reference, report)
-        search.tolerance = tolerance or search.tolerance
+        search = Search(problem, reference, report, *([] if tolerance is None else [tolerance]))
         search.take(reference)
         zs, costs, margins, redone = screen(problem, screening, seed)
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)

@@ -26,13 +26,13 @@ ROUGHLY = 1e-4
 class Search:
     """A problem as a solver sees it: scaled cost, margins, memory of the last points, the best one so far."""
 
-    def __init__(self, problem, reference, report):
-        self.problem, self.report = problem, report
-        self.tolerance = 1e-8
+    def __init__(self, problem, reference, report, tolerance=1e-8):
+        self.problem, self.report, self.tolerance = problem, report, tolerance
         self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
         self.room = np.array([max(abs(limit.value), 1.0) for limit in problem.limits])
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
-        self.backoff = BACKOFF * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
+        # a search ends within its tolerance of a limit, on either side
+        self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
         self.best_start = None
         self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
 
@@ -337,7 +337,8 @@ def optimality(search, point):
     """
     g = point.gradient / search.scale
     columns, owners = [], []
-    for i, (m, slope) in enumerate(zip(point.margins / search.room, point.margin_slopes / search.room[:, None])):
+    room = point.margins / search.room - search.backoff
+    for i, (m, slope) in enumerate(zip(room, point.margin_slopes / search.room[:, None])):
         if m < 1e-4:
             columns.append(slope)
             owners.append(i)
