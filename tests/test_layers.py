@@ -29,6 +29,7 @@ ABOVE = [
     {"experiments"},
     {"identifiability"},
     {"identify"},
+    {"many"},
     {"objective"},
     {"screening", "solvers", "input_search", "evidence"},
     {"result"},

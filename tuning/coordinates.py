@@ -25,6 +25,17 @@ class Coordinates:
         return tuple(n for kind, *rest in self.items for n in (rest[:2] if kind == "branch" else rest[:1]))
 
     @property
+    def pairs(self):
+        """((i, i + 1), ...): which coordinates are the two branches of one pump, whose gain and split neither tells alone."""
+        found, i = [], 0
+        for kind, *_ in self.items:
+            if kind == "branch":
+                found.append((i, i + 1))
+                i += 1
+            i += 1
+        return tuple(found)
+
+    @property
     def size(self):
         """Number of coordinates [-]."""
         return len(self.names)

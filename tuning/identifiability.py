@@ -132,12 +132,8 @@ class Spread:
     def _hidden(self):
         """(unknowns,) whose values have no interval: part of an open direction, or at a bound; of a branch pair, both."""
         hidden = self.vague | self.at_bound
-        i = 0
-        for kind, *_ in self.estimation.coordinates.items:
-            if kind == "branch":
-                hidden[i : i + 2] = hidden[i : i + 2].any()
-                i += 1
-            i += 1
+        for pair in self.estimation.coordinates.pairs:
+            hidden[list(pair)] = hidden[list(pair)].any()
         return hidden
 
     def parameters(self):
@@ -217,12 +213,9 @@ class Spread:
         return told
 
     def _touched(self, part):
-        touched, i = part.copy(), 0
-        for kind, *_ in self.estimation.coordinates.items:
-            if kind == "branch":
-                touched[i : i + 2] = part[i : i + 2].any()
-                i += 1
-            i += 1
+        touched = part.copy()
+        for pair in self.estimation.coordinates.pairs:
+            touched[list(pair)] = part[list(pair)].any()
         return touched
 
     def worst(self):

@@ -382,7 +382,9 @@ def identify(
     parameters, levels = spread.parameters(), spread.levels()
     directions = spread.directions()
     status = "converged" if best.status > 0 else "not_converged"
-    if not all(p["identifiable"] for p in parameters.values()):  # a level at the start that is not told costs nothing but its interval
+    if not all(
+        p["identifiable"] for p in parameters.values()
+    ):  # a level at the start that is not told costs nothing but its interval
         status = "not_identifiable"
     return Identification(
         case=case,

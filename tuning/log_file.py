@@ -96,7 +96,7 @@ def _text(path):
         raise DataError(f"log {path.name!r} is not UTF-8 text (byte {error.start})") from None
     if "\0" in text:
         raise DataError(f"log {path.name!r} is not text: it has zero bytes")
-    return text
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _rows(text, name):
@@ -153,7 +153,7 @@ def split_header(header):
     if found:
         return found.group(1).strip(), found.group(2)
     stem, line, tail = header.rpartition("_")
-    return (stem.strip(), tail) if line and tail in KNOWN else (header.strip(), None)
+    return (stem.strip(), tail) if line and tail in KNOWN and not tail.isdigit() else (header.strip(), None)
 
 
 def _columns(header, name, line, loop, given):

@@ -86,7 +86,7 @@ def log(*, t, u, y, tanks=None, in_volts=None, name="log", lines=None, headers=N
     lines = None if lines is None else np.asarray(lines)
     found = Log(t=t, u=u, y=y, tanks=tanks, in_volts=in_volts, name=name, lines=lines, headers=headers, units=units)
     if len(t) < 2:
-        raise DataError(f"{name}: has {len(t)} samples, at least 2 are needed")
+        raise DataError(f"{name}: has {len(t)} sample{'s' if len(t) != 1 else ''}, at least 2 are needed")
     table = np.concatenate([t[:, None], u, y], axis=1)
     wrong = ~np.isfinite(table)
     wrong[:, 1 + u.shape[1] :] = np.isinf(y)  # a reading may be missing
@@ -139,7 +139,7 @@ def check_fits(found, loop):
         what = "pump's upper limit"
         _check_range(found, 1 + j, found.u[:, j], drive, low - 0.1 * top, DRIVE_MARGIN * top, what, top)
         most = float(np.max(np.abs(found.u[:, j])))
-        if np.isfinite(top) and 0 < most < FAINT * top:
+        if np.isfinite(top) and 0 < most < FAINT * top and (drive in VOLTS or drive in FLOWS):  # others have limits in name only
             hint = _instead(found, 1 + j, np.array([most]), drive, 2 * FAINT * top, DRIVE_MARGIN * top)
             raise DataError(
                 f"{found.where(column=1 + j)}: pump{j + 1} is never given more than {most:g} {drive}, where its upper limit is "
