@@ -398,7 +398,11 @@ MEASURES = {
         "cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"
     ),
     "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
+    "time_of_min_level": Measure("s", "tank", ("min_level",), _extremes("min_level", 1), "when the lowest level was reached"),
 }
+
+TIMES = {"max_level": "time_of_max_level", "min_level": "time_of_min_level"}
+"""Measures that say when another one was reached: not reported by themselves."""
 
 SQUARES = tuple(m for m, spec in MEASURES.items() if spec.residual)
 """Measures that are sums of squares over the run."""

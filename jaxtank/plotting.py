@@ -1,7 +1,10 @@
 """Pictures: one function each, drawn on given matplotlib axes and returning them. The only room here that imports matplotlib."""
 
+import textwrap
+
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import BoundaryNorm
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
@@ -96,9 +99,10 @@ def responses(loop, trajectories, title="", limits=None):
     ]
     rows = [row for row in rows if row]
     columns = max(len(row) for row in rows)
+    width = max(4.6 * columns, 6.4)
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            len(rows), columns, figsize=(4.6 * columns, 2.05 * len(rows) + 0.5), sharex=True, squeeze=False, layout="constrained"
+            len(rows), columns, figsize=(width, 2.05 * len(rows) + 0.5), sharex=True, squeeze=False, layout="constrained"
         )
         for row, line in zip(rows, axes):
             for draw, ax in zip(row, line):
@@ -112,7 +116,7 @@ def responses(loop, trajectories, title="", limits=None):
             for handle, label in zip(*ax.get_legend_handles_labels()):
                 handles.setdefault(label, handle)
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle("\n".join(textwrap.fill(line, int(12 * width)) for line in title.splitlines()), fontsize=10)
     return figure
 
 
@@ -140,8 +144,14 @@ def convergence(ax, history, unit, limited):
     for s in np.unique(start)[1:]:
         ax.axvline(index[start == s][0] - 0.5, color="0.85", linewidth=0.8, zorder=0)
     ax.set(xlabel="evaluation (grey lines: next start)", ylabel=f"objective [{unit}]", title="convergence")
-    if cost.max() > 5 * cost.min() > 0:
+    finite = cost[np.isfinite(cost)]
+    top = max(float(np.quantile(finite, 0.95)), float(finite[0]))  # a few wild trials would press all the rest into one line
+    high = min(float(finite.max()), 1.5 * top) if top > 0 else float(finite.max())
+    if high > 5 * finite.min() > 0:
         ax.set_yscale("log")
+    if high < finite.max():
+        ax.set_ylim(top=high)
+        ax.set_title(f"convergence ({int((finite > high).sum())} evaluations above the picture)")
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
     return ax
 
@@ -167,9 +177,12 @@ def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, 
     """Objective over two parameters as filled contours; beyond the pink line a limit is broken."""
     finite = np.where(np.isfinite(cost), cost, np.nan)
     low, high = np.nanmin(finite), np.nanquantile(finite, 0.98)
-    levels = np.geomspace(max(low, 1e-12), high, 18) if high > 4 * low > 0 else np.linspace(low, high, 18)
-    filled = ax.contourf(x, y, finite, levels=levels, cmap="cividis_r", extend="both")
-    ax.figure.colorbar(filled, ax=ax, label=f"objective [{cost_unit}]", format="%.3g")
+    # a colour for each factor in the distance from the least, so that the valley shows and not the slopes alone
+    levels = np.unique(np.append(low, low + max(high - low, 1e-12) * np.geomspace(1e-3, 1.0, 16)))
+    filled = ax.contourf(
+        x, y, finite, levels=levels, cmap="cividis_r", extend="both", norm=BoundaryNorm(levels, 256, extend="both")
+    )
+    ax.figure.colorbar(filled, ax=ax, label=f"objective [{cost_unit}]", format="%.4g", ticks=levels[::3])
     if np.nanmax(violation) > 0 and np.nanmin(violation) <= 0:
         ax.contour(x, y, violation, levels=[0.0], colors=[FORBIDDEN], linewidths=2.0)
         ax.contourf(x, y, violation, levels=[0.0, np.inf], colors="none", hatches=["///"])

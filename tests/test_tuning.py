@@ -249,6 +249,7 @@ class Bowl:
     """(z1 - 0.7)^2 + 4 (z2 - 0.2)^2 + 0.1 under z1 <= 0.5: optimum (0.5, 0.2), multiplier 0.4. NaN in a corner."""
 
     limits = (Limit("max_level", 0, 1.0),)
+    rooms = np.ones(1)
     bounds = ()
     model = None
 

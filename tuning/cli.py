@@ -255,7 +255,10 @@ def _one_line(error):
 
 
 def _limits(args, case):
-    limits = dict(case.limits)
+    limits, given = dict(case.limits), [text.partition("=")[0].strip() for text in args.limit]
+    for name in given:
+        if given.count(name) > 1:
+            raise InputError(f"--limit {name} is given {given.count(name)} times: give it once (several tanks: {name}=30,28)")
     for text in args.limit:
         if text == "none":
             limits = {}
@@ -269,6 +272,15 @@ def _limits(args, case):
         else:
             limits[measure] = value
     return limits
+
+
+def _once(option, pairs):
+    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is given twice."""
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{option} {name} is given {names.count(name)} times: give it once")
+    return dict(pairs) or None
 
 
 def _scenarios(args):
@@ -487,7 +499,7 @@ def _simulate(args):
         rows = [
             [m, ms.unit(m, case.loop.units), report.numbers(values[m]), s.doc]
             for m, s in ms.MEASURES.items()
-            if m in values and m != "time_of_max_level"
+            if m in values and m not in ms.TIMES.values()
         ]
         print(report.table(rows, ["measure", "unit", "value", ""]))
     _written(written, args)
@@ -500,13 +512,15 @@ def _tune(args):
     from jaxtank.rig import check_objective
     from tuning import report, search
 
-    free = dict(_pair("--free", text, _range) for text in args.free) or None
-    objective = dict(_pair("--objective", text, lambda v: _number("--objective", v)) for text in args.objective) or None
+    free = _once("--free", [_pair("--free", text, _range) for text in args.free])
+    objective = _once("--objective", [_pair("--objective", text, lambda v: _number("--objective", v)) for text in args.objective])
     if objective:
         objective = check_objective(objective)
     limits, scenarios, sweep = _limits(args, case), _scenarios(args), _tradeoff(args)
     if args.resume and args.out and args.resume != args.out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
+    if args.resume is not None and not args.resume.strip():
+        raise InputError("--resume '': must name a folder")
     folder = args.resume or args.out
     choices, varied = _choices(args), _distributions(args, case)
     only = (args.samples, args.fresh, args.back_off)
@@ -537,7 +551,7 @@ def _tune(args):
         **more,
         batch=None if args.batch is None else _whole("--batch", args.batch, 1, 100_000),
         validation=_whole("--validation", args.validation, 0, 100_000),
-        log=None if choices else folder,
+        log=folder,
         resume=args.resume is not None,
         starts=_whole("--starts", args.starts, 1, 1000),
         seed=seed,
@@ -559,7 +573,7 @@ def _tune(args):
         result = result.replace(bound=bound(result.tuned, objective, limits))
     written = result.save(folder) if folder else []
     args.out = folder
-    if folder and not choices and result.status != "interrupted":
+    if folder and result.status != "interrupted":
         from tuning.memo import discard
 
         discard(folder)  # the result is whole: there is nothing left to go on with

@@ -19,7 +19,7 @@ LARGEST_CURVATURE = 24
 HELD_OUT = 1_000_003
 """Offset of the seeds of the validation from those of the search."""
 
-REPORTED = tuple(m for m in ms.MEASURES if m not in ("time_of_max_level",))
+REPORTED = tuple(m for m in ms.MEASURES if m not in ms.TIMES.values())
 """Measures in a result, before and after."""
 
 
@@ -130,7 +130,7 @@ def table_of(problem, values):
     table = [None] * len(problem.lanes)
     for group in problem.groups:
         loop = problem.lanes[group.lanes[0]].case.loop
-        names = (*(m for m in REPORTED if ms.serves(m, loop)), "time_of_max_level")
+        names = (*(m for m in REPORTED if ms.serves(m, loop)), *ms.TIMES.values())
         measures, _ = sc.values_of(group, names, points)
         for j, lane in enumerate(group.lanes):
             table[lane] = {m: np.asarray(v)[0, j] for m, v in measures.items()}

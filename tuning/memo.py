@@ -98,9 +98,13 @@ class Log(Memo):
 
 
 def discard(folder):
-    """Remove the log of a folder, if it has one."""
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(Path(folder) / NAME)
+    """Remove the log of a folder, if it has one, and those of a search over choices."""
+    for log in (Path(folder) / NAME, *Path(folder).glob(f"choice_*/{NAME}")):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(log)
+        if log.parent != Path(folder):
+            with contextlib.suppress(OSError):  # not empty: somebody else's
+                log.parent.rmdir()
 
 
 def _digest(kind, asked):

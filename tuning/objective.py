@@ -35,6 +35,9 @@ TAIL = 0.05
 NOT_A_NUMBER = 1e6
 """Amount by which an infinite measure (never settled) is taken to break its limit, and one that does not apply to hold it."""
 
+NOTHING = 1e-3
+"""Share of what a measure is about, below which a limit is as good as 0 [-]."""
+
 SPILL = 1e-6
 """Volume over a rim that counts as none, where rims are physics, as a share of what the tank holds [-]."""
 
@@ -67,6 +70,19 @@ class Limit(NamedTuple):
         if np.isnan(value):
             return NOT_A_NUMBER
         return float(np.clip(self.sign * (self.value - value), -NOT_A_NUMBER, NOT_A_NUMBER))
+
+
+def room_of(limit, loop):
+    """The size by which a limit's margin counts: the limit's own, but no less than a thousandth of what its measure is about (the tanks' height
+    or volume, 1 for a share, 100 for percent), which matters where a limit is 0 or nearly."""
+    length, plant = loop.units[0], loop.plant
+    own = {
+        length: float(np.max(np.asarray(plant.rim))),
+        f"{length}^3": float(np.max(np.asarray(plant.rim) * np.asarray(plant.area))),
+        "%": 100.0,
+        "-": 1.0,
+    }.get(ms.unit(limit.measure, loop.units))
+    return max(abs(limit.value), NOTHING * own) if own is not None else abs(limit.value) or 1.0
 
 
 class Point(NamedTuple):
@@ -126,6 +142,7 @@ class Problem:
         self.lanes = sc.lanes_of(case, self.scenarios, seed)
         self.groups = sc.groups_of(self.lanes)
         self.limits = [limit for i, lane in enumerate(self.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
+        self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
         self.memo = Memo() if memo is None else memo
         self.simulations, self.gradients, self.non_finite = 0, 0, 0

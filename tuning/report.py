@@ -79,7 +79,7 @@ def reasons(measures):
 
 def measures_json(measures):
     """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
-    return {**dict.fromkeys(UNSERVED), **clean({m: v for m, v in measures.items() if m != "time_of_max_level"})}
+    return {**dict.fromkeys(UNSERVED), **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()})}
 
 
 def dumps(table):

@@ -5,6 +5,7 @@ from typing import Any
 
 from jaxtank import measures as ms
 from tuning.evidence import flat_words
+from tuning.solvers import SLOPING
 
 BARELY = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
@@ -22,9 +23,9 @@ class TuningResult:
     parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent}}, the last how much 10 % of the value changes the
     objective [%]; measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
     that the search was judged by; constraints: one dict per limit and scenario with value, margin, tank and time; history: (start,
-    cost, violation [unit of the limit], z) of every evaluation; starts: one dict per local search; curvature, validation: see
-    `evidence`; cloud: cost and highest level of every run of the validation, see `evidence.summary_of`; mirrored: the answer's mirror image, see
-    `evidence.mirror_of`; choices: what each combination of discrete choices gave;
+    cost, violation [share of the limit, see `objective.room_of`], z) of every evaluation; starts: one dict per local search; curvature,
+    validation: see `evidence`; cloud: cost and highest level of every run of the validation, see `evidence.summary_of`; mirrored: the
+    answer's mirror image, see `evidence.mirror_of`; choices: what each combination of discrete choices gave;
     bound: what no law could beat, tradeoff: what a limit costs,
     certificate: what is known of fresh plants, where asked. case and tuned are the Case before and after.
     """
@@ -98,7 +99,7 @@ def constraint_rows(problem, table):
                 "value": float(measures[limit.measure].ravel()[limit.index]),
                 "margin": limit.margin(measures),
                 "tank": None if tank is None else tank + 1,
-                "time_s": float(measures["time_of_max_level"][limit.index]) if limit.measure == "max_level" else None,
+                "time_s": float(measures[ms.TIMES[limit.measure]][limit.index]) if limit.measure in ms.TIMES else None,
                 "scenario": limit.scenario or None,
             }
         )
@@ -109,22 +110,49 @@ def message(result, z, felt, redone):
     """One paragraph for people, parts joined by "; ": what was found, what is tight, what to doubt."""
     words, problem, checked = [], result.problem, result.constraints
     broken = [c for c in checked if c["margin"] < 0]
-    if result.status == "infeasible":
-        worst = min(broken, key=lambda c: c["margin"] / max(abs(c["limit"]), 1.0))
+    if result.status == "not_converged" and broken:
         words.append(
-            f"no point was found that meets every limit: {worst['name']} is {worst['value']:.6g} {worst['unit']}, "
-            f"limit {worst['limit']:.6g} {worst['unit']}, missed by {-worst['margin']:.3g} {worst['unit']}, the least that was found"
+            f"no point that meets every limit was found before the search ended ({broken[0]['name']} is {broken[0]['value']:.6g} of "
+            f"{broken[0]['limit']:.6g} {broken[0]['unit']}): more --iterations, --starts or --screening may find one"
+        )
+    if result.status == "infeasible":
+        worst = sorted(zip((c["margin"] / room for c, room in zip(checked, problem.rooms)), range(len(checked))))
+        worst = [(share, checked[i]) for share, i in worst if share < 0]
+        told = [
+            f"{c['name']} is {c['value']:.6g} {c['unit']}, limit {c['limit']:.6g} {c['unit']}, missed by {-c['margin']:.3g} {c['unit']}"
+            for _, c in worst[:4]
+        ]
+        more = f" (and {len(worst) - 4} more)" if len(worst) > 4 else ""
+        words.append(
+            f"no point was found that meets every limit: {', '.join(told)}{more}; the largest of these, {-100 * worst[0][0]:.3g} % of its "
+            "limit, is the least that was found"
         )
     if result.status == "interrupted":
         words.append("interrupted: this is the best point so far")
-    if result.status == "not_converged":
+    residual, steep = result.optimality["kkt_residual"], result.optimality["gradient_norm"]
+    if result.status != "infeasible" and steep == 0.0 and result.objective["after"] != 0.0:
+        words.append(
+            "the objective has no slope here: it changes in steps, as times and counts do, and a search by gradients cannot tell that this is "
+            "its least; weigh a smooth measure beside it"
+        )
+    elif result.status in ("converged", "not_converged") and residual is not None and residual > SLOPING and not broken:
+        words.append(
+            f"a slope is left that no limit holds up (KKT residual {residual:.2g} of the objective per range of a parameter): "
+            + (
+                "a kink, for steps along it find nothing lower within the limits"
+                if result.status == "converged"
+                else "not yet an optimum"
+            )
+        )
+    if result.status == "not_converged" and not broken and steep != 0.0:
         words.append("no search converged within its iterations: raise --iterations, or try other starts")
     over = [c for c in constraint_rows(problem, result.tables["before"]) if c["margin"] < 0]
-    if over and result.status != "infeasible":
+    if over and not broken:
         told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over[:4])
         more = f" and {len(over) - 4} more" if len(over) > 4 else ""
         words.append(f"the starting values break a limit ({told}{more}), so their objective is not one to reach")
-    tight = [c for c in checked if 0 <= c["margin"] < 1e-3 * abs(c["limit"])]
+    holding = result.optimality["multipliers"]
+    tight = [c for c in checked if c["margin"] >= 0 and (c["margin"] < 1e-3 * abs(c["limit"]) or holding.get(c["name"], 0.0) > 0)]
     for c in tight:
         when = f" at {c['time_s']:.2f} s" if c["time_s"] is not None else ""
         words.append(f"tight: {c['name']}{when} ({c['value']:.7g} of {c['limit']:.7g} {c['unit']})")

@@ -162,7 +162,7 @@ def _on_fresh(result, judge, distributions, limits, fresh, seed):
 
 def _support(result):
     """How many plants hold the answer in place: those at a limit, and for the worst case those at the largest cost."""
-    held = {c["scenario"] for c in result.constraints if c["margin"] < 1e-3 * max(abs(c["limit"]), 1.0)}
+    held = {c["scenario"] for c, room in zip(result.constraints, result.problem.rooms) if c["margin"] < 1e-3 * room}
     if result.problem.risk != "mean":
         costs = np.array([result.problem.cost(row) for row in result.tables["after"]])
         share = result.problem.shares(costs, range(len(costs)))

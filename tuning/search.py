@@ -21,7 +21,7 @@ from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.screening import coarse_clock, distinct_starts, screen
-from tuning.solvers import METHODS, SETTLED, Search, minibatches, optimality, restore, slsqp
+from tuning.solvers import METHODS, SETTLED, Search, downhill, minibatches, optimality, restore, slsqp
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
@@ -107,6 +107,7 @@ def tune(
         problem.memo = Log(log, fingerprint(problem, method, options), resume)
 
     search, outcomes, interrupted, redone, polished, curved = None, [], False, 0, False, None
+    least, settled = False, False  # whether the least violation was found; whether nothing lower lies along a slope that is left
     report = _reporter(progress, problem, starts)
     try:
         reference = problem.point(first)
@@ -124,12 +125,13 @@ def tune(
             outcomes.append(_outcome(search, z, count, converged))
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
-            _find_feasible(search, zs, margins, iterations)
+            least = _find_feasible(search, zs, margins, iterations)
         if tolerance is not None and search.best is not None:
             polished = _settled(search, outcomes, iterations)
         elif method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
         if search.best is not None and search.violation(search.best) == 0:
+            settled = _at_rest(search, iterations)
             curved = evidence.curvature(problem, search, search.best)
     except KeyboardInterrupt:
         interrupted = True
@@ -146,7 +148,7 @@ def tune(
         tables = {"before": evidence.table_of(problem, own_values(problem)), "after": evidence.table_of(problem, values)}
     checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
-    status = "interrupted" if interrupted else _status(outcomes, holds, search, polished)
+    status = "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
     assert status in STATUSES
     mirrored = None if interrupted or best is None else evidence.mirror_of(problem, outcomes, values)
     validated, cloud = None, None
@@ -214,14 +216,17 @@ def _settled(search, outcomes, iterations):
 
 
 def _find_feasible(search, zs, margins, iterations):
-    """Where no search met the limits: least violations from the best so far and from the screened points that come nearest to them."""
+    """Where no search met the limits: least violations from the best so far and from the screened points that come nearest to them. True if
+    one of these searches for the least came to its end."""
     shortfall = np.maximum(0.0, -margins / search.room).max(axis=1)
     nearest = [zs[i] for i in np.argsort(np.where(np.isfinite(shortfall), shortfall, np.inf), kind="stable")[:2]]
+    ended = []
     for z in (search.best.z, *nearest):
-        restore(search, z, iterations)
+        ended.append(restore(search, z, iterations))
         if search.violation(search.best) == 0:
             slsqp(search, search.best.z, iterations)
-            return
+            break
+    return any(ended)
 
 
 def own_values(problem):
@@ -276,9 +281,9 @@ def noisy(case):
 
 
 def run_measures(loop, clock, key):
-    """{measure: value} of everything that is reported of a run, and when the highest levels were reached."""
+    """{measure: value} of everything that is reported of a run, and when the highest and lowest levels were reached."""
     names = tuple(m for m in REPORTED if ms.serves(m, loop))
-    values = lp.evaluate(loop, clock, (*names, "time_of_max_level"), key)
+    values = lp.evaluate(loop, clock, (*names, *ms.TIMES.values()), key)
     return {m: np.asarray(v) for m, v in values.items()}
 
 
@@ -299,14 +304,27 @@ def _outcome(search, z, count, converged):
     }
 
 
-def _status(outcomes, holds, search, polished):
-    """Converged means: the search that gave the answer did, or the last polish of it."""
+def _at_rest(search, iterations):
+    """True if nothing lower is found along what is left of the slope at the best point; where there is, the search goes on from it, a few
+    times."""
+    for _ in range(RENEWED):
+        better = downhill(search, search.best)
+        if better is None:
+            return True
+        slsqp(search, better.z, iterations)
+    return downhill(search, search.best) is None
+
+
+def _status(outcomes, holds, search, polished, least=False, settled=True):
+    """Converged means: the search that gave the answer came to its end, or the last polish of it did, and nothing lower lies along a slope that
+    is left (`settled`). Infeasible: the search for the least violation (`least`) came to its end, and some was left."""
     if search.best is None:
         return "not_converged"
     if not holds:
-        return "infeasible"
+        return "infeasible" if least else "not_converged"
     mine = search.best_start < len(outcomes) and outcomes[search.best_start]["converged"]
-    return "converged" if mine or polished else "not_converged"
+    flat = not np.any(search.best.gradient) and search.best.cost != 0.0
+    return "converged" if (mine or polished) and settled and not flat else "not_converged"
 
 
 def _optimality(search, best):

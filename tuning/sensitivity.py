@@ -28,7 +28,7 @@ LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
 LANES, NUMBERS = 64, 1 << 22
 """Runs in a batch, and the samples that all of them may have together: what is prepared before the loop is held for each."""
 
-COUNTED = ("settling_time", "rise_time", "recovery_time", "saturated_fraction", "time_of_max_level")
+COUNTED = ("settling_time", "rise_time", "recovery_time", "saturated_fraction", *ms.TIMES.values())
 """Measures that count whole samples: a step function of the parameters, whose derivative says nothing."""
 
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}

@@ -12,6 +12,9 @@ BACKOFF = 1e-6
 SETTLED = 0.02
 """KKT residual, of the scaled cost per unit of z, below which a first-order method counts as converged."""
 
+SLOPING = 0.05
+"""KKT residual, of the scaled cost per unit of z, above which an answer is looked at once more: see `downhill`."""
+
 STEEPEST = 10.0
 """Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
 
@@ -29,7 +32,7 @@ class Search:
     def __init__(self, problem, reference, report, tolerance=1e-8):
         self.problem, self.report, self.tolerance = problem, report, tolerance
         self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
-        self.room = np.array([max(abs(limit.value), 1.0) for limit in problem.limits])
+        self.room = problem.rooms
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
         # a search ends within its tolerance of a limit, on either side
         self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
@@ -60,8 +63,8 @@ class Search:
         self.report(self)
 
     def violation(self, point):
-        """Largest amount by which a limit is broken, in the measure's unit; 0 where all hold."""
-        return float(max(0.0, *(-point.margins))) if len(point.margins) else 0.0
+        """Largest amount by which a limit is broken, as a share of its `objective.room_of` [-]; 0 where all hold."""
+        return float(max(0.0, *(-point.margins / self.room))) if len(point.margins) else 0.0
 
     def better(self, a, b):
         """True if a is to be preferred: fewer violations first, then lower cost."""
@@ -236,9 +239,10 @@ def gauss_newton_first(search, z, iterations):
 
 
 def restore(search, z, iterations):
-    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with every margin at least -t."""
+    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with every margin at least -t. True if it came to
+    its end."""
     if not search.problem.limits:
-        return
+        return True
 
     def holds(y):
         return search.margins(y[:-1])[0] + y[-1]
@@ -248,7 +252,7 @@ def restore(search, z, iterations):
         return np.hstack([rows, np.ones((len(rows), 1))])
 
     worst = max(0.0, float(-search.margins(z)[0].min()))
-    minimize(
+    done = minimize(
         lambda y: (y[-1], np.eye(len(y))[-1]),
         np.append(z, worst),
         jac=True,
@@ -257,6 +261,7 @@ def restore(search, z, iterations):
         constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
         options={"maxiter": iterations, "ftol": 1e-10},
     )
+    return bool(done.success) or done.status == 8
 
 
 def lbfgs(search, z, iterations):
@@ -283,7 +288,7 @@ def minibatches(search, z, iterations, batch, rng):
         if not point.finite:
             z = 0.5 * (z + search.last_finite.z)
             continue
-        room = np.array([max(abs(limit.value), 1.0) for limit in search.problem.limits])[list(point.rows)]
+        room = search.room[list(point.rows)]
         push = 100.0 * np.maximum(0.0, -point.margins / room)
         g = point.gradient / search.scale - push @ (point.margin_slopes / room[:, None])
         g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
@@ -335,6 +340,12 @@ def optimality(search, point):
 
     The residual is what is left of the gradient after the best non-negative combination of the slopes of active limits and bounds.
     """
+    residual, multipliers = _left(search, point)
+    return float(np.linalg.norm(point.gradient / search.scale)), float(np.linalg.norm(residual)), multipliers
+
+
+def _left(search, point):
+    """(what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
     g = point.gradient / search.scale
     columns, owners = [], []
     room = point.margins / search.room - search.backoff
@@ -355,7 +366,27 @@ def optimality(search, point):
         for owner, value in zip(owners, found):
             if owner is not None:
                 multipliers[owner] = value
-    return float(np.linalg.norm(g)), float(np.linalg.norm(residual)), multipliers
+    return residual, multipliers
+
+
+STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+"""Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
+
+LOWER_BY = 1e-4
+"""Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""
+
+
+def downhill(search, point):
+    """A Point within the limits that is lower than `point` by more than the cost can be trusted to, found along the slope that is left of it;
+    None where there is none: the point is an optimum, or at a kink."""
+    residual, _ = _left(search, point)
+    if np.linalg.norm(residual) <= SLOPING:
+        return None
+    for stride in STRIDES:
+        other = search.point(point.z - stride * residual / np.linalg.norm(residual))
+        if other.finite and search.violation(other) == 0.0 and other.cost < point.cost - LOWER_BY * abs(point.cost):
+            return other
+    return None
 
 
 METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam, "trf-slsqp": gauss_newton_first, "coarse-trf": coarse_first}

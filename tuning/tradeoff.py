@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.errors import InputError
 from jaxtank.measures import check_names
-from tuning.objective import LOWER, Problem, resolve_limits
+from tuning.objective import LOWER, Problem, resolve_limits, room_of
 from tuning.solvers import Search, restore, slsqp
 
 MANY = 50
@@ -38,6 +38,7 @@ def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, s
             for i, lane in enumerate(problem.lanes)
             for limit in resolve_limits(lane.case, {**others, measure: value}, i, lane.name)
         ]
+        problem.rooms = np.array([room_of(limit, problem.loop) for limit in problem.limits])
         problem.memo = type(problem.memo)()  # margins are of the limits: what is remembered would be of the last ones
         search = Search(problem, problem.point(problem.start()), lambda s: None)
         converged = slsqp(search, z, iterations)
