@@ -14,6 +14,7 @@ from scipy import stats
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
+from jaxtank._xla import WIDE
 from jaxtank.analysis import steady_flows
 from jaxtank.errors import InputError
 from jaxtank.tree import with_values
@@ -300,7 +301,7 @@ class _Runner:
         return {n: np.asarray(v) for n, v in found.items()}
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"))
+@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"), compiler_options=WIDE)
 def _run(loop, values, indices, seed, clock, names):
     def one(values, index):
         noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)

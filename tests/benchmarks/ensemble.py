@@ -2,16 +2,20 @@
 
     python tests/benchmarks/ensemble.py [--rounds 3]
 
-Every figure is of this machine in this run; compilation is apart. The C loop runs one plant at a time
-(gcc -O3 -march=native), without vector lanes.
+Every figure is of this machine in this run; compilation is apart. The C loop in vector lanes is floor_lanes.c (gcc -O3 -march=native
+-mprefer-vector-width=512, no -ffast-math) on the same plants, its time taken in turn with ours, one core each; the other one runs one plant
+at a time (tuning/floor.c).
 """
 
 import argparse
+import ctypes
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -19,7 +23,12 @@ import numpy as np
 import tuning
 from jaxtank import presets, rig
 from tuning import bench
+from tuning.distributions import Draws
+from tuning.ensemble import probabilities, spread_of
 
+SOURCE = Path(__file__).with_name("floor_lanes.c")
+FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+BLOCK = 32  # lanes that the C loop holds in registers and L1; 8 to 64 differ by a tenth
 NAMES = ("rms_error_total", "max_level")
 
 
@@ -37,6 +46,66 @@ def seconds(call, rounds):
 def draw(case, samples, **options):
     """The ensemble that is timed: error and highest levels, no fan."""
     return tuning.ensemble(case, samples=samples, measures=NAMES, fan=False, **options)
+
+
+def c_lanes(folder):
+    """The C loop of floor_lanes.c, None where there is no gcc."""
+    if shutil.which("gcc") is None:
+        return None
+    library = Path(folder) / "lanes.so"
+    subprocess.run(["gcc", *FLAGS, f"-DLANES={BLOCK}", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True)
+    function = ctypes.CDLL(str(library)).four_tanks
+    function.restype = None
+    return function
+
+
+def c_run(function, case, samples):
+    """A call of the C loop on the plants that `draw` draws: () -> (total rms error (samples,), highest levels (samples, 4)) [cm]."""
+    plant, law, clock = case.loop.plant, case.loop.controller, case.clock
+    space = Draws(case.loop, spread_of(case))
+    v = space.values(probabilities("random", space.dimensions, samples, 0))
+    rows = np.concatenate([v["plant.drain"][:, :2].T, v["plant.orifice"].T, v["plant.pump_gain"].T])
+    rows = np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge").copy()
+    model = law.model
+    area, drain, orifice, gain = (np.array(x, dtype=float) for x in (model.area, model.drain, model.orifice, model.pump_gain))
+    w = float(2.0 * model.gravity) ** 0.5
+    out = np.array([drain[0], orifice[0], orifice[2], drain[1], orifice[1], orifice[3]]) * w / area[[0, 0, 0, 1, 1, 1]]
+    upper = [orifice[:2].sum() * w / area[2], gain[0] / area[2], orifice[2:].sum() * w / area[3], gain[1] / area[3]]
+    nominal, own = np.concatenate([out, upper]), np.array(plant.area, dtype=float)
+    r, x0 = np.array(case.loop.reference.sample(clock)[0]).copy(), np.array(case.loop.x0, dtype=float)
+    found = np.zeros((rows.shape[1], 5))
+
+    def at(array):
+        return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+
+    real = [
+        ctypes.c_double(float(x))
+        for x in (plant.gravity, plant.knee, clock.dt, law.k, law.k1, law.level_floor, case.loop.actuator.high[0])
+    ]
+    gravity, knee, dt, *rest = real
+
+    def run():
+        function(
+            ctypes.c_long(rows.shape[1]), at(rows), at(own), gravity, knee, at(nominal), ctypes.c_long(clock.samples), dt,
+            int(clock.integrator == "rk4"), *rest, at(x0), at(r), at(found),
+        )  # fmt: skip
+        return np.sqrt(found[:samples, 0] / clock.samples), found[:samples, 1:]
+
+    return run
+
+
+def beside_lanes(function, case, samples, rounds):
+    """(ns per step and plant of ours, of the C loop, ratio, largest difference [cm]): medians of core time, the two in turn."""
+    ours, theirs = (lambda: draw(case, samples)), c_run(function, case, samples)
+    seen, (rms, top), times = ours(), theirs(), {ours: [], theirs: []}
+    apart = max(abs(rms - seen.measures["rms_error_total"]).max(), abs(top - seen.measures["max_level"]).max())
+    for _ in range(rounds):
+        for call, spent in times.items():
+            began = time.process_time()
+            call()
+            spent.append(time.process_time() - began)
+    a, b = (1e9 * statistics.median(spent) / (samples * case.clock.samples) for spent in times.values())
+    return a, b, statistics.median(p / q for p, q in zip(*times.values())), apart
 
 
 CHILD = """
@@ -75,7 +144,16 @@ def main():
     ns = seconds(lambda: draw(fine, 1024), rounds) / (1024 * fine.clock.samples) * 1e9
     beside = "no gcc" if c is None else f"{ns / (1e9 * c):.2f} x the scalar C loop ({1e9 * c:.1f} ns)"
     print(f"1,024 plants x {fine.clock.samples} samples: {ns:.1f} ns per step and plant, {beside}")
-    for words, case in (("RK4", coarse), ("midpoint", rig.set_values(coarse, {"clock.integrator": "midpoint"}))):
+    halves = {"clock.integrator": "midpoint"}
+    with tempfile.TemporaryDirectory() as folder:
+        function = c_lanes(folder)
+        for words, case in (("RK4", fine), ("midpoint", rig.set_values(fine, halves))) if function else ():
+            a, b, ratio, apart = beside_lanes(function, case, 1000, rounds)
+            print(
+                f"1,000 plants x {case.clock.samples} samples, {words}: {a:.1f} ns of one core per step and plant, {b:.1f} the C loop in "
+                f"lanes, {ratio:.2f} x; they agree to {apart:.0e} cm"
+            )
+    for words, case in (("RK4", coarse), ("midpoint", rig.set_values(coarse, halves))):
         draw(case, 1024)
         began = time.process_time()
         draw(case, 10_000)
