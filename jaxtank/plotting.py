@@ -150,7 +150,7 @@ def convergence(ax, history, unit, limited):
     if high > 5 * finite.min() > 0:
         ax.set_yscale("log")
     if high < finite.max():
-        ax.set_ylim(top=high)
+        ax.set_ylim(None if ax.get_yscale() == "log" else finite.min() - 0.05 * (high - finite.min()), high)
         ax.set_title(f"convergence ({int((finite > high).sum())} evaluations above the picture)")
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
     return ax

@@ -385,7 +385,7 @@ def figures(result, runs=None):
 
     key = result_key(result)
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
     tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level" and limit.lane == 0}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
     told = {"before": "", "after": ""}
