@@ -47,12 +47,15 @@ def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
         ],
         axis=1,
     )
-    half = np.where(t[:, None] >= starts + 0.5 * duration / max(plant.pumps, 1) - 1e-9, -1.0, 1.0)
+    third = duration / (plant.pumps + 1)
+    up = (t[:, None] >= np.arange(plant.pumps) * third - 1e-9) & (
+        t[:, None] < (np.arange(plant.pumps) + plant.pumps) * third - 1e-9
+    )
     made = {
         "step of every pump at once, from empty": (np.tile(voltage, (len(t), 1)), empty),
         "steps one pump after the other, from empty": (voltage * later, empty),
         "small step of every pump at once, from rest": (np.tile(voltage + size, (len(t), 1)), rest),
-        "small staggered steps, from rest": (voltage + size * later * half, rest),
+        "small staggered steps, from rest": (voltage + size * up, rest),
         "pseudo-random binary sequence about rest": (voltage + size * signs, rest),
     }
     return {words: (t, np.clip(u, low, high), x0) for words, (u, x0) in made.items()}

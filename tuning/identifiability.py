@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.stats import t as student
 
 from jaxtank.tree import describe, get_value
@@ -67,22 +68,18 @@ class Spread:
         edge = 1e-6 * (high - low)
         self.at_bound = (z < low + edge) | (z > high - edge)
         # a tank that starts empty is at the end of its range for a good reason
-        self.moving = np.flatnonzero(~self.at_bound)
-        self.freedom = max(fit.residual.size - self.moving.size, 1)
-        self.scale = float(fit.residual @ fit.residual) / self.freedom
-        jacobian = fit.jacobian[:, self.moving]
-        _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
-        self.singular, self.axes = s, vt
-        with np.errstate(divide="ignore"):
-            sd = np.sqrt(max(self.scale, 0.0)) / s
-        self.open = (sd > VAGUE) | (s < ROUND_OFF * s.max(initial=0.0))
-        self.sd_of_axes = sd
+        self._decompose(np.flatnonzero(~self.at_bound))
+        if self.open.any():  # a search that slid along a valley until a bound stopped it is not held there by the data
+            here, count = self.moving, self.open.sum()
+            self._decompose(np.arange(z.size))
+            if self.open.sum() == count:
+                self._decompose(here)
+        s, vt, n = self.singular, self.axes, fit.residual.size
         kept = ~self.open
         inverse = (vt[kept].T / s[kept] ** 2) @ vt[kept]
         self.white = inverse * self.scale
         self.widened = 1.0
         self.covariance = self.white
-        n = fit.residual.size
         if max(map(abs, told["residual_autocorrelation"]), default=0.0) > 3 / math.sqrt(n / len(estimation.record.channels)):
             middle = self._scores()
             sandwich = inverse @ middle @ inverse * n / self.freedom
@@ -92,8 +89,19 @@ class Spread:
         # an unknown is vague if an open direction carries it further than the rest of the data would let it go
         own = np.sqrt(np.maximum(np.diag(self.covariance), 0))
         self.vague = np.zeros(estimation.size, dtype=bool)
-        for axis, reach in zip(self.axes[self.open], np.minimum(sd[self.open], 1.0)):
+        for axis, reach in zip(self.axes[self.open], np.minimum(self.sd_of_axes[self.open], 1.0)):
             self.vague[self.moving[np.abs(axis) * reach > np.maximum(0.5 * own, 1e-6)]] = True
+        self.at_bound &= ~self.vague
+
+    def _decompose(self, moving):
+        """Singular values and axes of the slopes by the unknowns `moving`, and which axes the data leave open."""
+        self.moving, residual = moving, self.fit.residual
+        self.freedom = max(residual.size - moving.size, 1)
+        self.scale = float(residual @ residual) / self.freedom
+        _, self.singular, self.axes = np.linalg.svd(self.fit.jacobian[:, moving], full_matrices=False)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.sd_of_axes = np.where(self.singular > 0, np.sqrt(self.scale) / self.singular, np.inf)
+        self.open = (self.sd_of_axes > VAGUE) | (self.singular < ROUND_OFF * self.singular.max(initial=0.0))
 
     def _scores(self):
         """Newey and West's S of the weighted residuals: products of scores up to the lag at which the residuals have forgotten."""
@@ -191,26 +199,43 @@ class Spread:
         """What the data leave open: [{"words", "parameters" {name: factor or change}, "sd"}], the vaguest first."""
         est, told = self.estimation, []
         z = est.unknowns(self.fit)
-        for axis, sd in zip(self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]):
+        for axis, sd in zip(*self._plainly()):
             whole = np.zeros(est.size)
             whole[self.moving] = axis
             step = math.log(1.1) / max(np.abs(whole).max(), 1e-300)
             if whole[np.argmax(np.abs(whole))] < 0:
                 step = -step
-            part = np.abs(whole) > PART
-            moved = {}
-            here, there = (
-                est.coordinates.values(z[: est.coordinates.size]),
-                est.coordinates.values((z + step * whole)[: est.coordinates.size]),
-            )
-            touched = self._touched(part)
+            here, there = (est.coordinates.values(v[: est.coordinates.size]) for v in (z, z + step * whole))
+            touched, moved, said = self._touched(np.abs(whole) > PART * np.abs(whole).max()), {}, []
             for i, name in enumerate(est.names):
                 if not touched[i]:
                     continue
-                moved[name] = float(there[name] / here[name]) if here.get(name) else float(step * whole[i])
-            words = " with ".join(f"{n} x {v:.3g}" if n in here else f"{n} {v:+.2g}" for n, v in moved.items())
+                if here.get(name):
+                    moved[name] = float(there[name] / here[name])
+                    said.append(f"{name} x {moved[name]:.3g}")
+                else:  # a level, or what is 0 now: by how much it changes
+                    change = step * whole[i] * est.level_scale[i - len(here)] if name not in here else there[name] - here[name]
+                    moved[name] = float(change)
+                    said.append(
+                        f"{name} {change:+.2g} {est.case.loop.units[0] if name not in here else self._unit(name)}".rstrip(" -")
+                    )
+            words = " with ".join(said)
             told.append({"words": words, "parameters": moved, "sd": float(sd) if np.isfinite(sd) else None})
         return told
+
+    def _unit(self, name):
+        return next(b.unit for b in self.estimation.bounds if b.name == name)
+
+    def _plainly(self):
+        """(axes, standard deviations) of the open directions, the vaguest first; of several the combinations of fewest unknowns."""
+        axes, sd = self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]
+        if len(axes) < 2:
+            return axes, sd
+        lead = qr(axes, pivoting=True, mode="r")[1][: len(axes)]
+        plain = np.linalg.solve(axes[:, lead], axes)
+        reach = np.sqrt(np.square(np.minimum(sd, 1e150)) @ np.square(axes[:, lead]))  # of the unknown that leads each combination
+        order = np.argsort(-reach, kind="stable")
+        return plain[order], np.where(reach < 1e100, reach, np.inf)[order]
 
     def _touched(self, part):
         touched = part.copy()
