@@ -1,16 +1,19 @@
 """gouta2015 sec. 5.3: what the laws make of coefficients that are off (spec 11), with intervals."""
 
-import functools
+import sys
+from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import loop as lp
 from jaxtank.tree import with_values
 
-N = 200
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+
+import robustness_table
+from robustness_table import N, Row, interval, verdict
+
 ROWS = [  # law, spread, mean, sd, p5, p50, p95 of the total RMS error [cm], mean largest error at the plateaus' ends [cm]
     ("ngpc", 0.05, 0.467, 0.210, 0.226, 0.418, 0.875, 0.375),
     ("backstepping", 0.05, 0.877, 0.174, 0.697, 0.834, 1.244, 0.445),
@@ -19,42 +22,20 @@ ROWS = [  # law, spread, mean, sd, p5, p50, p95 of the total RMS error [cm], mea
 ]
 
 
-def coefficients(plant, spread):
-    """{name: (N, ...)} of the plant with c1, c2, c3, c7, c8 (and their twins) off by factors of their own, uniform within +-spread.
-
-    c7, what leaves an upper tank, then differs from c2 + c3, what arrives below: an outlet takes up the difference, or, where that is
-    negative, a source (the paper varies c7 by itself, which no rig can do).
-    """
-    f1, f2, f3, f7, f8 = np.random.default_rng(2015).uniform(1 - spread, 1 + spread, (5, N))
-    inner, outer = np.asarray(plant.orifice)[:2]
-    rest = f7 * (inner + outer) - f2 * inner - f3 * outer
-    drain = np.asarray(plant.drain)[0]
-    return {
-        "plant.drain": np.stack([drain * f1, drain * f1, rest, rest], axis=1),
-        "plant.orifice": np.stack([inner * f2, outer * f3, outer * f3, inner * f2], axis=1),
-        "plant.pump_gain": np.stack([7.687 * f8] * 2, axis=1),
-    }
-
-
-def error(case, values):
-    return lp.evaluate_and_flag(with_values(case.loop, values), case.clock, ("rms_error_total",))[0]["rms_error_total"]
+@pytest.fixture(scope="module")
+def everything():
+    return robustness_table.everything()
 
 
 @pytest.fixture(scope="module")
-def errors(gouta):
+def errors(everything):
     """{(law, spread): (N,) total RMS errors [cm]}, and those of the nominal plant as {law: number}."""
-    found, nominal = {}, {}
-    for law in ("ngpc", "backstepping"):
-        case = gouta(law, {"reference.ramp": 30.0, "clock.dt": 0.02})
-        run = jax.jit(jax.vmap(functools.partial(error, case)))
-        nominal[law] = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
-        for spread in (0.05, 0.10):
-            found[law, spread] = np.asarray(run(coefficients(case.loop.plant, spread)))
-    return found, nominal
+    found, nominal = everything
+    return {key: f.measures["rms_error_total"] for key, f in found.items()}, nominal
 
 
-@pytest.mark.parametrize("law, spread, mean, sd, p05, p50, p95, _", ROWS)
-def test_rows_of_the_study(errors, law, spread, mean, sd, p05, p50, p95, _):
+@pytest.mark.parametrize("law, spread, mean, sd, p05, p50, p95, rest", ROWS)
+def test_rows_of_the_study(everything, errors, law, spread, mean, sd, p05, p50, p95, rest):
     """Within three standard errors of two samples of 200 (the study's draws are in another order); of a quantile by the binomial law."""
     values = errors[0][law, spread]
     assert values.mean() == pytest.approx(mean, abs=3 * sd * np.sqrt(2 / N))
@@ -64,6 +45,10 @@ def test_rows_of_the_study(errors, law, spread, mean, sd, p05, p50, p95, _):
         half = 3 * np.sqrt(2 * p * (1 - p) / N)
         low, high = np.quantile(values, (max(0.0, p - half), min(1.0, p + half)))
         assert low <= expected <= high
+    found = everything[0][law, spread]
+    ends = [round(t / robustness_table.EVERY) for t in robustness_table.CHANGES]
+    worst = np.abs(found.errors[:, ends]).max(axis=(1, 2))
+    assert worst.mean() == pytest.approx(rest, abs=3 * worst.std() * np.sqrt(2 / N))
 
 
 def test_backstepping_degrades_relatively_less_and_predictive_control_is_better(errors):
@@ -78,3 +63,43 @@ def test_backstepping_degrades_relatively_less_and_predictive_control_is_better(
         gain = (far[picks] - near[picks]).mean(axis=1)
         assert np.quantile(gain, 0.025) > 0.0
         assert np.sum(far < near) <= 8  # spec: 0 to 3 of 200
+
+
+def test_runs_of_the_table_are_those_of_the_library(everything):
+    case = robustness_table.case_of("ngpc")
+    values = robustness_table.coefficients(case.loop.plant, 0.10)
+    i = int(np.argmax((values["plant.drain"] >= 0).all(axis=1)))  # a plant that the door lets in
+    t = jaxtank.simulate(with_values(case.loop, {n: v[i] for n, v in values.items()}), case.clock)
+    found = everything[0]["ngpc", 0.10]
+    e, x, u = (np.asarray(v) for v in (t.e, t.x, t.u))
+    np.testing.assert_allclose(found.measures["rms_error_total"][i], np.sqrt((e**2).mean(axis=0).sum()), rtol=1e-9)
+    np.testing.assert_allclose(found.measures["max_level"][i], x.max(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(found.measures["input_travel"][i], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-8)
+    np.testing.assert_allclose(found.errors[i], e[::25], atol=1e-9)
+    row = robustness_table.window(found, 0, 270.0, 470.0)[i]
+    assert row == np.abs(found.errors[7, 540:940, 0]).max() and np.asarray(t.r)[::25][540, 1] < np.asarray(t.r)[::25][620, 1]
+
+
+def test_claims_of_the_paper(everything):
+    """What is borne out, and what is not; the README says the same."""
+    table = robustness_table.rows(*everything)
+    held = {row.claim: row.holds for row in table}
+    assert {c for c, h in held.items() if h != "yes"} == {
+        "more robust: the smaller error",
+        "compensate the steady-state error",
+        "feasible trajectories (30 cm)",
+    } and "not settled" not in held.values()
+    page = robustness_table.README.read_text()
+    lines = page.split(robustness_table.BEGIN)[1].split(robustness_table.END)[0].strip().splitlines()
+    printed = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines[2:]]
+    assert [(cells[0], cells[1], cells[-1]) for cells in printed] == [(r.claim, r.paper, r.holds) for r in table]
+    assert all(len(r.measured) == len(robustness_table.SPREADS) for r in table)
+
+
+def test_intervals_and_verdicts():
+    rng = np.random.default_rng(5)
+    estimate, low, high = interval(rng.normal(1.0, 2.0, 400))
+    assert (high - low) / 2 == pytest.approx(1.96 * 2.0 / 20, rel=0.12) and low < estimate < high
+    assert verdict([(1, 0.5, 2), (1, 0.1, 2)]) == "yes" and verdict([(-1, -2, -0.5)]) == "no"
+    assert verdict([(1, 0.5, 2), (1, -0.1, 2)]) == "not settled"
+    assert "| a | b | 1 | 2 | yes |" in robustness_table.markdown([Row("a", "b", ("1", "2"), "yes")])
