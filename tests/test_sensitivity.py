@@ -4,6 +4,8 @@ import contextlib
 import csv
 import io
 import json
+import subprocess
+import sys
 
 import jax
 import matplotlib.image
@@ -404,6 +406,32 @@ def test_bad_command(args, tmp_path):
     code, out, err = say(*args, "--out", str(tmp_path / "none"))
     assert code == 2 and out == "" and not (tmp_path / "none").exists()
     assert err.startswith("jaxtank: ") and err.count("\n") == 1 and "Traceback" not in err
+
+
+DEVICES = """
+import sys, jax, numpy as np
+import jaxtank, tuning
+from jaxtank import presets, rig
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 3)
+case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0})
+for devices in (1, 3):
+    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, devices=devices, progress=lambda *done: print(*done))
+    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.felt.values() if hasattr(v, "tolist")])
+"""
+
+
+def test_three_devices_give_the_bits_of_one():
+    ran = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    lines = ran.stdout.splitlines()
+    half = len([line for line in lines if line.startswith("[")])
+    numbers = [line for line in lines if line.startswith("[")]
+    assert half == 2 and numbers[0] == numbers[1] and "nan" not in numbers[0]
+    done = [int(line.split()[0]) for line in lines if not line.startswith("[")]
+    assert done.count(54) == 2 and len(done) == 7 + 3  # 55 runs in batches of 8: seven, or three groups of three
+    with pytest.raises(InputError, match="devices = 2: this process has 1"):
+        sensitivity(presets.find("cascaded/pi"), method="morris", devices=2)
 
 
 def test_a_cloud_shows_who_broke_a_limit_and_when():

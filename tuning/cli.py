@@ -179,6 +179,7 @@ def parser():
     sense.add_argument(
         "--samples", metavar="N", help="trajectories of morris (default 32), base points of sobol (default 512, a power of 2)"
     )
+    sense.add_argument("--devices", default="1", metavar="N", help="devices of this machine to use (default 1)")
     sense.add_argument("--spread", metavar="FRACTION", help="one share for all that the case calls uncertain, as 0.05")
     sense.add_argument(
         "--vary",
@@ -387,8 +388,18 @@ def _told(found, args):
     return 0
 
 
+def _devices(args):
+    """The number of --devices, which jax is told before it starts."""
+    devices = _whole("--devices", args.devices, 1, 1024)
+    if devices > 1:
+        import jax
+
+        jax.config.update("jax_num_cpu_devices", devices)
+    return devices
+
+
 def _uncertainty(args):
-    devices, shard = _whole("--devices", args.devices, 1, 1024), None
+    shard = None
     if args.shard is not None:
         shard = _shard(args.shard)
         if not args.out and not args.resume:
@@ -397,10 +408,7 @@ def _uncertainty(args):
         raise InputError("--resume and --out name different folders: a run is continued in its own")
     args.out = args.resume or args.out
     _out(args)
-    import jax
-
-    if devices > 1:
-        jax.config.update("jax_num_cpu_devices", devices)
+    devices = _devices(args)
     progress = None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
     found = _ensemble(args, devices=devices, shard=shard, folder=args.out, resume=args.resume is not None, progress=progress)
     if found is None:
@@ -620,6 +628,7 @@ def _written(paths, args):
 
 def _sensitivity(args):
     _out(args)
+    devices = _devices(args)
     seed, case = _seed(args), _open(args)
     varied = _distributions(args, case)
     from tuning import report, sensitivity_report
@@ -641,6 +650,7 @@ def _sensitivity(args):
         measures=args.measure or None,
         samples=None if args.samples is None else _whole("--samples", args.samples, 1, MOST),
         seed=seed,
+        devices=devices,
         progress=progress,
     )
     if terminal and not args.quiet:

@@ -205,7 +205,7 @@ def ensemble(
     began = time.perf_counter()
     if shard is not None and not (isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]):
         raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
-    for name, value in (("samples", samples), ("key", key), ("devices", devices)):
+    for name, value in (("samples", samples), ("key", key)):
         if isinstance(value, bool) or not isinstance(value, int) or not (0 if name == "key" else 1) <= value <= 2**31 - 1:
             raise InputError(f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to {2**31 - 1}")
     distributions = spread_of(case) if distributions is None else dict(distributions)
@@ -216,10 +216,7 @@ def ensemble(
     wanted = tuple(dict.fromkeys([*wanted, *(limit.measure for limit in held)]))
     random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
-    if devices > jax.local_device_count():
-        raise InputError(
-            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices before jax starts)"
-        )
+    check_devices(devices)
     lanes = lanes or _lanes(case, random, samples)
     p = probabilities(draws, space.dimensions, samples, key)
     count = -(-samples // lanes)
@@ -269,6 +266,16 @@ def ensemble(
         seed=key,
         method=draws,
     )
+
+
+def check_devices(devices):
+    """Raise InputError unless this process has so many."""
+    if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
+        raise InputError(f"devices = {devices!r}: must be a whole number of at least 1")
+    if devices > jax.local_device_count():
+        raise InputError(
+            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices before jax starts)"
+        )
 
 
 def _lanes(case, random, samples):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from tuning import indices
 from tuning import scenarios as sc
 from tuning.distributions import Correlated, Draws
 from tuning.effects import Column, entries_of, local_columns
-from tuning.ensemble import spread_of
+from tuning.ensemble import check_devices, spread_of
 
 METHODS = ("local", "morris", "sobol")
 
@@ -99,6 +100,7 @@ def sensitivity(
     spread=None,
     seed=0,
     batch=None,
+    devices=1,
     progress=None,
 ):
     """Which uncertain parameter moves which measure of a case.
@@ -108,8 +110,8 @@ def sensitivity(
     own values times half-width of the distribution; "morris": elementary effects over `samples` (32) trajectories, samples (D + 1) runs;
     "sobol": first and total order from `samples` (512) base points, rounded up to a power of 2, samples (D + 2) runs. measures: names,
     those of the case's objective, rms_error_total and max_level where None; seed: of the points and of the sensor noise, which is the same
-    in every run; batch: runs at once; progress: called with (runs done, runs in all). Returns a SensitivityResult. Raises InputError
-    before anything is run, and NonFiniteError if the local method meets a run that is not finite.
+    in every run; batch: runs at once; devices: of this process, each of which takes batches of its own, to the same bits; progress: called
+    with (runs done, runs in all). Returns a SensitivityResult. Raises InputError before anything is run, and NonFiniteError if the local method meets a run that is not finite.
     """
     began = time.perf_counter()
     if method not in METHODS:
@@ -133,6 +135,7 @@ def sensitivity(
         raise InputError(f"seed = {seed!r}: must be a whole number from 0 to {2**31 - 1}")
     if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
         raise InputError(f"batch = {batch!r}: must be a whole number of at least 1")
+    check_devices(devices)
     random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
     key = jax.random.key(seed) if random else None  # one key for all runs: differences are the parameters' alone
     lp.check(case.loop, case.clock, key)
@@ -142,7 +145,7 @@ def sensitivity(
         runs, failed = 1, 0
     else:
         points = (indices.morris_points if method == "morris" else indices.sobol_points)(draws.dimensions, samples, seed)
-        run = Runs(case, draws, names, key, batch, progress)
+        run = Runs(case, draws, names, key, batch, progress, devices)
         found = run(points.reshape(-1, draws.dimensions)).reshape(*points.shape[:2], -1)
         columns = [
             _column(case, names, k, run.nominal[k], found[..., k], _indices(method, points, found[..., k], seed))
@@ -210,26 +213,34 @@ class Runs:
     values and `failed` the number of other runs that stopped being finite.
     """
 
-    def __init__(self, case, draws, names, key, batch=None, progress=None):
+    def __init__(self, case, draws, names, key, batch=None, progress=None, devices=1):
         (self.group,) = sc.groups_of([sc.Lane("", case, key, 1.0)])
         self.own = {name: np.asarray(get_value(case.loop, name))[None] for name in draws.values(np.zeros((0, draws.dimensions)))}
         self.draws, self.names, self.progress = draws, names, progress
         self.batch = batch or max(8, min(LANES, 1 << (max(1, NUMBERS // case.clock.samples).bit_length() - 1)))
         self.nominal, self.failed = None, 0
+        self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
+
+    def _batch(self, device, values):
+        measures, broken = sc.values_of(self.group, self.names, jax.device_put(values, device))
+        flat = np.concatenate([np.asarray(measures[m])[:, 0].reshape(len(broken), -1) for m in self.names], axis=1)
+        return np.where(np.asarray(broken), np.nan, flat), np.asarray(broken)[:, 0]
 
     def __call__(self, p):
         values = {name: np.concatenate([self.own[name], v]) for name, v in self.draws.values(p).items()}
         total, found = len(p) + 1, []
         size = min(self.batch, total)
-        for start in range(0, total, size):
-            rows = np.minimum(np.arange(start, start + size), total - 1)  # the last run repeated to fill the batch
-            measures, broken = sc.values_of(self.group, self.names, {name: v[rows] for name, v in values.items()})
-            flat = np.concatenate([np.asarray(measures[m])[:, 0].reshape(size, -1) for m in self.names], axis=1)
-            found.append(np.where(np.asarray(broken), np.nan, flat)[: total - start])
-            lost = np.asarray(broken)[: total - start, 0]
-            self.failed += int(lost.sum()) - int(start == 0 and lost[0])
+        starts = range(0, total, size)
+        for group in (starts[i : i + len(self.devices)] for i in range(0, len(starts), len(self.devices))):
+            rows = [
+                np.minimum(np.arange(start, start + size), total - 1) for start in group
+            ]  # the last run repeated to fill the batch
+            done = self.pool.map(self._batch, self.devices, [{name: v[r] for name, v in values.items()} for r in rows])
+            for start, (flat, lost) in zip(group, done):
+                found.append(flat[: total - start])
+                self.failed += int(lost[: total - start].sum()) - int(start == 0 and lost[0])
             if self.progress is not None:
-                self.progress(min(start + size, total) - 1, len(p))
+                self.progress(min(group[-1] + size, total) - 1, len(p))
         found = np.concatenate(found)
         self.nominal = found[0]
         return found[1:]
