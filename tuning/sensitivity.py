@@ -111,7 +111,8 @@ def sensitivity(
     "sobol": first and total order from `samples` (512) base points, rounded up to a power of 2, samples (D + 2) runs. measures: names,
     those of the case's objective, rms_error_total and max_level where None; seed: of the points and of the sensor noise, which is the same
     in every run; batch: runs at once; devices: of this process, each of which takes batches of its own, to the same bits; progress: called
-    with (runs done, runs in all). Returns a SensitivityResult. Raises InputError before anything is run, and NonFiniteError if the local method meets a run that is not finite.
+    with (runs done, runs in all). Returns a SensitivityResult. Raises InputError before anything is run, and NonFiniteError if the local
+    method meets a run that is not finite.
     """
     began = time.perf_counter()
     if method not in METHODS:
