@@ -21,7 +21,8 @@ LAYERS = [
     {"scheduling"},
     {"record_tables"},
     {"rig", "plotting"},
-    {"record_plots"},
+    {"record_plots", "codegen"},
+    {"export"},
 ]
 ABOVE = [
     {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects", "parts", "logs", "coordinates"},

@@ -197,6 +197,13 @@ def parser():
     )
     identify_command.add(commands, [common, case, run])
     commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
+    exported = commands.add_parser(
+        "export", parents=[common, case], help="the law and its observer as one C99 file or MATLAB function"
+    )
+    exported.add_argument("--lang", default="c", metavar="LANG", help="c (default) or m")
+    exported.add_argument("--precision", default="double", metavar="TYPE", help="double (default) or float, of C")
+    exported.add_argument("--name", metavar="NAME", help="of the functions (default: the case's)")
+    exported.add_argument("--out", metavar="DIR", help="folder for the file (default: print it)")
     compare = commands.add_parser(
         "compare", parents=[common], help="published numbers beside measured ones, and why they differ; PAPER or all"
     )
@@ -479,6 +486,25 @@ def _init(args):
     return 0
 
 
+def _export(args):
+    _out(args)
+    case = _open(args)
+    from pathlib import Path
+
+    from jaxtank.export import export
+    from tuning import report
+
+    text = export(case, args.lang, args.precision, args.name)
+    name = args.name or case.name.replace("/", "_").replace("-", "_").replace(" ", "_")
+    if args.json:
+        print(report.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
+    if args.out:
+        _written(report.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
+    elif not args.json:
+        print(text, end="")
+    return 0
+
+
 def _simulate(args):
     _out(args)
     seed, case = _seed(args), _open(args)
@@ -720,6 +746,7 @@ COMMANDS = {
     "sensitivity": _sensitivity,
     "identify": identify_command.run,
     "init": _init,
+    "export": _export,
     "uncertainty": _uncertainty,
     "merge": _merge,
     "compare": _compare,

@@ -1,0 +1,172 @@
+"""Exported laws, compiled by gcc, against the law in the loop they were made from: 10,000 samples of every law of every paper."""
+
+import ctypes
+import functools
+import math
+import re
+import shutil
+import subprocess
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.errors import InputError
+from jaxtank.export import export
+from tuning import cli
+
+SAMPLES = 10_000
+GCC = shutil.which("gcc")
+needs_gcc = pytest.mark.skipif(GCC is None, reason="no gcc on this machine")
+
+# one case of every law, observer and way of saturating; the rest differ in numbers alone
+QUICK = [
+    "gouta2015/ngpc",
+    "gouta2015/backstepping-boxqp",
+    "gouta2022/chadpc",
+    "gouta2022/pid-ff",
+    "gouta2022/fopi",
+    "calofir/backstepping",
+    "cascaded/pi",
+    "mirakhorli/sfc",
+    "mirakhorli/hybrid",
+    "mirakhorli/smc",
+    "mirakhorli/lqi",
+    "khalid/laguerre",
+]
+SLOW = [name for name in presets.names() if name not in QUICK and name != "cascaded/open-loop" and "printed" not in name]
+EVERY = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+
+
+@functools.cache
+def replayed(name, noise=1e-4, values=()):
+    """(Case, Trajectory, setpoints with rates) of a run of 10,000 samples as host arrays; noise: as a share of the highest rim; values: what is
+    set, as pairs."""
+    case = presets.find(name)
+    noise = noise * float(np.max(np.asarray(case.loop.plant.rim)))
+    values = {"clock.duration": (SAMPLES - 1) * case.clock.dt, "sensor.noise": noise, "actuator.delay": 0.0, **dict(values)}
+    case = rig.set_values(case, values)
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(1)))
+    signals = [np.stack([np.asarray(v) for v in part], axis=1) for part in case.loop.reference.sample(case.clock)]
+    return case, run, signals
+
+
+class Compiled:
+    """An exported law as Python functions."""
+
+    def __init__(self, case, folder, precision="double"):
+        text = export(case, "c", precision, name="law")
+        source, library = folder / "law.c", folder / "law.so"
+        source.write_text(text)
+        flags = ["-std=c99", "-pedantic", "-O1", "-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-Wno-unused-variable"]
+        made = subprocess.run([GCC, *flags, "-shared", "-fPIC", "-o", library, source, "-lm"], capture_output=True, text=True)
+        assert made.returncode == 0, made.stderr
+        self.library = ctypes.CDLL(str(library))
+        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
+        self.type = np.float64 if precision == "double" else np.float32
+        self.state = np.zeros(int(re.search(r"LAW_STATE (\d+)", text).group(1)), dtype=self.type)
+
+    def pointer(self, array):
+        return array.ctypes.data_as(ctypes.POINTER(self.real))
+
+    def run(self, case, run, signals):
+        y, r, dr, ddr = (np.ascontiguousarray(v, dtype=self.type) for v in (run.y, *signals))
+        u = np.asarray(case.loop.actuator.initial, dtype=self.type).copy()
+        start = np.asarray(case.loop.x0, dtype=self.type).copy()
+        self.library.law_init(self.pointer(self.state), self.pointer(start), self.pointer(u))
+        out = np.zeros((len(y), len(u)), dtype=self.type)
+        for k in range(len(y)):
+            self.library.law_step(
+                self.pointer(self.state), self.real(run.t[k]), *(self.pointer(v[k]) for v in (y, r, dr, ddr, out))
+            )
+        return out
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", EVERY)
+def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
+    """Within 1e-9 of the pumps' range."""
+    case, run, signals = replayed(name)
+    told = Compiled(case, tmp_path).run(case, run, signals)
+    reach = max(1.0, float(np.abs(run.applied).max()))
+    assert len(told) == SAMPLES and np.ptp(run.applied) > 0
+    np.testing.assert_allclose(told, run.applied, atol=1e-9 * reach, rtol=0)
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    "name", ["gouta2015/backstepping", "gouta2022/chadpc", "mirakhorli/hybrid", "cascaded/pi", "khalid/laguerre"]
+)
+def test_c_in_single_precision(name, tmp_path):
+    case, run, signals = replayed(name)
+    told = Compiled(case, tmp_path, "float").run(case, run, signals)
+    np.testing.assert_allclose(told, run.applied, atol=1e-4 * float(np.abs(run.applied).max()), rtol=0)
+
+
+def matlab(text):
+    """A generated MATLAB function as a Python one, by rewriting its few kinds of statement; independent of the printer of C."""
+    lines, depth = [], 1
+    body = text.split("\n\nfunction out")[0].replace(" ...\n", " ")
+    for line in body.splitlines()[1:]:
+        line = line.strip().rstrip(";")
+        if not line or line.startswith("%"):
+            continue
+        if line in ("end", "else"):
+            depth -= 1
+            if line == "end":
+                continue
+        line = re.sub(r"\b(s|y|r|dr|ddr|u|a\d+|m\d+)\((\d+)\)", lambda m: f"{m.group(1)}[{int(m.group(2)) - 1}]", line)
+        line = line.replace("~=", "!=").replace("&&", " and ").replace("||", " or ").replace("~", " not ").replace("^", "**")
+        line = line.replace("isempty(s)", "s is None")
+        line = re.sub(r"zeros\(1, (\d+)\)", r"[0.0] * \1", line)
+        line = re.sub(r"for i = 1:(\d+)", r"for i in range(\1)", line)
+        opens = line.startswith(("if ", "for "))
+        lines.append("    " * depth + line + (":" if opens else ""))
+        depth += opens
+    known = {f: getattr(math, f) for f in ("sqrt", "exp", "log", "tanh", "sin", "cos", "floor")}
+    known |= {
+        "pick": lambda c, yes, no: yes if c else no,
+        "abs": abs,
+        "max": max,
+        "min": min,
+        "double": float,
+        "true": True,
+        "false": False,
+    }
+    known |= {"sqrt": lambda v: math.sqrt(v) if v >= 0 else math.nan, "sign": np.sign, "Inf": math.inf, "NaN": math.nan}
+    exec("def law(s, t, y, r, dr, ddr, u):\n" + "\n".join(lines) + "\n    return u, s", known)
+    return known["law"]
+
+
+@pytest.mark.parametrize(
+    "name", ["gouta2015/backstepping", "gouta2022/chadpc", "mirakhorli/hybrid", "cascaded/pi", "khalid/laguerre"]
+)
+def test_matlab_gives_the_inputs_of_the_loop(name):
+    case, run, signals = replayed(name, noise=0.0)  # it begins with the first readings, the loop with the true levels
+    law, s, u = matlab(export(case, "m")), None, list(map(float, np.asarray(case.loop.actuator.initial)))
+    for k in range(2000):
+        u, s = law(s, run.t[k], run.y[k], *(v[k] for v in signals), u)
+        np.testing.assert_allclose(u, run.applied[k], atol=1e-9 * max(1.0, float(np.abs(run.applied).max())), rtol=0)
+
+
+def test_what_cannot_be_exported_is_told():
+    with pytest.raises(InputError, match="plays a signal back"):
+        export(presets.find("cascaded/open-loop"))
+    for option, words in (
+        ({"language": "rust"}, "must be one of c, m"),
+        ({"precision": "half"}, "double, float"),
+        ({"name": "2x"}, "--name"),
+    ):
+        with pytest.raises(InputError, match=words):
+            export(presets.find("cascaded/pi"), **option)
+
+
+def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
+    assert cli.main(["export", "gouta2015/backstepping", "--set", "controller.k1=0.01", "--lang", "c", "--out", str(tmp_path)]) == 0
+    text = (tmp_path / "gouta2015_backstepping.c").read_text()
+    assert "controller.k1 = 0.01 1/s" in text and "measured levels [cm]" in text and "pump inputs [V]" in text
+    assert cli.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
+    assert capsys.readouterr().out.startswith("function [u, s] = gouta2015_backstepping(")
+    assert cli.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
