@@ -122,8 +122,8 @@ def tune_robust(
         words += f"; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
     elif broken and support:
         words += (
-            f"; {support} of {samples} plants at a limit leave about {100 * support / (samples + 1):.2g} % of fresh ones past it: "
-            "more plants or a back-off (--back-off 0.03) bring that down"
+            f"; {support} of {samples} plants hold the answer in place, which leaves about {100 * support / (samples + 1):.2g} % of fresh "
+            "ones past a limit: more plants or a back-off (--back-off 0.03) bring that down"
         )
     return result.replace(certificate=certificate, validation=found[0], cloud=found[1], message=f"{words}; {result.message}")
 
