@@ -296,8 +296,10 @@ def test_saturation_is_of_the_command_and_its_excess_is_bounded():
 
 
 def test_levels_over_the_rim_and_when():
-    got = folded(("max_level", "min_level", "rms_over_rim", "time_of_max_level"), [9, 12, 14, 14, 9], [9] * 5, [0] * 5, [0] * 5)
+    names = ("max_level", "min_level", "rms_over_rim", "mean_square_over_rim", "time_of_max_level")
+    got = folded(names, [9, 12, 14, 14, 9], [9] * 5, [0] * 5, [0] * 5)
     np.testing.assert_allclose(got["rms_over_rim"], np.sqrt((4 + 16 + 16) / 5))
+    np.testing.assert_allclose(got["mean_square_over_rim"], [(4 + 16 + 16) / 5])
     assert (got["max_level"], got["min_level"], got["time_of_max_level"]) == (14, 9, 2)
 
 

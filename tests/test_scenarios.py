@@ -82,15 +82,18 @@ def test_the_gauss_newton_matrix_is_that_of_the_trajectory(case):
 
     def residuals(theta):
         t = jaxtank.simulate(with_values(case.loop, dict(zip(names, theta))), case.clock)
-        return t.e, jax.numpy.diff(t.u, axis=0)
+        return t.e, jax.numpy.diff(t.u, axis=0), jax.numpy.maximum(t.x - case.loop.plant.rim, 0.0)
 
-    e, du = jax.jacfwd(residuals)(np.array(list(values.values())))
+    e, du, over = jax.jacfwd(residuals)(np.array(list(values.values())))
     n = len(e)
     expected = 2 / n * (np.einsum("kip,kiq->pq", e, e) + 5.0 * np.einsum("kip,kiq->pq", du, du))
     found = jaxtank.sensitivities(case.loop, case.clock, ["rms_error"], values, squares=SQUARES)[2]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     plain = jaxtank.sensitivities(case.loop, case.clock, ["rms_error"], values)[2]
     np.testing.assert_allclose(plain, 2 / n * np.einsum("kip,kiq->pq", e, e), rtol=1e-9)
+    past = jaxtank.sensitivities(case.loop, case.clock, ["rms_error"], values, squares={"mean_square_over_rim": 3.0})[2]
+    np.testing.assert_allclose(past, 6 / n * np.einsum("kip,kiq->pq", over, over), rtol=1e-9)
+    assert np.abs(past).max() > 0
     with pytest.raises(InputError, match="iae is not a sum of squares"):
         jaxtank.sensitivities(case.loop, case.clock, ["iae"], values, squares={"iae": 1.0})
 
