@@ -53,7 +53,7 @@ import jax
 import numpy as np
 
 from jaxtank import loop as lp
-from jaxtank import presets, record_tables, scheduling
+from jaxtank import presets, record_tables, rig_build, scheduling
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.files import read_text, write_atomic
@@ -77,8 +77,15 @@ TABLES = (
     "covariance",
     "log",
     "scenario",
+    *rig_build.TABLES,
 )
-KINDS = {"case": (str, "a text"), "name": (str, "a text"), "scenario": (list, "a list of tables, [[scenario]]")}
+LISTS = ("scenario", "tank", "orifice", "pipe", "spill", "pump")
+KINDS = {
+    "case": (str, "a text"),
+    "name": (str, "a text"),
+    "units": (list, "a list"),
+    **{k: (list, f"a list of tables, [[{k}]]") for k in LISTS},
+}
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 REFERENCE_KEYS = ("initial", "changes", "ramp", "shape", "band")
 
@@ -117,9 +124,15 @@ def from_table(table):
         wanted, words = KINDS.get(key, (dict, "a table"))
         if not isinstance(value, wanted):
             raise InputError(f"{key} = {_short(value)}: must be {words}")
-    if "case" not in table:
-        raise InputError('a rig file needs case = "paper/case" to start from; `jaxtank list` prints them')
-    case = presets.find(table["case"])
+    if "case" in table and (given := [k for k in rig_build.TABLES if k in table]):
+        raise InputError(
+            f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out case, or [{given[0]}]"
+        )
+    if "case" not in table and "tank" not in table:
+        raise InputError(
+            'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or [[tank]] to describe a rig'
+        )
+    case = presets.find(table["case"]) if "case" in table else rig_build.build(table)
     case = case.replace(name=table.get("name", case.name))
     if "reference" in table:
         case = case.replace(loop=dataclasses.replace(case.loop, reference=_reference(table["reference"], case.loop.reference)))
@@ -291,7 +304,9 @@ def set_and_schedule(case, values, table):
 def dump(case):
     """The complete rig file of `case` as text: every leaf, every static field that a file may set, reference, limits, free, objective."""
     table = scheduling.table_of(case.loop)
-    lines = [f"case = {_toml(_origin(case))}", f"name = {_toml(case.name)}", *([] if case.scenarios else ["scenario = []"]), ""]
+    origin = _origin(case)
+    lines = [*([] if origin is None else [f"case = {_toml(origin)}"]), f"name = {_toml(case.name)}"]
+    lines += [*([] if case.scenarios else ["scenario = []"]), *(rig_build.tables(case, _toml) if origin is None else [""])]
     lines += ["[schedule]", *(f"{key} = {_toml(value)}" for key, value in table.items()), ""] if table else []
     lines += ["[values]"]
     whole = ("controller.knots", "controller.variable") if table else ()
@@ -338,12 +353,12 @@ def save(case, path):
 
 
 def _origin(case):
-    """The preset that a case came from: one with the same components, so that values are all there is to set."""
+    """The preset that a case came from: one with the same components, so that values are all there is to set; None for a rig of its own."""
     loop = scheduling.unscheduled(case.loop)
     structure = jax.tree.structure(_plain(loop))
     alike = [c for p in presets.PAPERS for c in presets.load(p).cases.values() if jax.tree.structure(_plain(c.loop)) == structure]
     if not alike:
-        raise InputError(f"{case.name}: no preset has these components, so the case cannot be written as a rig file")
+        return None
     mine = _statics(loop)
     # its own preset, or the one with the most in common: its title is the one the file will show
     return max(alike, key=lambda c: (c.name == case.name, sum(a == b for a, b in zip(mine, _statics(c.loop))))).name

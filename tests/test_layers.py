@@ -19,7 +19,7 @@ LAYERS = [
     {"loop"},
     {"presets"},
     {"scheduling"},
-    {"record_tables"},
+    {"record_tables", "rig_build"},
     {"rig", "plotting"},
     {"record_plots", "codegen"},
     {"export"},
