@@ -98,9 +98,10 @@ class Coordinates:
         return out
 
 
-def coordinates(bounds):
-    """The Coordinates of a list of tuning.bounds.Bound: a pump's gain and split, where both are free, by their branch gains."""
-    by_name = {b.name: b for b in bounds}
+def coordinates(bounds, branches=True):
+    """The Coordinates of a list of tuning.bounds.Bound: a pump's gain and split, where both are free, by their branch gains (or, without
+    `branches`, by themselves)."""
+    by_name = {b.name: b for b in bounds} if branches else {}
     items, done = [], set()
     for b in bounds:
         if b.name in done:

@@ -83,14 +83,23 @@ def settled(plant, voltage):
 
 
 def _operating(loop):
-    """(pumps,) voltages at which the case's pumps run before it starts, or those of its first setpoint, or half of their range."""
-    initial = np.asarray(loop.actuator.initial, dtype=float)
-    if np.any(initial > 0):
-        return initial
+    """(pumps,) inputs at which the case's pumps run before it starts, or those of its first setpoint, or half of their range; less where a
+    tank would come near its rim."""
+    plant, high = loop.plant, np.asarray(loop.actuator.high, dtype=float)
+    high = np.where(np.isfinite(high), high, 2.0)
+    found = np.asarray(loop.actuator.initial, dtype=float)
     try:
-        return np.asarray(equilibrium(loop.plant, np.asarray(loop.reference.initial))[1], dtype=float)
+        if not np.all(found > 0.02 * high):
+            found = np.asarray(equilibrium(plant, np.asarray(loop.reference.initial))[1], dtype=float)
     except (AttributeError, EquilibriumError, InputError):
-        return 0.5 * np.asarray(loop.actuator.high, dtype=float)
+        pass
+    if not (np.all(np.isfinite(found)) and np.all(found > 0.02 * high)):
+        found = 0.5 * high
+    for _ in range(20):
+        if np.max(settled(plant, found) / np.asarray(plant.rim)) < 0.8:
+            break
+        found = 0.8 * found
+    return found
 
 
 def compare_experiments(
@@ -114,9 +123,11 @@ def compare_experiments(
     values = nominal(loop, moved.names)
     p, rig = moved.point(values), pb.rig_of(loop)
     found = {}
+    count = max((_substeps(rig, t, u, x0, tanks) for t, u, x0 in made.values()), default=1)
     for words, (t, u, x0) in made.items():
         jacobian = (
-            _jacobian(rig, moved, p, t, u, x0, tanks, start) / np.tile(np.broadcast_to(noise, (len(tanks),)), len(t))[:, None]
+            _jacobian(rig, moved, p, t, u, x0, tanks, start, count)
+            / np.tile(np.broadcast_to(noise, (len(tanks),)), len(t))[:, None]
         )
         _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
         slopes = moved.slopes(p)
@@ -134,13 +145,25 @@ def compare_experiments(
     return found
 
 
-def _jacobian(rig, moved, p, t, u, x0, tanks, start):
+def most_telling(found):
+    """The words of the experiment, of those `compare_experiments` compared, whose standard deviations have the smallest product; None where
+    each leaves something open."""
+    whole = {words: np.sum(np.log(list(row["sd"].values()))) for words, row in found.items() if None not in row["sd"].values()}
+    return min(whole, key=whole.get) if whole else None
+
+
+def _substeps(rig, t, u, x0, tanks):
+    """How many steps each sample of an experiment needs."""
+    channels, own = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
+    blank = pb.Record(np.append(np.diff(t), 0.0)[None], u[None], np.zeros((1, len(t), len(tanks))), channels)
+    return pb.substeps_for(rig, blank, own, 1e-5 * float(np.max(np.asarray(rig.plant.rim))))
+
+
+def _jacobian(rig, moved, p, t, u, x0, tanks, start, count=None):
     """(samples * measured tanks, unknowns) derivative of the readings."""
     dt = np.append(np.diff(t), 0.0)[None]
-    channels = tuple((i, False) for i in tanks)
-    own = np.asarray(x0, dtype=float)[None]
-    blank = pb.Record(dt, u[None], np.zeros((1, len(t), len(tanks))), channels)
-    count = pb.substeps_for(rig, blank, own, 1e-5 * float(np.max(np.asarray(rig.plant.rim))))
+    channels, own = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
+    count = _substeps(rig, t, u, x0, tanks) if count is None else count
     _, slopes = pb.passes(
         rig, dt, u[None], p, own, coordinates=moved, tanks=tuple(range(own.shape[1])), channels=channels, substeps=count
     )
@@ -180,10 +203,10 @@ def open_directions(estimation, z, experiment, noise):
     usual_noise = float(np.mean(estimation.noise)) * noise
     by_tank = {tank: float(estimation.noise[c]) * noise for c, (tank, volts) in enumerate(channels) if not volts}
     p, _ = estimation.parts(z)
-    jacobian = _jacobian(estimation.rig, estimation.coordinates, p, t, u, x0, tanks, "known")
+    jacobian = _jacobian(estimation.rig, estimation.coordinates, p, t, u, x0, tanks, "known", 2 * estimation.substeps)
     jacobian = jacobian / np.tile([by_tank.get(i, usual_noise) for i in tanks], len(t))[:, None]
     s = np.linalg.svd(jacobian, compute_uv=False)
     return float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None
 
 
-__all__ = ["alternatives", "candidates", "compare_experiments", "open_directions", "prbs", "settled"]
+__all__ = ["alternatives", "candidates", "compare_experiments", "most_telling", "open_directions", "prbs", "settled"]

@@ -58,7 +58,9 @@ class Spread:
     """Standard deviations of a Fit from J'J; directions that the data leave open are taken out first.
 
     Where residuals are correlated from sample to sample, as those of a model that is not quite the rig's, the covariance is the
-    sandwich (J'J)^-1 S (J'J)^-1 with S of Newey and West (Econometrica 55, 1987, 703): `widened` says how much it widens the intervals.
+    sandwich (J'J)^-1 S (J'J)^-1, with S of Newey and West (Econometrica 55, 1987, 703) or S = J' C J with C that of first-order noise with
+    the residuals' correlation, whichever is wider: the first is too narrow for slow noise, the second for slow noise under a fast one.
+    `widened` says how much it widens the intervals.
     """
 
     def __init__(self, estimation, fit, told):
@@ -81,11 +83,11 @@ class Spread:
         self.widened = 1.0
         self.covariance = self.white
         if max(map(abs, told["residual_autocorrelation"]), default=0.0) > 3 / math.sqrt(n / len(estimation.record.channels)):
-            middle = self._scores()
-            sandwich = inverse @ middle @ inverse * n / self.freedom
-            ratio = np.sqrt(np.maximum(np.diag(sandwich), 0) / np.maximum(np.diag(self.white), 1e-300))
-            if ratio.size and np.median(ratio) > 1:
-                self.covariance, self.widened = sandwich, float(np.median(ratio))
+            for middle in (self._scores() * n / self.freedom, self._first_order()):
+                sandwich = inverse @ middle @ inverse
+                ratio = np.sqrt(np.maximum(np.diag(sandwich), 0) / np.maximum(np.diag(self.white), 1e-300))
+                if ratio.size and np.median(ratio) > self.widened:
+                    self.covariance, self.widened = sandwich, float(np.median(ratio))
         # an unknown is vague if an open direction carries it further than the rest of the data would let it go
         own = np.sqrt(np.maximum(np.diag(self.covariance), 0))
         self.vague = np.zeros(estimation.size, dtype=bool)
@@ -119,6 +121,28 @@ class Spread:
         for lag in range(1, lags + 1):
             one = np.einsum("eki,ekj->ij", score[:, lag:], score[:, :-lag])
             total += (1 - lag / (lags + 1)) * (one + one.T)
+        return total
+
+    def _first_order(self):
+        """J' C J, C the covariance of weighted residuals that follow each other as rho^(time / usual step), anew in each log and channel.
+
+        rho is that of the residuals from sample to sample, less what fitting has taken from it (Marriott and Pope, Biometrika 41, 1954, 390).
+        """
+        estimation, size = self.estimation, self.moving.size
+        shape, dt = estimation.mask.shape, estimation.record.dt
+        residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
+        residual[estimation.mask], slopes[estimation.mask] = self.fit.residual, self.fit.jacobian[:, self.moving]
+        samples = np.mean([one.samples for one in estimation.logs])
+        steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
+        for c in range(shape[-1]):
+            rho = autocorrelation(residual[..., c], 1)[1]
+            rho = float(np.clip(rho + (1 + 4 * rho) / samples, 0.0, 0.999))
+            variance = np.nanmean(residual[..., c] ** 2) * self.fit.residual.size / self.freedom
+            one, before = slopes[:, :, c], np.zeros((shape[0], size))
+            for k in range(shape[1]):  # before: the sum of rho^(time since) J of all earlier samples
+                product = one[:, k].T @ before
+                total += variance * (one[:, k].T @ one[:, k] + product + product.T)
+                before = (before + one[:, k]) * rho ** steps[:, k, None]
         return total
 
     def _values(self):
@@ -244,11 +268,20 @@ class Spread:
         return touched
 
     def worst(self):
-        """Index of the shared coordinate with the largest standard deviation, among those that are not open."""
-        sd = np.zeros(self.estimation.size)
-        sd[self.moving] = np.sqrt(np.maximum(np.diag(self.covariance), 0))
-        sd[self.vague | self.at_bound] = 0
-        return int(np.argmax(sd[: self.estimation.coordinates.size]))
+        """(name, standard deviation of its own coordinate: a logarithm, or a share of its range) of the parameter that is known worst; None
+        for a standard deviation where the data leave it open."""
+        est, shared = self.estimation, self.estimation.coordinates.size
+        if self.vague[:shared].any():
+            part = np.zeros(est.size)
+            part[self.moving] = np.abs(self._plainly()[0][0])
+            return est.coordinates.names[int(np.argmax(np.where(self.vague[:shared], part[:shared], -1.0)))], None
+        plain = est.plainly().coordinates
+        values = est.coordinates.values(self.fit.p)
+        slopes = np.diag(plain.slopes(plain.point(values)))
+        own = dict(zip(est.coordinates.names, np.sqrt(np.diag(self._values()))))
+        sd = {n: own[n] / abs(slopes[i]) for i, n in enumerate(plain.names)}
+        name = max(sd, key=sd.get)
+        return name, float(sd[name])
 
 
 def within(meta, low, high):
@@ -303,12 +336,12 @@ def profile(estimation, fit, spread, loss="linear", points=11, reach=3.0):
     Returns {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio, "interval95": where it passes 3.84, interpolated, None at
     a side where it does not}.
     """
-    i = spread.worst()
-    name = estimation.coordinates.names[i]
-    z = estimation.unknowns(fit)
-    sd = np.zeros(estimation.size)
-    sd[spread.moving] = np.sqrt(np.maximum(np.diag(spread.covariance), 0))
-    grid = np.clip(z[i] + np.linspace(-reach, reach, points) * sd[i], estimation.box[0][i], estimation.box[1][i])
+    name, sd = spread.worst()
+    levels, values = estimation.unknowns(fit)[estimation.coordinates.size :], estimation.coordinates.values(fit.p)
+    estimation = estimation.plainly()
+    i, z = estimation.coordinates.names.index(name), np.concatenate([estimation.coordinates.point(values), levels])
+    grid = np.linspace(-reach, reach, points) * (sd if sd else 1 / reach)
+    grid = np.clip(z[i] + grid, estimation.box[0][i], estimation.box[1][i])
     inflate = max(spread.widened, 1.0) ** 2 * max(spread.scale, 1e-300)
     grid = np.unique(grid)  # a bound cuts it short
     points, middle = len(grid), int(np.argmin(np.abs(grid - z[i])))

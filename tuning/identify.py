@@ -1,5 +1,6 @@
 """Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the answer is to be believed."""
 
+import copy
 import dataclasses
 import time
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import qmc
+from scipy.stats import chi2, qmc
 
 from jaxtank import rig as rigs
 from jaxtank.errors import DataError, InputError
@@ -52,10 +53,11 @@ class Estimation:
 
     case: the rig; logs: of one rig; free: {name: (low, high[, scale])} or None; start: "free" levels at the first sample of each log,
     "measured" (the readings there are exact) or "case" (they are those of the case); tanks that no log measures start from the case's
-    levels unless they are free; noise: (channels,) standard deviation that weighs each channel, estimated from the record where None.
+    levels unless they are free; noise: (channels,) standard deviation that weighs each channel, estimated from the record where None; samples:
+    least length that records are padded to.
     """
 
-    def __init__(self, case, logs, free=None, start="free", noise=None, substeps=None):
+    def __init__(self, case, logs, free=None, start="free", noise=None, substeps=None, samples=0):
         self.case, self.logs = case, logs
         loop = case.loop
         spec = usual(loop) if free is None else {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
@@ -66,31 +68,19 @@ class Estimation:
                 )
         self.bounds = bounds(loop, spec)
         self.coordinates = coordinates(self.bounds)
-        self.rig, self.record = pb.rig_of(loop), pb.record(logs, float(loop.actuator.delay))
+        self.rig, self.record = pb.rig_of(loop), pb.record(logs, float(loop.actuator.delay), samples)
         self.start = start
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
         self.first = self._first_levels()
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
-        self.noise = (
-            noise_of(logs, self.record)
-            if noise is None
-            else np.broadcast_to(np.asarray(noise, dtype=float), (len(self.record.channels),))
-        )
+        self.noise = noise_of(logs, self.record) if noise is None else _given(noise, len(self.record.channels))
         self.mask = np.isfinite(self.record.y)
         self.size = self.coordinates.size + self.first[:, list(self.tanks)].size
         if self.mask.sum() <= self.size:
             raise DataError(f"{self.mask.sum()} readings cannot tell {self.size} unknowns: give a longer log, or free fewer")
-        low, high = self.coordinates.box
-        rim = np.asarray(loop.plant.rim)[list(self.tanks)]
-        top = np.maximum(
-            rim * (1.0 if getattr(loop.plant, "overflow", False) else 1.5), self.first[:, list(self.tanks)].max(axis=0, initial=0.0)
-        )
-        self.level_scale = np.tile(rim, len(logs))
-        self.box = (
-            np.concatenate([low, np.zeros(self.level_scale.size)]),
-            np.concatenate([high, np.tile(top, len(logs)) / self.level_scale]),
-        )
+        self.level_scale = np.tile(np.asarray(loop.plant.rim)[list(self.tanks)], len(logs))
+        self.box = self._box()
         self.passes = 0
         middle = self.at(self.origin())
         self.substeps = (
@@ -105,6 +95,24 @@ class Estimation:
         logs = len(self.logs)
         where = [f"h{i + 1}(0)" + (f" of log {e + 1}" if logs > 1 else "") for e in range(logs) for i in self.tanks]
         return (*self.coordinates.names, *where)
+
+    def _box(self):
+        """(low, high) of every unknown: coordinates, then levels as shares of their rims."""
+        low, high = self.coordinates.box
+        plant, tanks, count = self.case.loop.plant, list(self.tanks), len(self.logs)
+        past = 1.0 if getattr(plant, "overflow", False) else 1.5
+        top = np.maximum(np.asarray(plant.rim)[tanks] * past, self.first[:, tanks].max(axis=0, initial=0.0))
+        return (
+            np.concatenate([low, np.zeros(self.level_scale.size)]),
+            np.concatenate([high, np.tile(top, count) / self.level_scale]),
+        )
+
+    def plainly(self):
+        """The same problem in coordinates of which each is that of one parameter: no branch gains."""
+        other = copy.copy(self)
+        other.coordinates = coordinates(self.bounds, branches=False)
+        other.box = other._box()
+        return other
 
     def _first_levels(self):
         x0 = np.tile(np.asarray(self.case.loop.x0, dtype=float), (len(self.logs), 1))
@@ -181,9 +189,10 @@ class Estimation:
             residual, jacobian = np.full_like(residual, np.nan), np.zeros_like(jacobian)
         return residual, jacobian
 
-    def solve(self, z, loss="linear", iterations=100, fixed=None, tolerance=1e-14):
+    def solve(self, z, loss="linear", iterations=100, fixed=None, tolerance=1e-14, pull=None):
         """The Fit from the start z. fixed: {index: value} of unknowns that stay, in coordinates; tolerance: gain of an iteration, as a share
-        of the cost, at which it ends."""
+        of the cost, at which it ends; pull: (point (unknowns,), strength) to which every unknown is drawn, as readings of
+        it with a standard deviation of 1 / strength would, a level's of a tenth of that."""
         moving = np.array([i for i in range(self.size) if i not in (fixed or {})])
         whole, kept = z.copy(), {}
         for i, value in (fixed or {}).items():
@@ -196,6 +205,7 @@ class Estimation:
             return kept["at"]
 
         low, high = self.box[0][moving], self.box[1][moving]
+        drawn = None if pull is None else pull[1] * np.where(moving < self.coordinates.size, 1.0, 10.0)
         before = self.passes
         if not np.all(np.isfinite(both(np.clip(whole[moving], low, high))[0])):
             p, own = self.parts(whole)
@@ -204,9 +214,9 @@ class Estimation:
                 p=p.copy(), own=own, cost=np.inf, residual=empty[:, 0], jacobian=empty, evaluations=self.passes - before, status=-1
             )
         found = least_squares(
-            lambda v: both(v)[0],
+            lambda v: both(v)[0] if pull is None else np.concatenate([both(v)[0], drawn * (v - pull[0][moving])]),
             np.clip(whole[moving], low, high),
-            lambda v: both(v)[1][:, moving],
+            lambda v: both(v)[1][:, moving] if pull is None else np.concatenate([both(v)[1][:, moving], np.diag(drawn)]),
             bounds=(low - 1e-12, high + 1e-12),
             x_scale=1.0,
             loss=loss,
@@ -216,13 +226,13 @@ class Estimation:
             gtol=min(1e-8, 1e2 * tolerance),
             max_nfev=iterations,
         )
-        whole[moving] = found.x
+        whole[moving] = np.clip(found.x, low, high)
         residual, jacobian = self.pass_at(whole)
         p, own = self.parts(whole)
         return Fit(
             p=p.copy(),
             own=own,
-            cost=float(found.cost),
+            cost=float(found.cost) if pull is None else 0.5 * float(residual @ residual),
             residual=residual,
             jacobian=jacobian,
             evaluations=self.passes - before,
@@ -249,6 +259,16 @@ class Estimation:
             low, high = self.box[0][vary], self.box[1][vary]
             starts[1:, vary] = low + points * (high - low)
         return starts
+
+
+def _given(noise, channels):
+    """(channels,) standard deviations that were given, one for all or one each."""
+    noise = np.atleast_1d(np.asarray(noise, dtype=float))
+    if noise.shape not in ((1,), (channels,)) or not np.all(np.isfinite(noise) & (noise > 0)):
+        raise InputError(
+            f"noise = {noise.tolist()}: must be one standard deviation above 0, or one for each of the {channels} channels"
+        )
+    return np.broadcast_to(noise, (channels,))
 
 
 def noise_of(logs, rec):
@@ -362,11 +382,14 @@ def identify(
         raise InputError("no log is given")
     if loss not in LOSSES:
         raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    for name, count in (("starts", starts), ("iterations", iterations)):
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
     for one in logs:
         lg.check_gaps(one, gap)
         lg.check_fits(one, case.loop)
     kept = [_kept(one, hold_back) for one in logs]
-    options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
+    options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
     partial = Estimation(case, [one.part(0, n) for one, n in zip(logs, kept)], **options)
     fits = [partial.solve(z, loss, iterations, tolerance=1e-8) for z in partial.begin(starts, seed)]
     ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
@@ -379,6 +402,10 @@ def identify(
         best = estimation.solve(partial.unknowns(best), loss, iterations)
     quality = idf.quality(estimation, best)
     spread = idf.Spread(estimation, best, quality)
+    if spread.open.any():
+        best = _nearest(estimation, best, spread.scale, loss, iterations)
+        quality = idf.quality(estimation, best)
+        spread = idf.Spread(estimation, best, quality)
     parameters, levels = spread.parameters(), spread.levels()
     directions = spread.directions()
     status = "converged" if best.status > 0 else "not_converged"
@@ -405,6 +432,17 @@ def identify(
         wall_s=time.perf_counter() - began,
         seed=seed,
     )
+
+
+def _nearest(estimation, best, scale, loss, iterations):
+    """Of the points in the 95 % region about `best` one near to the case's own values: a search that slides along a valley ends in a corner
+    that says nothing."""
+    origin, most = estimation.origin(), best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
+    for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
+        near = estimation.solve(origin, loss, iterations, tolerance=1e-8, pull=(origin, strength))
+        if near.residual.size and near.residual @ near.residual <= most:
+            return near
+    return best
 
 
 def _kept(one, hold_back):

@@ -45,6 +45,9 @@ def add(commands, parents):
     one.add_argument("--profile", action="store_true", help="also: profile likelihood of the parameter known worst")
     one.add_argument("--plan", action="store_true", help="no log: compare experiments by the standard deviations they would leave")
     one.add_argument("--duration", default="300", metavar="S", help="of a planned experiment [s] (default 300)")
+    one.add_argument(
+        "--voltage", metavar="V1,V2", help="pump inputs that a planned experiment works about (default: the case's own)"
+    )
     one.add_argument("--measure", metavar="H1,H2", help="tanks that are measured in a planned experiment (default all)")
 
 
@@ -113,7 +116,7 @@ def plan(args, case, free):
     import numpy as np
 
     from tuning import report
-    from tuning.experiments import compare_experiments
+    from tuning.experiments import compare_experiments, most_telling
 
     duration, dt = arguments.number("--duration", args.duration), 0.0
     if not 0 < duration < 1e7:
@@ -126,23 +129,46 @@ def plan(args, case, free):
             if word.strip() not in names:
                 raise InputError(f"--measure {word!r}: must be among {', '.join(names)}")
         tanks = sorted({names.index(w.strip()) for w in args.measure.split(",")})
+    voltage = None
+    if args.voltage is not None:
+        voltage = [arguments.number("--voltage", text) for text in args.voltage.split(",")]
+        high = np.asarray(case.loop.actuator.high)
+        if len(voltage) != high.size or not all(0 < v <= top for v, top in zip(voltage, high)):
+            tops = ", ".join(f"{v:g}" for v in high)
+            raise InputError(
+                f"--voltage {args.voltage!r}: must be {high.size} numbers above 0 and at most {tops} {case.loop.units[1]}"
+            )
     length = case.loop.units[0]
     own = float(np.max(np.asarray(case.loop.sensor.noise)))
     noise = arguments.number("--noise", args.noise) if args.noise else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
     if not noise > 0:
         raise InputError(f"--noise {args.noise!r}: must be above 0")
-    found = compare_experiments(case, free, noise=noise, duration=duration, dt=dt, levels=tanks, start="known")
+    found = compare_experiments(case, free, noise=noise, duration=duration, dt=dt, levels=tanks, start="known", voltage=voltage)
+    best = most_telling(found)
     if args.json:
-        print(report.dumps(report.clean({"case": case.name, "noise": noise, "duration": duration, "dt": dt, "experiments": found})))
+        print(
+            report.dumps(
+                report.clean(
+                    {"case": case.name, "noise": noise, "duration": duration, "dt": dt, "experiments": found, "most_telling": best}
+                )
+            )
+        )
         return 0
-    names = list(next(iter(found.values()))["sd"])
-    rows = []
-    for words, row in found.items():
-        sds = ["open" if row["sd"][n] is None else f"{row['sd'][n]:.2g}" for n in names]
-        rows.append([words, *sds, "-" if row["condition"] is None else f"{row['condition']:.3g}"])
+    from jaxtank.tree import get_value
+
+    letters, rows = dict(zip("ABCDEFGH", found)), []
+    for name in next(iter(found.values()))["sd"]:
+        value = float(np.asarray(get_value(case.loop, name)))
+        sds = [found[words]["sd"][name] for words in letters.values()]
+        shares = ["open" if sd is None else f"{100 * sd / abs(value):.2g} %" if value else f"{sd:.2g}" for sd in sds]
+        rows.append([name, f"{value:.5g}", *shares])
+    conditions = [found[words]["condition"] for words in letters.values()]
+    rows.append(["condition of J'J", "", *("-" if c is None or c > 1e15 else f"{c:.3g}" for c in conditions)])
     measured = "every level" if tanks is None else ", ".join(f"h{i + 1}" for i in tanks)
     print(
         f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with noise of {noise:g} {length} would leave\n"
     )
-    print(report.table(rows, ["experiment", *names, "condition"]))
+    print(report.table(rows, ["parameter", "value", *letters]) + "\n")
+    print("\n".join(f"{letter}  {words}" for letter, words in letters.items()))
+    print(f"\nIt tells most: {best}." if best else "\nNone of them tells all of these parameters.")
     return 0

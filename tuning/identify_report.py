@@ -27,6 +27,8 @@ def message(found):
         words.append("the best search had not converged when its iterations ended: more of them with --iterations")
     for d in found.directions:
         words.append(f"the data cannot tell apart: {d['words']} changes no reading that could be seen")
+    if found.status == "not_identifiable":
+        words.append("of the values that fit alike some near to the case's own are printed")
     agree = sum(s["agrees"] for s in found.starts)
     words.append(f"{agree} of {len(found.starts)} starts ended in the same place")
     q = found.quality

@@ -51,10 +51,11 @@ class Record(NamedTuple):
     channels: tuple  # ((tank, in volts), ...)
 
 
-def record(logs, delay=0.0):
-    """The Record of Logs. delay: transport delay of the pumps [s]: an input reaches its tank at the first sample that is at least as late."""
+def record(logs, delay=0.0, samples=0):
+    """The Record of Logs. delay: transport delay of the pumps [s]: an input reaches its tank at the first sample that is at least as late;
+    samples: least length to pad to, so that logs cut short run through the program of the whole ones."""
     channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
-    n = max(one.samples for one in logs)
+    n = max(samples, *(one.samples for one in logs))
     dt, u = np.zeros((len(logs), n)), np.zeros((len(logs), n, logs[0].u.shape[1]))
     y = np.full((len(logs), n, len(channels)), np.nan)
     for e, one in enumerate(logs):
