@@ -21,7 +21,7 @@ LAYERS = [
     {"scheduling"},
     {"record_tables", "rig_build"},
     {"rig", "plotting"},
-    {"record_plots", "codegen"},
+    {"record_plots", "codegen", "neighbours", "environment"},
     {"export"},
 ]
 ABOVE = [

@@ -1,0 +1,76 @@
+"""Doors to other libraries: python-control, tables, Gymnasium."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import neighbours, presets, rig
+from jaxtank.errors import InputError
+
+
+def test_python_control_sees_the_linearised_rig():
+    """mirakhorli at 12/12: zeros and steady gain of spec 1; poles from the printed time constants."""
+    control = pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    system = neighbours.to_control(plant, (12.0, 12.0))
+    assert sorted(control.zeros(system).real) == pytest.approx([-0.10717, 0.02467], abs=1e-5)
+    np.testing.assert_allclose(control.dcgain(system), [[3.5849, 4.0151], [4.9506, 2.0684]], atol=1e-4)
+    np.testing.assert_allclose(sorted(-1 / control.poles(system).real), [19.0178, 33.4252, 43.2223, 43.2223], atol=1e-3)
+    assert system.state_labels == ["h1", "h2", "h3", "h4"] and system.input_labels == ["pump1", "pump2"]
+
+
+def test_an_operating_point_is_asked_for():
+    pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    for options in (
+        {},
+        {"outputs": (12.0, 12.0), "levels": (1.0,) * 4},
+        {"levels": (1.0,) * 4},
+        {"levels": (1.0,) * 3, "inputs": (1.0, 1.0)},
+    ):
+        with pytest.raises(InputError, match="to_control"):
+            neighbours.to_control(plant, **options)
+
+
+def test_columns_of_a_run_have_units():
+    case = rig.set_values(presets.find("khalid/gpc"), {"clock.duration": 40.0})
+    run = jaxtank.simulate(case.loop, case.clock)
+    found = neighbours.columns(run, case.loop.units)
+    assert {"t [s]", "h1 [m]", "r1 [m]"} <= set(found) and len({len(v) for v in found.values()}) == 1
+    np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
+
+
+def test_the_environment_plays_the_case():
+    """With the law's own inputs as actions, the levels are those of the closed loop; and Gymnasium's own checker has no complaint."""
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    from jaxtank.environment import TankEnv
+
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 150.0})
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
+    env = TankEnv(case)
+    env.reset(seed=0)
+    low, high = np.asarray(case.loop.actuator.low), np.asarray(case.loop.actuator.high)
+    total, k, ended = 0.0, 0, False
+    while not ended:
+        _, reward, broken, ended, info = env.step(2 * (run.applied[k] - low) / (high - low) - 1)
+        k, total = k + 1, total + reward
+        np.testing.assert_allclose(info["x"], run.x[k], atol=1e-9)
+        assert not broken and info["t"] == pytest.approx(run.t[k])
+    assert k == case.clock.samples - 1
+    assert total == pytest.approx(
+        -np.sum(np.mean((run.e[1:] / 30.0) ** 2, axis=1)) - 100 * np.sum(np.maximum(run.x[1:] - 30, 0) ** 2 / 900), rel=1e-6
+    )
+    check_env(TankEnv(case), skip_render_check=True)
+
+
+def test_noise_of_the_environment_follows_its_seed():
+    pytest.importorskip("gymnasium")
+    from jaxtank.environment import TankEnv
+
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0, "sensor.noise": 0.1})
+    env = TankEnv(case)
+    one, two, other = (env.reset(seed=s)[0] for s in (1, 1, 2))
+    assert np.array_equal(one, two) and not np.array_equal(one, other)
