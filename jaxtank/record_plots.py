@@ -11,7 +11,7 @@ def measured(ax, t, y, told, name, unit, held_from=None):
     ax.plot(t, y, ".", color=BEFORE, markersize=2.0, label="measured")
     ax.plot(t, told, color=AFTER, linewidth=1.2, label="simulated")
     if held_from is not None:
-        ax.axvspan(held_from, t[-1], color=OTHER, alpha=0.08, linewidth=0, label="held back first")
+        ax.axvspan(held_from, t[-1], color=OTHER, alpha=0.08, linewidth=0, label="held back at first")
     ax.set(ylabel=f"{name} [{unit}]", xlim=(t[0], t[-1]))
     return ax
 
@@ -20,6 +20,7 @@ def inputs(ax, t, u, unit):
     """What the pumps were given, u (samples, pumps), over time [s]."""
     for j in range(u.shape[1]):
         ax.step(t, u[:, j], where="post", linewidth=1.0, label=f"pump {j + 1}", color=(AFTER, BEFORE, OTHER)[j % 3])
+    ax.margins(y=0.1)
     ax.set(ylabel=f"input [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
     return ax
 
@@ -30,7 +31,6 @@ def residual(ax, t, r, name, unit, noise=None):
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     if noise is not None:
         ax.axhspan(-2 * noise, 2 * noise, color=OTHER, alpha=0.2, linewidth=0, label="2 sd of the record's noise")
-        ax.legend(loc="upper right")
     ax.margins(y=0.15)
     ax.set(ylabel=f"{name}: residual [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
     return ax
@@ -44,7 +44,6 @@ def autocorrelation(ax, acf, samples, name):
     ax.axhspan(-bound, bound, color=OTHER, alpha=0.25, linewidth=0, label="white noise, 95 %")
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8)
     ax.set(xlabel="lag [samples]", ylabel=f"{name}: autocorrelation [-]", ylim=(-1.05, 1.05))
-    ax.legend(loc="upper right")
     return ax
 
 
@@ -60,7 +59,7 @@ def correlation(ax, names, matrix):
                 ax.text(
                     j,
                     i,
-                    f"{matrix[i, j]:.2f}",
+                    f"{round(float(matrix[i, j]), 2) + 0.0:.2f}",
                     ha="center",
                     va="center",
                     fontsize=6.5,
@@ -78,6 +77,10 @@ def profile(ax, found):
     for end in found["interval95"]:
         if end is not None:
             ax.axvline(end, color=OTHER, linewidth=0.9, linestyle="--")
-    ax.set(xlabel=f"{found['name']} [{found['unit']}]", ylabel="rise of -2 log likelihood [-]", ylim=(0, None))
+    ax.set(
+        xlabel=f"{found['name']} [{found['unit']}]",
+        ylabel="rise of -2 log likelihood [-]",
+        ylim=(-0.03 * max(rise.max(), 5.0), None),
+    )
     ax.legend()
     return ax

@@ -174,16 +174,24 @@ def figures(found):
                     axes[c].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3)
             record_plots.inputs(axes[-1], one.t, one.u, found.case.loop.units[1])
             if one.u.shape[1] > 1:
-                axes[-1].legend(loc="upper right", ncols=one.u.shape[1])
+                axes[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=one.u.shape[1])
+            figure.align_ylabels(axes)
             figure.suptitle(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig", fontsize=9)
             made["fit" if len(est.logs) == 1 else f"fit_{e + 1}"] = figure
         left = idf.residuals_of(est, found.fit)
-        figure, axes = plt.subplots(len(names), 2, figsize=(8.4, 0.6 + 2.0 * len(names)), squeeze=False, layout="constrained")
+        figure, axes = plt.subplots(len(names), 2, figsize=(8.4, 0.9 + 1.9 * len(names)), squeeze=False, layout="constrained")
         for c, (name, unit) in enumerate(names):
             one = est.logs[0]
             record_plots.residual(axes[c, 0], one.t, left[0, : one.samples, c], name, unit, found.quality["noise"][c])
             acf = idf.autocorrelation(left[..., c])
             record_plots.autocorrelation(axes[c, 1], acf, int(np.isfinite(left[..., c]).sum()), name)
+            for ax in axes[c] if c < len(names) - 1 else ():
+                ax.set_xlabel("")
+        for ax in axes[0]:
+            ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
+        figure.align_ylabels(axes)
+        more = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
+        figure.suptitle(f"{found.case.name}: measured less simulated{more}", fontsize=9)
         made["residuals"] = figure
         kept, matrix = correlation_of(found)
         if len(kept) > 1:
@@ -225,4 +233,16 @@ def save(found, folder):
     if found.status != "not_identifiable":
         files["rig.toml"] = rigs.dump(found.identified)
     files |= {f"{name}.png": report._png(figure) for name, figure in figures(found).items()}
+    for path in _left_over(Path(folder), files):
+        path.unlink()
     return report.write_files(Path(folder), files)
+
+
+def _left_over(folder, files):
+    """What an earlier identification wrote to the folder and this one does not: a rig that this one refuses must not be taken for its own."""
+    if not (folder / "fit.csv").exists():
+        return []
+    ours = [folder / name for name in ("rig.toml", "fit.png", "correlation.png", "profile.png")] + sorted(
+        folder.glob("fit_[0-9]*.png")
+    )
+    return [path for path in ours if path.name not in files and path.is_file()]
