@@ -14,6 +14,12 @@ BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
     "#CC79A7",
     "#009E73",
 )  # Okabe and Ito, colour-blind safe
+WATER, GLASS = "#9CCEEB", "0.35"
+"""What is in a tank and what it is made of, in drawings of a rig."""
+
+PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
+"""One colour for each pump and its pipework, of the same colour-blind safe set."""
+
 STYLE = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -28,6 +34,11 @@ STYLE = {
     "savefig.dpi": 130,
     "svg.fonttype": "none",
 }
+
+
+def plain(text):
+    """`text` for matplotlib, which would otherwise set what stands between two dollar signs as mathematics."""
+    return text.replace("$", r"\$")
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
@@ -116,7 +127,7 @@ def responses(loop, trajectories, title="", limits=None):
             for handle, label in zip(*ax.get_legend_handles_labels()):
                 handles.setdefault(label, handle)
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        figure.suptitle("\n".join(textwrap.fill(line, int(12 * width)) for line in title.splitlines()), fontsize=10)
+        figure.suptitle("\n".join(textwrap.fill(plain(line), int(12 * width)) for line in title.splitlines()), fontsize=10)
     return figure
 
 
@@ -251,7 +262,7 @@ def panels(draw, title, rows):
             ax.set_visible(False)
         handles, labels = axes.flat[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
-        figure.suptitle(title, fontsize=10)
+        figure.suptitle(plain(title), fontsize=10)
     return figure
 
 
@@ -307,7 +318,7 @@ def fan(loop, bands, title):
             ax.set_xlabel("time [s]")
         for ax in axes.ravel()[tanks:]:
             ax.set_visible(False)
-        figure.suptitle(title)
+        figure.suptitle(plain(title))
     return figure
 
 

@@ -1,0 +1,100 @@
+"""Where the parts of a rig go in a drawing of it: tanks in rows by what pours into what, pumps below, pipework between."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+PITCH = 1.7
+"""From the middle of one tank to that of the next in its row, in heights of the tallest tank."""
+
+STOREY = 1.75
+"""From the floor of one row of tanks to that of the next."""
+
+
+class Box(NamedTuple):
+    """A tank: its left lower corner, its width and its height, in heights of the tallest tank."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    scale: float  # drawn height of one unit of level [1/cm]
+
+    @property
+    def middle(self):
+        return self.x + self.width / 2
+
+
+class Layout(NamedTuple):
+    """Places of everything: boxes one per tank, pumps one (x, y) each, risers one path ((x, y), ...) per pump and tank that it fills,
+    drawn from the pump to where the jet ends; left, right, bottom, top: what the drawing needs."""
+
+    boxes: tuple
+    pumps: tuple
+    risers: tuple  # (pump, tank, path)
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+
+def storeys(plant):
+    """(n,) which row each tank stands in, 0 the lowest: above every tank that it pours into, level with those that it is piped to.
+
+    Tanks that pour in a circle, which no rig of bricks and gravity can do, stand as they come.
+    """
+    row = [0] * plant.tanks
+    for _ in range(plant.tanks):
+        for source, sink in (*plant.links, *plant.spills):
+            row[source] = min(max(row[source], row[sink] + 1), plant.tanks - 1)
+        for one, other in plant.pipes:
+            row[one] = row[other] = max(row[one], row[other])
+    used = sorted(set(row))
+    return tuple(used.index(r) for r in row)
+
+
+def place(plant):
+    """The Layout of a `TankNetwork`. Heights are to scale within the rig; widths follow the roots of the areas, within limits."""
+    rims, areas = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
+    heights = np.clip(rims / rims.max(), 0.3, 1.0)
+    widths = 0.95 * np.clip(np.sqrt(areas / areas.max()), 0.4, 1.0)
+    rows = storeys(plant)
+    wide = max(rows.count(r) for r in set(rows))
+    boxes = [None] * plant.tanks
+    for row in sorted(set(rows)):
+        mine = [i for i in range(plant.tanks) if rows[i] == row]
+        for k, i in enumerate(mine):
+            x = PITCH * (k + (wide - len(mine)) / 2) + PITCH / 2
+            boxes[i] = Box(x - widths[i] / 2, row * STOREY, float(widths[i]), float(heights[i]), float(heights[i] / rims[i]))
+    return _with_pumps(plant, boxes, rows, wide * PITCH)
+
+
+def _with_pumps(plant, boxes, rows, width):
+    """Pumps stand in the basin at the nearer side of the first tank that they fill; each has a riser and a height of its own above a row."""
+    sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
+    pumps, risers, above = [], [], {}
+    for j, feed in enumerate(plant.feeds):
+        place = sides[:j].count(sides[j])  # the how-manieth on this side
+        x = -0.35 - 0.5 * place if sides[j] == "left" else width + 0.35 + 0.5 * place
+        pumps.append((x, -0.78))
+        targets = [i for i in feed if i is not None]
+        for i in targets:
+            row = rows[i]
+            above[row] = above.get(row, 0) + 1
+            y = row * STOREY + 1.0 + 0.12 + 0.14 * (above[row] - 1)
+            # jets of different pumps into one tank side by side, on the side that they come from
+            share = 0.2 if sides[j] == "left" else 0.8
+            end = boxes[i].x + boxes[i].width * share
+            risers.append((j, i, ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))))
+    most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
+    edge = 0.75 + 0.5 * max(0, most - 1)
+    top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
+    return Layout(tuple(boxes), tuple(pumps), tuple(risers), -edge, width + edge, -1.12, top)
+
+
+def _side(plant, boxes, width, j):
+    first = plant.feeds[j][0]
+    middle = boxes[first].middle - width / 2
+    if abs(middle) > 1e-9:
+        return "left" if middle < 0 else "right"
+    return "left" if j % 2 == 0 else "right"

@@ -1,0 +1,180 @@
+"""The rig drawn from its own topology: tanks, pumps and their splits, orifices, pipes, spills and the basin, on given matplotlib axes."""
+
+import numpy as np
+from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+
+from jaxtank.layout import place
+from jaxtank.plotting import AFTER, GLASS, PUMPS, REFERENCE, WATER
+
+JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
+"""Water in free fall."""
+
+
+def schematic(ax, plant, levels=None, setpoints=None):
+    """Draw the rig `plant` (TankNetwork): the tanks of each row beside each other, above those that they pour into, heights to scale.
+
+    levels: (tanks,) [cm] to fill the tanks to, or None for empty ones; setpoints: (outputs,) [cm], marked on the controlled tanks, which
+    have a heavier outline. A closed orifice (area 0) is not drawn. Dashes fall freely, dots pass a rim, double lines lie below the
+    surface. Returns the axes.
+    """
+    where, unit = place(plant), plant.units[0]
+    _basin(ax, where)
+    for pump, _, path in where.risers:
+        ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, solid_joinstyle="round", zorder=1)
+        ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
+    for k, (one, other) in enumerate(plant.pipes):
+        if float(np.asarray(plant.pipe)[k]) > 0:
+            _pipe(ax, where.boxes[one], where.boxes[other])
+    _jets(ax, plant, where)
+    for source, sink in plant.spills:
+        _spill(ax, where.boxes[source], where.boxes[sink])
+    for i, box in enumerate(where.boxes):
+        held = i in plant.outputs
+        ax.add_patch(Rectangle((box.x, box.y), box.width, box.height, facecolor="white", edgecolor="none", zorder=1.5))
+        if levels is not None:
+            ax.add_patch(Rectangle((box.x, box.y), box.width, depth(box, levels[i]), facecolor=WATER, edgecolor="none", zorder=1.6))
+        x, y = box.x + box.width, box.y + box.height
+        ax.plot(
+            [box.x, box.x, x, x], [y, box.y, box.y, y], color=REFERENCE if held else GLASS, linewidth=2.2 if held else 1.4, zorder=3
+        )
+        _label(ax, plant, i, box, None if levels is None else float(levels[i]), unit)
+    if setpoints is not None:
+        for k, i in enumerate(plant.outputs):
+            mark(ax, where.boxes[i], float(setpoints[k]))
+    for j, (x, y) in enumerate(where.pumps):
+        _pump(ax, j, x, y)
+    _shares(ax, plant, where)
+    ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
+    ax.axis("off")
+    return ax
+
+
+def mark(ax, box, setpoint):
+    """The setpoint [cm] as a triangle and a short line at the right wall of a tank, clear of its name; returns the two artists."""
+    y, x = mark_height(box, setpoint), box.x + box.width
+    (line,) = ax.plot([x - 0.1 * box.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
+    (triangle,) = ax.plot([x + 0.07], [y], marker="<", color=REFERENCE, markersize=5, zorder=4)
+    return line, triangle
+
+
+def mark_height(box, setpoint):
+    """Where the mark of a setpoint [cm] stands; one above the rim just over it."""
+    return box.y + min(max(setpoint, 0.0) * box.scale, 1.05 * box.height)
+
+
+def depth(box, level):
+    """Drawn depth of a level [cm]; one past the rim just over it."""
+    return min(max(float(level), 0.0) * box.scale, 1.05 * box.height)
+
+
+def _colour(pump):
+    return PUMPS[pump % len(PUMPS)]
+
+
+def _basin(ax, where):
+    low, high = where.left + 0.06, where.right - 0.06
+    ax.add_patch(Rectangle((low, where.bottom + 0.06), high - low, 0.14, facecolor=WATER, alpha=0.5, edgecolor="none", zorder=0))
+    ax.plot([low, low, high, high], [-0.82, where.bottom + 0.06, where.bottom + 0.06, -0.82], color=GLASS, linewidth=1.4)
+    ax.text((low + high) / 2, where.bottom + 0.13, "basin", ha="center", va="center", fontsize=7, color="0.25")
+
+
+def _pump(ax, pump, x, y):
+    ax.add_patch(Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4))
+    ax.add_patch(Polygon([(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)], facecolor=_colour(pump), zorder=5))
+    right = x > 0
+    ax.text(
+        x + (-0.23 if right else 0.23),
+        y + 0.12,
+        f"pump {pump + 1}",
+        fontsize=8,
+        ha="right" if right else "left",
+        va="center",
+        zorder=5,
+    )
+
+
+def _shares(ax, plant, where):
+    """What share of a pump goes where, beside each branch of a pump that has two."""
+    for pump, tank, path in where.risers:
+        first, second = plant.feeds[pump]
+        if second is None:
+            continue
+        ax.plot(*path[1], marker="o", color=_colour(pump), markersize=3.5, zorder=2)
+        share = float(np.asarray(plant.split)[pump])
+        share = share if tank == first else 1.0 - share
+        (x, y), (end, _) = path[1], path[2]
+        ax.text(
+            x + (0.06 if end > x else -0.06),
+            y + 0.02,
+            f"{100 * share:.3g} %",
+            fontsize=7,
+            ha="left" if end > x else "right",
+            va="bottom",
+            color="0.15",
+        )
+
+
+def _label(ax, plant, tank, box, level, unit):
+    rim = float(np.asarray(plant.rim)[tank])
+    what = f"{level:.3g} {unit}" if level is not None else ("controlled" if tank in plant.outputs else "")
+    words = "\n".join(w for w in (f"tank {tank + 1}", what) if w)
+    small = box.width < 0.7
+    said = ax.text(box.middle, box.y + 0.5 * box.height, words, ha="center", va="center", fontsize=7 if small else 8, zorder=5)
+    said.set_path_effects([withStroke(linewidth=2.2, foreground="white")])  # a water line may pass behind the words
+    ax.text(
+        box.x + box.width + 0.05,
+        box.y + box.height,
+        f"{rim:g} {unit}",
+        ha="left",
+        va="center",
+        fontsize=6.5,
+        color="0.25",
+        zorder=5,
+    )
+
+
+def _jets(ax, plant, where):
+    """Free jets from the floor of each tank: into the tanks below it, and into the basin."""
+    for i, box in enumerate(where.boxes):
+        sinks = [
+            (where.boxes[sink].middle, where.boxes[sink])
+            for k, (source, sink) in enumerate(plant.links)
+            if source == i and float(np.asarray(plant.orifice)[k]) > 0
+        ]
+        sinks.sort(key=lambda s: s[0])
+        drained = float(np.asarray(plant.drain)[i]) > 0
+        for k, (_, below) in enumerate(sinks):
+            x = box.x + box.width * (k + 1) / (len(sinks) + 1)
+            end = min(max(x, below.x + 0.35 * below.width), below.x + 0.65 * below.width)
+            _spout(ax, x, box.y)
+            ax.plot([x, x, end], [box.y - 0.06, box.y - 0.12, below.y + 0.97 * below.height], **JET)
+        if drained and not sinks:
+            _spout(ax, box.middle, box.y)
+            ax.plot([box.middle, box.middle], [box.y - 0.06, -0.93], **JET)
+        elif drained:  # past the tanks below
+            x = box.x + box.width + 0.16
+            ax.plot([box.x + box.width, x, x], [box.y + 0.05, box.y + 0.05, -0.93], **JET)
+
+
+def _spout(ax, x, y):
+    ax.add_patch(Polygon([(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)], facecolor=GLASS, zorder=3))
+
+
+def _pipe(ax, one, other):
+    left, right = sorted((one, other), key=lambda b: b.x)
+    y = max(left.y, right.y) + 0.08
+    for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
+        ax.plot([left.x + left.width, right.x], [y, y], color=colour, linewidth=wide, solid_capstyle="butt", zorder=layer)
+
+
+def _spill(ax, source, sink):
+    x = source.x - 0.13
+    path = [
+        (source.x, source.y + source.height),
+        (x, source.y + source.height - 0.05),
+        (x, sink.y + sink.height + 0.25),
+        (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97),
+    ]
+    ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
+    ax.text(x - 0.04, (path[1][1] + path[2][1]) / 2, "overflow", fontsize=6.5, color="0.25", rotation=90, ha="right", va="center")
