@@ -666,7 +666,14 @@ def test_uncertainty_json_has_the_keys_of_the_contract_and_the_numbers_of_the_li
 
 def test_uncertainty_in_shards_is_that_of_one_run(here):
     one = done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--json", "--out", "one").json
-    assert {p.name for p in (here / "one").iterdir()} == {"result.json", "draws.csv", "fan.png", "violations.png"}
+    assert {p.name for p in (here / "one").iterdir()} == {
+        "result.json",
+        "draws.csv",
+        "report.html",
+        "fan.png",
+        "violations.png",
+        "rig.png",
+    }
     for picture in (here / "one").glob("*.png"):
         assert_picture(picture)
     said = say("merge", CASE, *SHORT, *DRAWS, "--out", "two")

@@ -576,6 +576,8 @@ def test_what_is_written(identified):
         "residuals.png",
         "correlation.png",
         "profile.png",
+        "rig.png",
+        "report.html",
     }
     again = rig.load(folder / "rig.toml")
     found = json.loads(identified[1])

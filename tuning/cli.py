@@ -7,6 +7,7 @@ be met, 5 bad data file, 130 interrupted (the best point so far is written and s
 import argparse
 import functools
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -84,7 +85,10 @@ def parser():
 
     commands.add_parser("list", parents=[common], help="print every case")
     commands.add_parser("show", parents=[common, case], help="one case: rig, law, every parameter, published numbers, departures")
-    commands.add_parser("simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures")
+    simulate = commands.add_parser(
+        "simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures"
+    )
+    simulate.add_argument("--gif", action="store_true", help="with --out also run.gif, the tanks of the rig filling and emptying")
     tune = commands.add_parser("tune", parents=[common, case, run], help="tune the gains of a case under its limits")
     tune.add_argument("--method", default="auto", metavar="NAME", help="auto (default), trf, coarse-trf, slsqp, lbfgs or adam")
     tune.add_argument(
@@ -208,6 +212,7 @@ def parser():
         "compare", parents=[common], help="published numbers beside measured ones, and why they differ; PAPER or all"
     )
     compare.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
+    compare.add_argument("--out", metavar="DIR", help="folder for report.html, result.json and the rigs as pictures")
     compare.add_argument("--markdown", action="store_true", help="as the table of the README")
     bench = commands.add_parser("bench", parents=[common], help="ns per closed-loop step here, beside a C loop")
     bench.add_argument("cases", nargs="*", metavar="CASE", help='cases to time instead, or "all"')
@@ -233,6 +238,7 @@ def main(argv=None):
             return 0
         if args.command is None:
             raise InputError("no command: try jaxtank --help")
+        args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
         return COMMANDS[args.command](args)
     except (InputError, NonFiniteError) as error:
         print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
@@ -389,7 +395,7 @@ def _told(found, args):
     """Write, print and end with an Ensemble."""
     from tuning import report
 
-    written = found.save(args.out) if args.out else []
+    written = found.save(args.out, args.line) if args.out else []
     print(report.dumps(found.to_json()) if args.json else repr(found))
     _written(written, args)
     return 0
@@ -507,6 +513,8 @@ def _export(args):
 
 def _simulate(args):
     _out(args)
+    if args.gif and not args.out:
+        raise InputError("--gif needs --out DIR, where run.gif is written")
     seed, case = _seed(args), _open(args)
     import jax
 
@@ -525,7 +533,7 @@ def _simulate(args):
         "parameters": report.clean(loop.parameters(case.loop)),
         "provenance": search.provenance(case, seed),
     }
-    written = report.save_run(case, report.run_for_people(case, key), payload, args.out) if args.out else []
+    written = report.save_run(case, report.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
     if args.json:
         print(report.dumps(payload))
     else:
@@ -605,7 +613,7 @@ def _tune(args):
         from tuning.bound import bound
 
         result = result.replace(bound=bound(result.tuned, objective, limits))
-    written = result.save(folder) if folder else []
+    written = result.save(folder, args.line) if folder else []
     args.out = folder
     if folder and result.status != "interrupted":
         from tuning.memo import discard
@@ -707,6 +715,7 @@ def _bench(args):
 
 
 def _compare(args):
+    _out(args)
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -721,10 +730,12 @@ def _compare(args):
         if not args.quiet:
             print(f"running {paper}", file=sys.stderr, flush=True)
         found[paper] = compare.measure(paper)
+    written = compare.save(found, args.out, args.line) if args.out else []
     if args.json:
         print(report.dumps(found if args.paper == "all" else found[args.paper]))
     else:
         print(compare.markdown(found) if args.markdown else "\n\n".join(compare.text(page) for page in found.values()))
+    _written(written, args)
     return 0
 
 

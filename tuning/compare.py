@@ -2,16 +2,21 @@
 
 import numbers
 import textwrap
+from collections import Counter
+from pathlib import Path
 
 import jax
 import numpy as np
 
+import jaxtank
 from jaxtank import loop as lp
 from jaxtank import presets, rig
+from jaxtank.files import check_folder
 from jaxtank.presets.base import Claim
 from jaxtank.tree import get_value
-from tuning import report
+from tuning import pictures, report
 from tuning.manual import noisy
+from tuning.page import document, svg
 
 QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
 
@@ -125,6 +130,48 @@ def text(page):
         if note:
             lines.append(f"- {row['quantity']} ({row['where']}): {note}")
     return "\n".join(lines)
+
+
+def save(pages, folder, command=None):
+    """Write result.json and report.html of {paper: page}, and a picture of the rig of each paper, to `folder`; returns their paths."""
+    check_folder(folder)
+    drawn, pictures_of = {}, []
+    for paper, found in pages.items():
+        seen = []
+        for name, case in presets.load(paper).cases.items():
+            plant = case.loop.plant
+            drawing = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs, np.asarray(plant.rim).tolist())
+            if drawing not in seen:  # cases of one paper share their rig, but for some
+                seen.append(drawing)
+                of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
+                drawn[of] = pictures.rig(case.loop, None, f"{paper}/{name}")["rig"]
+                pictures_of.append((of, svg(drawn[of], of), f"The rig of {paper}/{name}. {found['citation']}"))
+    rows = [row for found in pages.values() for row in found["rows"]]
+    count = Counter(row["verdict"] for row in rows)
+    parts = [part for found in pages.values() for part in (found["citation"], *_in_full(found))]
+    html = document(
+        f"{', '.join(pages)}: published and measured",
+        "What is printed beside what the same rigs and laws do here, and why they differ.",
+        f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured quantities and claims reproduced",
+        True,
+        [(word, str(n)) for word, n in count.most_common()],
+        [],
+        pictures_of,
+        parts,
+        command,
+        {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
+    )
+    table = pages if len(pages) > 1 else next(iter(pages.values()))
+    return report.write_files(Path(folder), {"result.json": report.dumps(table) + "\n", "report.html": html, **report.pngs(drawn)})
+
+
+def _in_full(found):
+    """The table of a page with room for what does not fit a line: where it is printed, and the reason for a difference."""
+    rows = [
+        [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"], r["where"], r["reason"]]
+        for r in found["rows"]
+    ]
+    return [report.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"])]
 
 
 def markdown(pages):

@@ -129,11 +129,11 @@ class Ensemble:
 
         return json_of(self)
 
-    def save(self, folder):
-        """Write result.json, draws.csv and the pictures to a folder."""
+    def save(self, folder, command=None):
+        """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.ensemble_report import save
 
-        return save(self, folder)
+        return save(self, folder, command)
 
     def __repr__(self):
         from tuning.ensemble_report import text

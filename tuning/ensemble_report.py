@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.files import check_folder
-from tuning import parts, report, search
+from tuning import page, parts, report, search
 
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
@@ -39,6 +39,11 @@ def json_of(ensemble):
 
 def text(ensemble):
     """The ensemble as a page of text."""
+    return "\n".join(parts_of(ensemble))
+
+
+def parts_of(ensemble):
+    """What `text` says: a list of lines and tables."""
     units, rows = ensemble.case.loop.units, []
     for name, found in ensemble.summary().items():
         columns = {w: np.ravel(found[w] if found[w] is not None else np.nan) for w in WORDS}
@@ -88,7 +93,7 @@ def text(ensemble):
         words.append(
             f"{int(ensemble.infeasible.sum())} draws have a plateau without a steady state within rims and pumps; they are in all figures"
         )
-    return "\n".join(words)
+    return words
 
 
 def _words(distribution):
@@ -111,24 +116,76 @@ def draws_csv(ensemble):
 
 
 def figures(ensemble):
-    """Matplotlib figures {name: figure}: "fan" of the levels, "violations"."""
+    """Matplotlib figures {name: figure}: "fan" of the levels, "violations", "rig"."""
     from jaxtank import plotting
+    from tuning import pictures
 
     drawn = {}
     if ensemble.fan is not None:
         drawn["fan"] = plotting.fan(ensemble.case.loop, ensemble.fan, f"{ensemble.case.name}: {ensemble.fan['draws']} draws")
     if ensemble.limits:
         drawn["violations"] = plotting.violations(ensemble.violations(), ensemble.samples)
-    return drawn
+    return drawn | pictures.rig(ensemble.case.loop, None, ensemble.case.name)
 
 
-def save(ensemble, folder):
-    """Write result.json, draws.csv and pictures to `folder`; returns their paths. Finished batches that lie there are removed."""
+CAPTIONS = {
+    "fan": "Levels over all draws that were kept whole: the median, the middle half, and 9 in 10 of them at each moment.",
+    "violations": "The probability that a rig of this spread breaks each limit, with its 95 % interval.",
+    "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
+}
+
+
+def page_of(ensemble, drawn, command=None):
+    """The page report.html of an ensemble, with `drawn`, the figures of `figures`; command: the line that made it."""
+    failed, broken = int(ensemble.failed.sum()), ensemble.violations() if ensemble.limits else []
+    facts = [("draws", str(ensemble.samples)), ("runs that left the numbers", str(failed)), ("time", f"{ensemble.wall_s:.1f} s")]
+    said = []
+    if broken:
+        worst = max(broken, key=lambda v: v["probability"])
+        low, high = worst["interval95"]
+        facts.insert(1, ("the limit most often broken", f"{100 * worst['probability']:.3g} %"))
+        said.append(
+            f"{worst['name']} ({report.number(worst['limit'])}) is the limit most often broken: in {worst['count']} of {ensemble.samples} draws, "
+            f"a probability between {low:.3g} and {high:.3g} with 95 % confidence"
+        )
+    found = ensemble.summary().get("rms_error_total")
+    if found is not None and found["p50"] is not None:
+        unit = ms.unit("rms_error_total", ensemble.case.loop.units)
+        shown = [report.number(np.ravel(found[k])[0], 4) for k in ("p50", "p05", "p95")]
+        facts.insert(1, ("median rms_error_total", f"{shown[0]} {unit}"))
+        said.append(
+            f"rms_error_total: half of the draws lie below {shown[0]} {unit}, 9 in 10 between {shown[1]} and {shown[2]} {unit}"
+        )
+    status = "no limits were asked for" if not broken else "no limit was broken in any draw"
+    if failed:
+        status = f"{failed} of {ensemble.samples} runs left the numbers"
+    elif any(v["count"] for v in broken):
+        status = "some draws break a limit"
+    return page.document(
+        f"{ensemble.case.name}: uncertainty",
+        ensemble.case.title,
+        status,
+        status.startswith("no "),
+        facts,
+        said,
+        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        parts_of(ensemble),
+        command,
+        search.provenance(ensemble.case, ensemble.seed),
+    )
+
+
+def save(ensemble, folder, command=None):
+    """Write result.json, draws.csv, pictures and report.html to `folder`; returns their paths. Finished batches that lie there are removed.
+
+    command: the line that made the ensemble, for the report, where there is one.
+    """
     check_folder(folder)
     folder = Path(folder)
     files = {"result.json": report.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
     written = report.write_files(folder, files)
-    written += report.write_files(folder, {f"{n}.png": report._png(f) for n, f in figures(ensemble).items()})
+    drawn = figures(ensemble)
+    written += report.write_files(folder, {"report.html": page_of(ensemble, drawn, command)} | report.pngs(drawn))
     if (folder / parts.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):
             if parts.NAME.fullmatch(path.name):

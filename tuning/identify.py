@@ -335,11 +335,14 @@ class Identification:
 
         return identify_report.figures(self)
 
-    def save(self, folder):
-        """Write rig.toml (where every parameter is identified), result.json, fit.csv and pictures; returns the paths."""
+    def save(self, folder, command=None):
+        """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and report.html; returns the paths.
+
+        command: the line that made it, for the report, where there is one.
+        """
         from tuning import identify_report
 
-        return identify_report.save(self, folder)
+        return identify_report.save(self, folder, command)
 
 
 def identify(

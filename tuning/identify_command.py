@@ -94,7 +94,7 @@ def run(args):
         iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
         gap=gap,
     )
-    written = found.save(args.out) if args.out else []
+    written = found.save(args.out, args.line) if args.out else []
     print(report.dumps(found.to_json()) if args.json else repr(found))
     if written and not args.quiet:
         print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.files import check_folder
 from tuning import identifiability as idf
-from tuning import report, search
+from tuning import page, pictures, report, search
 
 FEW = 0.5
 """Share of the starts that must agree for the answer not to say that few did."""
@@ -60,6 +60,11 @@ def _table(found):
 
 def text(found):
     """The result as a page of text."""
+    return "\n".join(parts_of(found))
+
+
+def parts_of(found):
+    """What `text` says: a list of lines and tables."""
     est = found.estimation
     readings = int(est.mask.sum())
     steps = np.concatenate([np.diff(one.t) for one in est.logs])
@@ -76,10 +81,10 @@ def text(found):
         "",
         _levels(found),
         "",
-        "\n".join(f"- {w}" for w in message(found).split("; ")),
+        report._wrap(message(found)),
     ]
     if found.validation:
-        lines += ["", _validation(found)]
+        lines += ["", *_validation(found)]
     if found.remedies:
         lines += ["", "What would tell them apart:"] + [f"- {w}" for w in found.remedies]
     if found.profile:
@@ -91,7 +96,7 @@ def text(found):
         ]
         lines += ["", f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"]
     lines += ["", f"{found.wall_s:.1f} s, {sum(s['evaluations'] for s in found.starts)} passes"]
-    return "\n".join(lines)
+    return lines
 
 
 def _levels(found):
@@ -112,7 +117,7 @@ def _validation(found):
             rmse, share = v[side]["rmse"][c], v[side]["nrmse_percent"][c]
             rows.append([name, words, "-" if rmse is None else f"{rmse:.4g} {unit}", "-" if share is None else f"{share:.1f} %"])
     head = f"fit to the first {', '.join(map(str, v['samples']))} samples, the rest predicted from the same start"
-    return head + "\n" + report.table(rows, ["reading", "part", "RMS", "fit"])
+    return [head, report.table(rows, ["reading", "part", "RMS", "fit"])]
 
 
 def json_of(found):
@@ -226,13 +231,53 @@ def fit_csv(found):
     return out.getvalue()
 
 
-def save(found, folder):
-    """Write result.json, fit.csv, pictures and, where every parameter is identified, rig.toml to `folder`; returns their paths."""
+CAPTIONS = {
+    "fit": "What was measured (dots) and what the fitted rig says (line), with what the pumps were given.",
+    "residuals": "What the fitted rig leaves of the readings: over time, and from sample to sample. Beyond the band it is not noise.",
+    "correlation": "Correlation of the estimates: near 1 or -1, the record tells a combination of the two better than each.",
+    "profile": "How much worse the record fits when one parameter is held away from its estimate and all others are fitted again.",
+    "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
+}
+
+
+def page_of(found, drawn, command=None):
+    """The page report.html of an identification, with `drawn`, figures by name; command: the line that made it."""
+    told = sum(p["interval95"] is not None for p in found.parameters.values())
+    facts = [
+        ("parameters with an interval", f"{told} of {len(found.parameters)}"),
+        ("samples", str(sum(one.samples for one in found.estimation.logs))),
+    ]
+    for (name, unit), rmse, share in zip(channel_names(found), found.quality["rmse"], found.quality["nrmse_percent"]):
+        facts.append((f"residual of {name}", f"{rmse:.3g} {unit}" + ("" if share is None else f" ({share:.1f} %)")))
+    captions = {n: CAPTIONS[n.split("_")[0]] for n in drawn}
+    said = message(found)
+    return page.document(
+        f"{found.case.name}: identified",
+        ", ".join(one.name for one in found.estimation.logs),
+        found.status.replace("_", " "),
+        found.status == "converged",
+        facts,
+        said.split("; "),
+        [(n, page.svg(f, n, captions[n]), captions[n]) for n, f in drawn.items()],
+        [part for part in parts_of(found)[1:] if part != report._wrap(said)],
+        command,
+        search.provenance(found.case, found.seed),
+        {} if found.status == "not_identifiable" else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)},
+    )
+
+
+def save(found, folder, command=None):
+    """Write result.json, fit.csv, pictures, report.html and, where every parameter is identified, rig.toml to `folder`; returns their paths.
+
+    command: the line that made it, for the report, where there is one.
+    """
     check_folder(folder)
     files = {"result.json": report.dumps(json_of(found)), "fit.csv": fit_csv(found)}
     if found.status != "not_identifiable":
         files["rig.toml"] = rigs.dump(found.identified)
-    files |= {f"{name}.png": report._png(figure) for name, figure in figures(found).items()}
+    drawn = figures(found) | pictures.rig(found.case.loop, None, found.case.name)
+    files["report.html"] = page_of(found, drawn, command)
+    files |= report.pngs(drawn)
     for path in _left_over(Path(folder), files):
         path.unlink()
     return report.write_files(Path(folder), files)

@@ -92,12 +92,22 @@ def units(rig_units):
     return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
+class Table(str):
+    """Aligned columns as text, which still knows its `head` and `rows`, so that a page may set them in its own way."""
+
+    head: list
+    rows: list
+
+
 def table(rows, head=None):
-    """Rows of text as aligned columns, the first to the left."""
-    rows = ([head] if head else []) + [[str(c) for c in row] for row in rows]
+    """Rows of text as aligned columns, the first to the left: a Table."""
+    body = [[str(c) for c in row] for row in rows]
+    rows = ([head] if head else []) + body
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
-    return "\n".join(lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines)
+    found = Table("\n".join(lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines))
+    found.head, found.rows = head or [], body
+    return found
 
 
 def json_of(result):
@@ -133,6 +143,11 @@ def json_of(result):
 
 def text(result):
     """The result as a page of text."""
+    return "\n".join([*parts_of(result), _wrap(result.message)])
+
+
+def parts_of(result):
+    """What `text` says but for the message: a list of lines and Tables."""
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
     head = [
         f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
@@ -199,7 +214,7 @@ def text(result):
         if result.tuned.loop.plant.overflow
         else "rims are limits: a level may rise past one"
     )
-    return "\n".join([*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s", _wrap(result.message)])
+    return [*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s"]
 
 
 def worst_of_scenarios(constraints):
@@ -370,6 +385,11 @@ def _png(figure):
     return out.getvalue()
 
 
+def pngs(drawn):
+    """{file name: bytes} of {name: figure}; the figures are closed."""
+    return {f"{name}.png": _png(figure) for name, figure in drawn.items()}
+
+
 def result_key(result):
     """The key of the sensor noise of the case's own run, None where it has none."""
     import jax
@@ -378,10 +398,11 @@ def result_key(result):
 
 
 def figures(result, runs=None):
-    """Matplotlib figures of a tuning result: "responses" (before against after), "convergence", "landscape"."""
+    """Matplotlib figures of a tuning result: those of CAPTIONS that have something to show."""
     import matplotlib.pyplot as plt
 
     from jaxtank import plotting
+    from tuning import pictures
 
     key = result_key(result)
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
@@ -403,7 +424,15 @@ def figures(result, runs=None):
         )
         + ")"
     )
-    drawn = {"responses": plotting.responses(result.tuned.loop, runs, title, limits)}
+    drawn = {
+        "responses": plotting.responses(result.tuned.loop, runs, title, limits),
+        **pictures.rig(result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"),
+        **pictures.margins(worst_of_scenarios(result.constraints)),
+        **pictures.behind(result.tuned.loop, runs),
+        **pictures.estimates(
+            result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
+        ),
+    }
     with plt.rc_context(plotting.STYLE):
         if result.cloud is not None and len(result.cloud["objective"]):
             drawn["clouds"] = _clouds(plt, result, unit)
@@ -414,7 +443,57 @@ def figures(result, runs=None):
         figure, ax = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
         _landscape(ax, result, unit)
         drawn["landscape"] = figure
+    if result.tradeoff:
+        of = ms.unit(result.tradeoff["measure"], result.tuned.loop.units)
+        drawn |= pictures.tradeoff(result.tradeoff, of, unit)
     return drawn
+
+
+CAPTIONS = {
+    "responses": "The run before tuning (orange, dashed) and after (blue): controlled levels with their setpoints, tracking errors, the other "
+    "tanks, and what the pumps were given. Shaded: past a limit.",
+    "margins": "Room that the tuned run leaves to each limit; a bar to the left of zero is a limit that is broken.",
+    "behind": "Behind the controlled levels: the other tanks against each other, and when pumps were commanded past their limits.",
+    "estimates": "What the observer believed beside what was true, in the tuned run.",
+    "clouds": "Runs that the search never saw, on perturbed plants and fresh noise where the case has them: a dot each, before across, after up.",
+    "convergence": "Every evaluation of the search in its order.",
+    "landscape": "The objective around the answer, at the case's own step.",
+    "tradeoff": "The least objective that each value of the limit leaves.",
+    "rig": "The rig, drawn from its own topology; triangles are setpoints, a heavier outline is a tank that is controlled.",
+}
+
+
+def page_of(result, drawn, command=None):
+    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the line that made it."""
+    from tuning import page
+
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
+    before, after = result.objective["before"], result.objective["after"]
+    broken = [c for c in result.constraints if c["margin"] < 0]
+    limits = f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold" if result.constraints else "none"
+    facts = [
+        ("objective before", f"{number(before)} {unit}".strip()),
+        ("objective after", f"{number(after)} {unit}".strip()),
+        ("limits", limits),
+        ("gains tuned", str(len(result.parameters))),
+        ("simulations", str(result.evaluations["simulations"])),
+        ("time", f"{result.wall_s:.1f} s"),
+    ]
+    if np.isfinite(before) and before and not broken:
+        facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
+    return page.document(
+        f"{result.tuned.name}: tuned",
+        result.case.title,
+        result.status.replace("_", " ") + ("; every limit holds" if result.constraints and not broken else ""),
+        result.success,
+        facts,
+        result.message.split("; "),
+        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        parts_of(result)[1:],
+        command,
+        result.provenance,
+        {"The tuned rig as a file (rig.toml)": rig.dump(result.tuned)},
+    )
 
 
 def _clouds(plt, result, unit):
@@ -428,7 +507,7 @@ def _clouds(plt, result, unit):
     plotting.cloud(right, found["level"], found["held"], name, length, found["limit"])
     handles, labels = right.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw", fontsize=10)
+    figure.suptitle(plotting.plain(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"), fontsize=10)
     return figure
 
 
@@ -482,8 +561,11 @@ def _landscape(ax, result, unit):
     return ax
 
 
-def save(result, folder):
-    """Write result.json, rig.toml, trajectory.csv and PNG pictures to `folder`, each whole or not at all; returns their paths."""
+def save(result, folder, command=None):
+    """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
+
+    command: the line that made the result, for the report, where there is one.
+    """
     check_folder(folder)
     folder = Path(folder)
     key = result_key(result)
@@ -495,16 +577,17 @@ def save(result, folder):
         "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
     written = write_files(folder, files)  # the numbers first: pictures take seconds
-    return written + write_files(folder, {f"{name}.png": _png(figure) for name, figure in figures(result, runs).items()})
+    drawn = figures(result, runs)
+    return written + write_files(folder, {"report.html": page_of(result, drawn, command)} | pngs(drawn))
 
 
-def save_run(case, run, payload, folder):
-    """Write result.json, trajectory.csv and responses.png of one simulation to `folder`."""
+def save_run(case, run, payload, folder, gif=False):
+    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`."""
     from jaxtank import plotting
 
     check_folder(folder)
     picture = plotting.responses(case.loop, {case.name: run}, case.title)
-    return write_files(
+    written = write_files(
         Path(folder),
         {
             "result.json": dumps(payload) + "\n",
@@ -512,6 +595,11 @@ def save_run(case, run, payload, folder):
             "responses.png": _png(picture),
         },
     )
+    if gif:
+        from jaxtank.animation import animate
+
+        written.append(animate(case.loop, run, Path(folder) / "run.gif"))
+    return written
 
 
 def write_files(folder, files):

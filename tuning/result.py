@@ -65,14 +65,14 @@ class TuningResult:
         """A copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def save(self, folder):
-        """Write result.json, rig.toml, trajectory.csv and the pictures to a folder."""
+    def save(self, folder, command=None):
+        """Write result.json, rig.toml, trajectory.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report import save
 
-        return save(self, folder)
+        return save(self, folder, command)
 
     def plot(self):
-        """Matplotlib figures {name: figure}: responses before and after, convergence, landscape."""
+        """Matplotlib figures {name: figure}: responses before and after, convergence, landscape, and what else there is to show."""
         from tuning.report import figures
 
         return figures(self)

@@ -1,0 +1,118 @@
+"""Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the limits. What says nothing is not drawn."""
+
+import numpy as np
+
+from jaxtank.units import local
+
+COLOURS = ("#D55E00", "#0072B2")  # before, after: as in jaxtank.plotting, which is not imported before something is drawn
+
+
+def rig(loop, run=None, title=""):
+    """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant that is no network of tanks."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting
+    from jaxtank.layout import place
+    from jaxtank.schematic import schematic
+
+    if not hasattr(loop.plant, "links"):
+        return {}
+    where = place(loop.plant)
+    wide, high = where.right - where.left, where.top - where.bottom
+    with plt.rc_context(plotting.STYLE):
+        figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
+        ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
+        levels, setpoints = (None, None) if run is None or not np.all(np.isfinite(run.x[-1])) else (run.x[-1], run.r[-1])
+        schematic(ax, loop.plant, levels, setpoints)
+        ax.set_title(plotting.plain(title))
+    return {"rig": figure}
+
+
+def behind(loop, runs):
+    """{"behind": phase of the tanks that are not controlled, and when pumps were commanded past their limits}; {} where there is neither.
+
+    runs: {name: Trajectory}, before and after, or one.
+    """
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, run_plots
+
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    inner = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
+    past = any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values())
+    styles = [(COLOURS[1], "-")] if len(runs) == 1 else [(COLOURS[0], "--"), (COLOURS[1], "-")]
+    drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
+    draws = []
+    if len(inner) > 1:
+        draws.append(lambda ax: run_plots.phase(ax, drawn, inner[:2], np.asarray(loop.plant.rim), loop.units[0]))
+    if past:
+        draws.append(lambda ax: run_plots.saturation(ax, runs, low, high))
+    if not draws:
+        return {}
+    with plt.rc_context(plotting.STYLE):
+        tall = max(3.4, 0.5 + 0.62 * len(runs) * loop.plant.pumps) if past else 3.4
+        figure, axes = plt.subplots(
+            1, len(draws), figsize=(4.6 * len(draws) + (0.6 if past else 0), tall), layout="constrained", squeeze=False
+        )
+        for draw, ax in zip(draws, axes[0]):
+            draw(ax)
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+    return {"behind": figure}
+
+
+def estimates(loop, clock, run, title=""):
+    """{"estimates": levels and disturbances as the observer saw them}; {} where levels are taken as they are measured."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, run_plots
+
+    tanks, disturbed = loop.plant.tanks, bool(np.any(run.d_hat))
+    if not disturbed and np.array_equal(run.x_hat, run.y):
+        return {}
+    length = loop.units[0]
+    known = None
+    if loop.disturbance is not None:
+        index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
+        known = np.asarray(loop.disturbance.sample(clock)[0])[index] / np.asarray(loop.plant.area)
+    rows = 2 if disturbed else 1
+    with plt.rc_context(plotting.STYLE):
+        figure, axes = plt.subplots(
+            rows, tanks, figsize=(max(6.4, 3.2 * tanks), 2.3 * rows + 0.5), sharex=True, squeeze=False, layout="constrained"
+        )
+        for i in range(tanks):
+            run_plots.estimate(axes[0, i], run, i, length)
+            if disturbed:
+                true = None if known is None else known[:, i]
+                run_plots.disturbance(axes[1, i], run, i, true, local("cm/s", loop.units))
+            axes[-1, i].set_xlabel("time [s]")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        figure.suptitle(plotting.plain(title), fontsize=10)
+    return {"estimates": figure}
+
+
+def margins(rows):
+    """{"margins": room to every limit}; {} where there are none."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, run_plots
+
+    if not rows:
+        return {}
+    with plt.rc_context(plotting.STYLE):
+        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.42 * min(len(rows), run_plots.MANY)), layout="constrained")
+        run_plots.margins(ax, rows)
+    return {"margins": figure}
+
+
+def tradeoff(found, unit, cost_unit):
+    """{"tradeoff": the least objective over a limit}; {} where none was asked. found: of `tuning.tradeoff`, or None."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, run_plots
+
+    if not found:
+        return {}
+    with plt.rc_context(plotting.STYLE):
+        figure, ax = plt.subplots(figsize=(6.0, 3.6), layout="constrained")
+        run_plots.tradeoff(ax, found["points"], found["measure"], unit, cost_unit)
+    return {"tradeoff": figure}
