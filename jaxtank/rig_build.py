@@ -161,6 +161,8 @@ def _entry(kind, index, entry, fields):
     for key, value in entry.items():
         if key not in fields:
             raise unknown(f"key of [[{kind}]]" if index is not None else f"key of [{kind}]", key, fields)
+        if key == "name" and not isinstance(value, str):
+            raise InputError(f"{where}: name = {_short(value)}: must be a text")
         free = key in ("name", "to", "from", "between", "outputs")
         truth = isinstance(fields[key], bool)
         good = isinstance(value, bool) if truth else not isinstance(value, bool) and isinstance(value, (int, float))
