@@ -74,8 +74,8 @@ def _with_pumps(plant, boxes, rows, width):
     sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
     pumps, risers, above = [], [], {}
     for j, feed in enumerate(plant.feeds):
-        place = sides[:j].count(sides[j])  # the how-manieth on this side
-        x = -0.35 - 0.5 * place if sides[j] == "left" else width + 0.35 + 0.5 * place
+        order = sides[:j].count(sides[j])  # the how-manieth on this side
+        x = -0.35 - 0.5 * order if sides[j] == "left" else width + 0.35 + 0.5 * order
         pumps.append((x, -0.78))
         targets = [i for i in feed if i is not None]
         for i in targets:
@@ -83,7 +83,7 @@ def _with_pumps(plant, boxes, rows, width):
             above[row] = above.get(row, 0) + 1
             y = row * STOREY + 1.0 + 0.12 + 0.14 * (above[row] - 1)
             # jets of different pumps into one tank side by side, on the side that they come from
-            share = 0.2 if sides[j] == "left" else 0.8
+            share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
             end = boxes[i].x + boxes[i].width * share
             risers.append((j, i, ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))))
     most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)

@@ -79,11 +79,12 @@ def estimate(ax, run, tank, unit="cm"):
     return ax
 
 
-def disturbance(ax, run, tank, true=None, unit="cm/s"):
-    """Estimated disturbance of one level's rate [unit] over time [s], and the true one, true: (rows,) [unit], where it is known."""
-    if true is not None:
-        ax.plot(run.t, true, color=REFERENCE, linewidth=1.3, label="true")
-    ax.plot(run.t, run.d_hat[:, tank], color=AFTER, linewidth=1.1, linestyle="-" if true is None else "--", label="estimated")
+def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
+    """Estimated disturbance of one level's rate [unit] over time [s], which lumps all that the observer's model leaves out, and what flows in
+    unasked, inflow: (rows,) [unit], where it is known."""
+    if inflow is not None:
+        ax.plot(run.t, inflow, color=REFERENCE, linewidth=1.3, label="disturbing inflow")
+    ax.plot(run.t, run.d_hat[:, tank], color=AFTER, linewidth=1.1, linestyle="-" if inflow is None else "--", label="estimated")
     ax.axhline(0.0, color="0.6", linewidth=0.8, linestyle=":")
     ax.set(title=f"disturbance of tank {tank + 1}", ylabel=f"d_hat [{unit}]")
     return ax

@@ -43,7 +43,8 @@ def schematic(ax, plant, levels=None, setpoints=None):
         for k, i in enumerate(plant.outputs):
             mark(ax, where.boxes[i], float(setpoints[k]))
     for j, (x, y) in enumerate(where.pumps):
-        _pump(ax, j, x, y)
+        crowded = sum((other > 0) == (x > 0) for other, _ in where.pumps) > 1
+        _pump(ax, x, y, j, str(j + 1) if crowded else f"pump {j + 1}")
     _shares(ax, plant, where)
     ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
     ax.axis("off")
@@ -79,19 +80,11 @@ def _basin(ax, where):
     ax.text((low + high) / 2, where.bottom + 0.13, "basin", ha="center", va="center", fontsize=7, color="0.25")
 
 
-def _pump(ax, pump, x, y):
+def _pump(ax, x, y, pump, words):
     ax.add_patch(Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4))
     ax.add_patch(Polygon([(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)], facecolor=_colour(pump), zorder=5))
-    right = x > 0
-    ax.text(
-        x + (-0.23 if right else 0.23),
-        y + 0.12,
-        f"pump {pump + 1}",
-        fontsize=8,
-        ha="right" if right else "left",
-        va="center",
-        zorder=5,
-    )
+    away, side = (-0.23, "right") if x > 0 else (0.23, "left")
+    ax.text(x + away, y + 0.12, words, fontsize=8, ha=side, va="center", zorder=5)
 
 
 def _shares(ax, plant, where):

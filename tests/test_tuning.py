@@ -325,7 +325,7 @@ def test_what_cannot_be_used_is_refused_before_anything_runs(gouta, options, wor
 def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(gouta, tmp_path):
     result = quick(gouta)
     names = {p.name for p in result.save(tmp_path / "out")}
-    pictures = {"responses.png", "rig.png", "margins.png", "behind.png", "convergence.png", "landscape.png"}
+    pictures = {"responses.png", "rig.png", "margins.png", "inner.png", "convergence.png", "landscape.png"}
     pictures |= {"clouds.png"} if result.validation else set()
     assert names == {"result.json", "rig.toml", "trajectory.csv", "before.csv", "report.html", *pictures}
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
@@ -341,7 +341,7 @@ def test_a_slice_of_the_landscape_is_drawn_where_there_are_more_parameters(gouta
     figures = quick(
         gouta, free={"controller.k": (1e-3, 5.0), "controller.k1": (1e-3, 5.0), "controller.level_floor": (1e-3, 1.0)}
     ).plot()
-    assert set(figures) - {"clouds"} == {"responses", "rig", "margins", "behind", "convergence", "landscape"}
+    assert set(figures) - {"clouds"} == {"responses", "rig", "margins", "inner", "convergence", "landscape"}
     assert "slice" in figures["landscape"].axes[0].get_title()
 
 

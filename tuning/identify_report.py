@@ -23,6 +23,8 @@ def channel_names(found):
 def message(found):
     """How it ended, in words."""
     words, names = [], channel_names(found)
+    if found.status == "interrupted":
+        words.append("interrupted: the best of the searches that had ended")
     if found.status == "not_converged":
         words.append("the best search had not converged when its iterations ended: more of them with --iterations")
     for d in found.directions:
@@ -181,7 +183,8 @@ def figures(found):
             if one.u.shape[1] > 1:
                 axes[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=one.u.shape[1])
             figure.align_ylabels(axes)
-            figure.suptitle(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig", fontsize=9)
+            title = plotting.plain(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig")
+            figure.suptitle(title, fontsize=9)
             made["fit" if len(est.logs) == 1 else f"fit_{e + 1}"] = figure
         left = idf.residuals_of(est, found.fit)
         figure, axes = plt.subplots(len(names), 2, figsize=(8.4, 0.9 + 1.9 * len(names)), squeeze=False, layout="constrained")
@@ -196,7 +199,7 @@ def figures(found):
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
         figure.align_ylabels(axes)
         more = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
-        figure.suptitle(f"{found.case.name}: measured less simulated{more}", fontsize=9)
+        figure.suptitle(plotting.plain(f"{found.case.name}: measured less simulated{more}"), fontsize=9)
         made["residuals"] = figure
         kept, matrix = correlation_of(found)
         if len(kept) > 1:
@@ -273,7 +276,7 @@ def save(found, folder, command=None):
     """
     check_folder(folder)
     files = {"result.json": report.dumps(json_of(found)), "fit.csv": fit_csv(found)}
-    if found.status != "not_identifiable":
+    if all(p["identifiable"] for p in found.parameters.values()):
         files["rig.toml"] = rigs.dump(found.identified)
     drawn = figures(found) | pictures.rig(found.case.loop, None, found.case.name)
     files["report.html"] = page_of(found, drawn, command)

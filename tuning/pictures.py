@@ -28,8 +28,8 @@ def rig(loop, run=None, title=""):
     return {"rig": figure}
 
 
-def behind(loop, runs):
-    """{"behind": phase of the tanks that are not controlled, and when pumps were commanded past their limits}; {} where there is neither.
+def inner(loop, runs):
+    """{"inner": phase of the first two tanks that are not controlled}; {} where there are none.
 
     runs: {name: Trajectory}, before and after, or one.
     """
@@ -37,27 +37,32 @@ def behind(loop, runs):
 
     from jaxtank import plotting, run_plots
 
-    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
-    inner = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
-    past = any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values())
+    tanks = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
+    if len(tanks) < 2:
+        return {}
     styles = [(COLOURS[1], "-")] if len(runs) == 1 else [(COLOURS[0], "--"), (COLOURS[1], "-")]
     drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
-    draws = []
-    if len(inner) > 1:
-        draws.append(lambda ax: run_plots.phase(ax, drawn, inner[:2], np.asarray(loop.plant.rim), loop.units[0]))
-    if past:
-        draws.append(lambda ax: run_plots.saturation(ax, runs, low, high))
-    if not draws:
+    with plt.rc_context(plotting.STYLE):
+        figure, ax = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
+        run_plots.phase(ax, drawn, tanks[:2], np.asarray(loop.plant.rim), loop.units[0])
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return {"inner": figure}
+
+
+def saturation(loop, runs):
+    """{"saturation": when each pump was commanded past its limits}; {} where none ever was. runs: {name: Trajectory}."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting, run_plots
+
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         return {}
     with plt.rc_context(plotting.STYLE):
-        tall = max(3.4, 0.5 + 0.62 * len(runs) * loop.plant.pumps) if past else 3.4
-        figure, axes = plt.subplots(
-            1, len(draws), figsize=(4.6 * len(draws) + (0.6 if past else 0), tall), layout="constrained", squeeze=False
-        )
-        for draw, ax in zip(draws, axes[0]):
-            draw(ax)
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
-    return {"behind": figure}
+        figure, ax = plt.subplots(figsize=(6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps), layout="constrained")
+        run_plots.saturation(ax, runs, low, high)
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return {"saturation": figure}
 
 
 def estimates(loop, clock, run, title=""):
@@ -73,7 +78,7 @@ def estimates(loop, clock, run, title=""):
     known = None
     if loop.disturbance is not None:
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
-        known = np.asarray(loop.disturbance.sample(clock)[0])[index] / np.asarray(loop.plant.area)
+        known = np.stack([np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1) / np.asarray(loop.plant.area)
     rows = 2 if disturbed else 1
     with plt.rc_context(plotting.STYLE):
         figure, axes = plt.subplots(
@@ -82,10 +87,13 @@ def estimates(loop, clock, run, title=""):
         for i in range(tanks):
             run_plots.estimate(axes[0, i], run, i, length)
             if disturbed:
-                true = None if known is None else known[:, i]
-                run_plots.disturbance(axes[1, i], run, i, true, local("cm/s", loop.units))
+                inflow = None if known is None else known[:, i]
+                run_plots.disturbance(axes[1, i], run, i, inflow, local("cm/s", loop.units))
             axes[-1, i].set_xlabel("time [s]")
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        handles = {}
+        for ax in axes[:, 0]:
+            handles |= dict(zip(ax.get_legend_handles_labels()[1], ax.get_legend_handles_labels()[0]))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
         figure.suptitle(plotting.plain(title), fontsize=10)
     return {"estimates": figure}
 

@@ -406,7 +406,7 @@ def figures(result, runs=None):
 
     key = result_key(result)
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
     tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level" and limit.lane == 0}
     limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
     told = {"before": "", "after": ""}
@@ -417,7 +417,7 @@ def figures(result, runs=None):
         }
     title = (
         f"{result.tuned.name}: objective {number(result.objective['before'], 4)}{told['before']} -> "
-        f"{number(result.objective['after'], 4)} {unit}{told['after']}\n("
+        f"{number(result.objective['after'], 4)}{'' if unit == '-' else f' {unit}'}{told['after']}\n("
         + ", ".join(
             f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}"
             for n, p in list(result.parameters.items())[:4]
@@ -428,7 +428,8 @@ def figures(result, runs=None):
         "responses": plotting.responses(result.tuned.loop, runs, title, limits),
         **pictures.rig(result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"),
         **pictures.margins(worst_of_scenarios(result.constraints)),
-        **pictures.behind(result.tuned.loop, runs),
+        **pictures.inner(result.tuned.loop, runs),
+        **pictures.saturation(result.tuned.loop, runs),
         **pictures.estimates(
             result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
         ),
@@ -453,7 +454,8 @@ CAPTIONS = {
     "responses": "The run before tuning (orange, dashed) and after (blue): controlled levels with their setpoints, tracking errors, the other "
     "tanks, and what the pumps were given. Shaded: past a limit.",
     "margins": "Room that the tuned run leaves to each limit; a bar to the left of zero is a limit that is broken.",
-    "behind": "Behind the controlled levels: the other tanks against each other, and when pumps were commanded past their limits.",
+    "inner": "The tanks that are not controlled, one against the other, from the dot to the square.",
+    "saturation": "When pumps were commanded past their limits: up past the upper, down past the lower, as tall as the share of the time.",
     "estimates": "What the observer believed beside what was true, in the tuned run.",
     "clouds": "Runs that the search never saw, on perturbed plants and fresh noise where the case has them: a dot each, before across, after up.",
     "convergence": "Every evaluation of the search in its order.",
