@@ -1,0 +1,301 @@
+"""One closed loop in everything a user might pick instead: the four-tank under backstepping, fourth-order Runge-Kutta, inputs held.
+
+    pip install ".[bench]"
+    python tests/benchmarks/rivals.py [rounds] [--markdown]
+
+All of them do the same arithmetic on the same setpoints and are timed in turn within one process; medians, the ratio to ours in the same
+round with its range, time of the first call (compilation) apart, and how far the RMS error is from ours. Slow ones run a part of the
+samples, and are told per step. Rivals that are not installed are named. Nothing is asserted: machines differ.
+"""
+
+import dataclasses
+import re
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxtank
+from jaxtank import presets
+from jaxtank.files import write_atomic
+from tuning import bench, report
+
+README = Path(__file__).parents[2] / "README.md"
+BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
+FEW = 6000  # samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
+
+
+def constants(case):
+    """(c (10,), gain k + k1, k1, coefficients of the decoupling (6,), floor, high) as the C loop has them."""
+    p, law = case.loop.plant, case.loop.controller
+    w = np.sqrt(2 * float(p.gravity))
+    A, d, o, g = (np.asarray(getattr(p, n)) for n in ("area", "drain", "orifice", "pump_gain"))
+    c = np.array(
+        [
+            d[0] * w / A[0], o[0] * w / A[0], o[2] * w / A[0], d[1] * w / A[1], o[1] * w / A[1], o[3] * w / A[1],
+            (o[0] + o[1]) * w / A[2], g[0] / A[2], (o[2] + o[3]) * w / A[3], g[1] / A[3],
+        ]
+    )  # fmt: skip
+    alpha = 0.5 * (c[1] * c[5] - c[2] * c[4])
+    b = np.array([c[5], c[2], c[4], c[1]]) / (alpha * np.array([c[7], c[7], c[9], c[9]]))
+    b = np.append(b, [c[6] / c[7], c[8] / c[9]])
+    return c, float(law.k) + float(law.k1), float(law.k1), b, float(law.level_floor), float(case.loop.actuator.high[0])
+
+
+def law(c, gain, k1, b, floor, high, x, r, np):
+    """(2) voltages of the law, with the roots and clips of `np` (numpy or jax.numpy)."""
+    s3, s4 = np.sqrt(np.maximum(x[2], floor)), np.sqrt(np.maximum(x[3], floor))
+    v1 = -gain * (c[1] * s3 + c[2] * s4 - c[0] * np.sqrt(r[0]) + k1 * (x[0] - r[0]))
+    v2 = -gain * (c[4] * s3 + c[5] * s4 - c[3] * np.sqrt(r[1]) + k1 * (x[1] - r[1]))
+    u1, u2 = s3 * (b[0] * v1 - b[1] * v2 + b[4]), s4 * (b[3] * v2 - b[2] * v1 + b[5])
+    return np.clip(u1, 0.0, high), np.clip(u2, 0.0, high)
+
+
+def field(c, x, u, np):
+    """(4) rates of the levels."""
+    s1, s2, s3, s4 = (np.sqrt(np.maximum(h, 0.0)) for h in x)
+    return (
+        c[1] * s3 + c[2] * s4 - c[0] * s1,
+        c[4] * s3 + c[5] * s4 - c[3] * s2,
+        c[7] * u[0] - c[6] * s3,
+        c[9] * u[1] - c[8] * s4,
+    )
+
+
+def runge_kutta(f, x, h):
+    """Four stages, as tuples."""
+    along = lambda k, by: tuple(a + by * q for a, q in zip(x, k))
+    k1 = f(x)
+    k2 = f(along(k1, 0.5 * h))
+    k3 = f(along(k2, 0.5 * h))
+    k4 = f(along(k3, h))
+    return tuple(a + h / 6 * (p + 2 * (q + s) + t) for a, p, q, s, t in zip(x, k1, k2, k3, k4))
+
+
+def numba_loop(case, r, x0):
+    import numba
+
+    c, gain, k1, b, floor, high = constants(case)
+
+    @numba.njit(fastmath=False)
+    def rates(x1, x2, x3, x4, u1, u2):
+        s1, s2, s3, s4 = np.sqrt(max(x1, 0.0)), np.sqrt(max(x2, 0.0)), np.sqrt(max(x3, 0.0)), np.sqrt(max(x4, 0.0))
+        return c[1] * s3 + c[2] * s4 - c[0] * s1, c[4] * s3 + c[5] * s4 - c[3] * s2, c[7] * u1 - c[6] * s3, c[9] * u2 - c[8] * s4
+
+    @numba.njit(fastmath=False)
+    def run(r, x1, x2, x3, x4, h):
+        total = 0.0
+        for i in range(r.shape[1]):
+            r1, r2 = r[0, i], r[1, i]
+            s3, s4 = np.sqrt(max(x3, floor)), np.sqrt(max(x4, floor))
+            v1 = -gain * (c[1] * s3 + c[2] * s4 - c[0] * np.sqrt(r1) + k1 * (x1 - r1))
+            v2 = -gain * (c[4] * s3 + c[5] * s4 - c[3] * np.sqrt(r2) + k1 * (x2 - r2))
+            u1 = min(max(s3 * (b[0] * v1 - b[1] * v2 + b[4]), 0.0), high)
+            u2 = min(max(s4 * (b[3] * v2 - b[2] * v1 + b[5]), 0.0), high)
+            total += (x1 - r1) ** 2 + (x2 - r2) ** 2
+            a1, a2, a3, a4 = rates(x1, x2, x3, x4, u1, u2)
+            b1, b2, b3, b4 = rates(x1 + 0.5 * h * a1, x2 + 0.5 * h * a2, x3 + 0.5 * h * a3, x4 + 0.5 * h * a4, u1, u2)
+            c1, c2, c3, c4 = rates(x1 + 0.5 * h * b1, x2 + 0.5 * h * b2, x3 + 0.5 * h * b3, x4 + 0.5 * h * b4, u1, u2)
+            d1, d2, d3, d4 = rates(x1 + h * c1, x2 + h * c2, x3 + h * c3, x4 + h * c4, u1, u2)
+            x1 += h / 6 * (a1 + 2 * (b1 + c1) + d1)
+            x2 += h / 6 * (a2 + 2 * (b2 + c2) + d2)
+            x3 += h / 6 * (a3 + 2 * (b3 + c3) + d3)
+            x4 += h / 6 * (a4 + 2 * (b4 + c4) + d4)
+        return np.sqrt(total / r.shape[1])
+
+    return lambda: run(r, *x0, case.clock.dt), r.shape[1]
+
+
+def plain_scan(case, r, x0):
+    """What one writes first: jax.lax.scan over a state vector, as JAX comes (`rollout` of most libraries)."""
+    c, gain, k1, b, floor, high = constants(case)
+    h = case.clock.dt
+
+    def body(x, now):
+        u = jnp.stack(law(c, gain, k1, b, floor, high, x, now, jnp))
+        f = lambda x: jnp.stack(field(c, x, u, jnp))
+        a = f(x)
+        p = f(x + 0.5 * h * a)
+        q = f(x + 0.5 * h * p)
+        s = f(x + h * q)
+        return x + h / 6 * (a + 2 * (p + q) + s), jnp.sum((x[:2] - now) ** 2)
+
+    run = jax.jit(lambda r: jnp.sqrt(jnp.mean(jax.lax.scan(body, jnp.asarray(x0), r)[1])))
+    rows = jnp.asarray(r.T)
+    return lambda: run(rows), r.shape[1]
+
+
+def diffrax_steps(case, r, x0):
+    import diffrax
+
+    c, gain, k1, b, floor, high = constants(case)
+    h = case.clock.dt
+    term = diffrax.ODETerm(lambda t, x, u: jnp.stack(field(c, x, u, jnp)))
+    constant = diffrax.ConstantStepSize()
+
+    def body(x, now):
+        u = jnp.stack(law(c, gain, k1, b, floor, high, x, now, jnp))
+        solved = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, h, h, x, args=u, stepsize_controller=constant, max_steps=2)
+        return solved.ys[-1], jnp.sum((x[:2] - now) ** 2)
+
+    run = jax.jit(lambda r: jnp.sqrt(jnp.mean(jax.lax.scan(body, jnp.asarray(x0), r)[1])))
+    rows = jnp.asarray(r[:, :FEW].T)
+    return lambda: run(rows), FEW
+
+
+def casadi_accumulated(case, r, x0):
+    import casadi as ca
+
+    c, gain, k1, b, floor, high = constants(case)
+
+    class Namespace:
+        sqrt, maximum = staticmethod(ca.sqrt), staticmethod(ca.fmax)
+        clip = staticmethod(lambda v, low, top: ca.fmin(ca.fmax(v, low), top))
+
+    x, now = ca.SX.sym("x", 4), ca.SX.sym("r", 2)
+    u = law(c, gain, k1, b, floor, high, [x[i] for i in range(4)], [now[0], now[1]], Namespace)
+    parts = runge_kutta(lambda z: field(c, z, u, Namespace), tuple(x[i] for i in range(4)), case.clock.dt)
+    step = ca.Function("step", [x, now], [ca.vertcat(*parts)])
+    run = step.mapaccum("run", r.shape[1])
+
+    def call():
+        levels = np.array(run(x0, r))[:2]
+        levels = np.concatenate([np.asarray(x0)[:2, None], levels[:, :-1]], axis=1)
+        return np.sqrt(np.mean(np.sum((levels - r) ** 2, axis=0)))
+
+    return call, r.shape[1]
+
+
+def scipy_lsoda(case, r, x0):
+    from scipy.integrate import solve_ivp
+
+    c, gain, k1, b, floor, high = constants(case)
+    few = FEW // 10
+
+    def call():
+        x, total = np.asarray(x0, dtype=float), 0.0
+        for k in range(few):
+            u = law(c, gain, k1, b, floor, high, x, r[:, k], np)
+            total += np.sum((x[:2] - r[:, k]) ** 2)
+            x = solve_ivp(lambda t, x, u=u: field(c, x, u, np), (0, case.clock.dt), x, method="LSODA").y[:, -1]
+        return np.sqrt(total / few)
+
+    return call, few
+
+
+def plain_python(case, r, x0):
+    c, gain, k1, b, floor, high = (list(map(float, v)) if np.ndim(v) else v for v in constants(case))
+    import math
+
+    class Namespace:
+        sqrt, maximum = math.sqrt, max
+        clip = staticmethod(lambda v, low, top: min(max(v, low), top))
+
+    rows = r[:, :FEW].T.tolist()
+
+    def call():
+        x, total = tuple(map(float, x0)), 0.0
+        for now in rows:
+            u = law(c, gain, k1, b, floor, high, x, now, Namespace)
+            total += (x[0] - now[0]) ** 2 + (x[1] - now[1]) ** 2
+            x = runge_kutta(lambda z, u=u: field(c, z, u, Namespace), x, case.clock.dt)
+        return math.sqrt(total / len(rows))
+
+    return call, FEW
+
+
+def python_control(case, r, x0):
+    import control
+
+    c, gain, k1, b, floor, high = constants(case)
+    few = FEW // 10
+    closed = lambda t, x, w, p: np.array(field(c, x, law(c, gain, k1, b, floor, high, x, w, np), np))
+    loop = control.nlsys(closed, None, inputs=2, outputs=4, states=4)
+    t = np.arange(few) * case.clock.dt
+
+    def call():
+        run = control.input_output_response(loop, t, r[:, :few], x0, solve_ivp_method="LSODA")
+        return np.sqrt(np.mean(np.sum((run.states[:2] - r[:, :few]) ** 2, axis=0)))
+
+    return call, few
+
+
+RIVALS = {
+    "numba": numba_loop,
+    "casadi, mapaccum": casadi_accumulated,
+    "JAX, lax.scan over a vector": plain_scan,
+    "diffrax, Tsit5 in a scan": diffrax_steps,
+    "plain Python": plain_python,
+    "scipy, LSODA between samples": scipy_lsoda,
+    "python-control (law continuous)": python_control,
+}
+WHOLE = (numba_loop, casadi_accumulated, plain_scan)
+ABSENT = ("jaxonomy", "fugacio")
+
+
+def main(words):
+    jax.config.update("jax_enable_x64", True)
+    rounds = next((int(w) for w in words if w.isdigit()), 7)
+    case = presets.find("gouta2015/backstepping")
+    r, x0 = np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]]), tuple(map(float, case.loop.x0))
+    resting = int(np.argmax(np.any(r != r[:, :1], axis=0)))
+    names = ("rms_error_total",)
+    ours = lambda: jaxtank.evaluate(case.loop, case.clock, names)["rms_error_total"]
+    calls, steps, missing = {"jaxtank": ours}, {"jaxtank": case.clock.samples}, list(ABSENT)
+    with tempfile.TemporaryDirectory() as folder:
+        function = bench.c_loop(folder)
+        if function is None:
+            missing.append("C loop (no gcc)")
+        else:
+            run = bench.c_runner(function, case)
+            calls["C, gcc -O3 -march=native"], steps["C, gcc -O3 -march=native"] = (lambda: run()[0]), case.clock.samples
+        for name, make in RIVALS.items():
+            try:
+                calls[name], steps[name] = make(case, r if make in WHOLE else r[:, resting:], x0)
+            except ImportError as error:
+                missing.append(f"{name} ({error.name} is not installed)")
+        first = {}
+        for name, call in calls.items():
+            began = time.perf_counter()
+            jax.block_until_ready(call())
+            first[name] = time.perf_counter() - began
+        seconds, results = bench.timed(calls, rounds)
+    rows, whole = [], float(results["jaxtank"])
+    for name, spent in seconds.items():
+        per = [1e9 * s / steps[name] for s in spent]
+        ratio = [a / (1e9 * b / steps["jaxtank"]) for a, b in zip(per, seconds["jaxtank"])]
+        part = steps[name] < case.clock.samples
+        until = resting + steps[name]
+        clock = dataclasses.replace(case.clock, duration=(until - 1) * case.clock.dt)
+        same = (
+            whole
+            if not part
+            else float(jaxtank.evaluate(case.loop, clock, names)["rms_error_total"]) * (until / steps[name]) ** 0.5
+        )
+        rows.append(
+            [
+                name,
+                f"{statistics.median(per):,.0f}",
+                f"{statistics.median(ratio):.3g} ({min(ratio):.3g} to {max(ratio):.3g})",
+                f"{max(first[name] - statistics.median(spent), 0.0):.2g}",
+                f"{abs(float(results[name]) - same):.1e}",
+                f"{steps[name]:,}",
+            ]
+        )
+    heads = ["one run in float64", "ns per step", "times ours (range)", "first call, s more", "RMS error from ours, cm", "samples"]
+    print(report.table(rows, heads))
+    print(f"not here: {', '.join(missing)}")
+    if "--markdown" in words:
+        lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+        text = README.read_text()
+        table = "\n".join(lines)
+        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
