@@ -1,0 +1,117 @@
+"""Pictures of what lies behind a run: the numbers in them are those of the run, and what matters is said."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
+
+from jaxtank import plotting, run_plots
+from jaxtank.records import Trajectory
+
+
+@pytest.fixture
+def ax():
+    figure, axes = plt.subplots()
+    yield axes
+    plt.close(figure)
+
+
+def made(rows=1001, **fields):
+    """A run of two outputs, four tanks and two pumps that stands still, but for the fields that are given."""
+    t = np.linspace(0.0, 100.0, rows)
+    shapes = {"x": 4, "y": 4, "x_hat": 4, "d_hat": 4, "r": 2, "e": 2, "command": 2, "applied": 2, "u": 2, "spilled": 4}
+    return Trajectory(**({"t": t} | {n: np.ones((rows, m)) for n, m in shapes.items()} | fields))
+
+
+def columns(*values):
+    return np.stack(values, axis=1)
+
+
+def test_phase_is_one_level_over_the_other_with_both_rims(ax):
+    t = np.linspace(0.0, 1.0, 1001)
+    run = made(x=columns(t, t, 5 * t, 29 * t**2))
+    run_plots.phase(ax, {"after": (run, plotting.AFTER, "-")}, (2, 3), [30.0] * 4, "cm")
+    line, first, last = ax.lines
+    np.testing.assert_array_equal(line.get_xydata(), run.x[:, 2:])
+    assert tuple(first.get_xydata()[0]) == (0.0, 0.0) and tuple(last.get_xydata()[0]) == (5.0, 29.0)
+    assert ax.get_xlabel() == "level of tank 3 [cm]" and ax.get_ylabel() == "level of tank 4 [cm]"
+    assert ax.get_ylim()[1] > 30.0 and ax.get_xlim()[1] < 30.0  # only the rim that is near
+
+
+def test_saturation_tells_the_share_and_when(ax):
+    t = np.linspace(0.0, 100.0, 1001)
+    run = made(command=columns(np.where(t < 25.0, 13.0, 5.0), np.where(t >= 90.0, -1.0, 12.0)))  # 12 V is not past 12 V
+    run_plots.saturation(ax, {"run": run}, [0.0, 0.0], [12.0, 12.0])
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["pump 1\n25 % up, 0 % down", "pump 2\n0 % up, 10.1 % down"]
+    strips = [c for c in ax.collections if isinstance(c, PolyCollection) and len(c.get_paths()) and len(c.get_paths()[0].vertices)]
+    up, _, _, down = (c.get_paths()[0].vertices for c in strips[:4])
+    y = ax.get_yticks()
+    assert up[np.abs(up[:, 1] - y[0]) > 1e-9, 0].max() == pytest.approx(25.0, abs=100.0 / run_plots.SLICES)
+    assert down[np.abs(down[:, 1] - y[1]) > 1e-9, 0].min() == pytest.approx(90.0, abs=100.0 / run_plots.SLICES)
+    assert up[:, 1].max() > y[0] and down[:, 1].min() < y[1]
+    assert {"past the upper limit", "past the lower limit"} == set(ax.get_legend_handles_labels()[1])
+
+
+def test_a_chattering_pump_is_a_strip_of_half_the_height(ax):
+    flip = np.arange(1001) % 2 * 20.0
+    run_plots.saturation(ax, {"run": made(command=columns(flip, flip))}, [-1.0, -1.0], [12.0, 12.0])
+    vertices = ax.collections[0].get_paths()[0].vertices
+    heights = vertices[vertices[:, 1] > ax.get_yticks()[0] + 1e-9, 1] - ax.get_yticks()[0]
+    np.testing.assert_allclose(heights / 0.42, 0.5, atol=0.13)  # four or five samples to a slice
+
+
+def test_estimate_and_disturbance_are_the_runs_own(ax):
+    t = np.linspace(0.0, 1.0, 1001)
+    run = made(x=columns(t, t, t, t), y=columns(t + 0.1, t, t, t), x_hat=columns(t + 0.2, t, t, t), d_hat=columns(t - 1, t, t, t))
+    run_plots.estimate(ax, run, 0, "m")
+    found = {line.get_label(): line.get_ydata() for line in ax.lines}
+    assert ax.get_ylabel() == "level [m]"
+    for name, offset in (("measured", 0.1), ("true", 0.0), ("estimated", 0.2)):
+        np.testing.assert_allclose(found[name], t + offset)
+    ax.clear()
+    run_plots.estimate(ax, run, 1)
+    assert "measured" not in {line.get_label() for line in ax.lines}  # it is what is true
+    ax.clear()
+    run_plots.disturbance(ax, run, 0, inflow=2 * t, unit="m/s")
+    found = {line.get_label(): line.get_ydata() for line in ax.lines}
+    np.testing.assert_allclose(found["estimated"], t - 1)
+    np.testing.assert_allclose(found["disturbing inflow"], 2 * t)
+    assert ax.get_ylabel() == "d_hat [m/s]"
+
+
+def limit(name, value, bound):
+    return {"name": name, "limit": bound, "value": value, "margin": bound - value, "unit": "cm"}
+
+
+def test_margins_are_shares_of_the_limit_with_the_nearest_first(ax):
+    rows = [limit("far", 15.0, 30.0), limit("broken", 33.0, 30.0), limit("met", 30.0, 30.0)]
+    run_plots.margins(ax, rows)
+    np.testing.assert_allclose([bar.get_width() for bar in ax.patches], [-10.0, 0.0, 50.0], atol=1e-12)
+    assert [bar.get_facecolor() for bar in ax.patches] == [to_rgba(c) for c in (plotting.FORBIDDEN, plotting.AFTER, plotting.AFTER)]
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    assert names == ["broken\n33 of 30 cm", "met\n30 of 30 cm", "far\n15 of 30 cm"] and ax.yaxis_inverted()
+    assert list(ax.lines[0].get_ydata()) == [1]  # a bar without length is marked
+
+
+def test_margins_beyond_what_can_be_shown_are_counted(ax):
+    run_plots.margins(ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(run_plots.MANY + 3)])
+    assert len(ax.patches) == run_plots.MANY and "3 with more room not shown" in ax.get_title()
+    assert ax.get_yticklabels()[0].get_text().startswith(f"tank {run_plots.MANY + 2}")
+
+
+def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
+    points = [
+        {"limit": 12.0, "status": "converged", "objective": 0.1},
+        {"limit": 10.0, "status": "not_converged", "objective": 0.2},
+        {"limit": 8.0, "status": "infeasible", "objective": 0.3},
+    ]
+    run_plots.tradeoff(ax, points, "max_level", "cm", "cm")
+    joined, *marks = ax.lines
+    np.testing.assert_array_equal(joined.get_xydata(), [[10.0, 0.2], [12.0, 0.1]])
+    assert {line.get_label(): line.get_xydata().tolist() for line in marks} == {
+        "converged": [[12.0, 0.1]],
+        "not converged": [[10.0, 0.2]],
+        "limit cannot be kept": [[8.0, 0.3]],
+    }
+    assert ax.get_xlabel() == "limit of max_level [cm]" and ax.get_ylabel() == "objective [cm]"
