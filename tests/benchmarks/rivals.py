@@ -8,9 +8,12 @@ round with its range, time of the first call (compilation) apart, and how far th
 samples, and are told per step. Rivals that are not installed are named. Nothing is asserted: machines differ.
 """
 
+import atexit
 import dataclasses
+import os
 import re
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -111,8 +114,38 @@ def numba_loop(case, r, x0):
     return lambda: run(r, *x0, case.clock.dt), r.shape[1]
 
 
+def jax_as_it_comes(case, r, x0):
+    """`plain_scan` in a process of its own, without the XLA option that importing jaxtank sets: one line in, one number out."""
+    script = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import rivals; rivals.serve()"
+    child = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "JAXTANK_XLA_OPTION": "0"},
+    )
+    atexit.register(child.kill)
+
+    def call():
+        child.stdin.write("\n")
+        child.stdin.flush()
+        return float(child.stdout.readline())
+
+    return call, r.shape[1]
+
+
+def serve():
+    """The other end of `jax_as_it_comes`."""
+    jax.config.update("jax_enable_x64", True)
+    case = presets.find("gouta2015/backstepping")
+    r = np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]])
+    run, _ = plain_scan(case, r, tuple(map(float, case.loop.x0)))
+    for _ in sys.stdin:
+        print(float(run()), flush=True)
+
+
 def plain_scan(case, r, x0):
-    """What one writes first: jax.lax.scan over a state vector, as JAX comes (`rollout` of most libraries)."""
+    """What one writes first: jax.lax.scan over a state vector (`rollout` of most libraries), with the XLA option that jaxtank sets."""
     c, gain, k1, b, floor, high = constants(case)
     h = case.clock.dt
 
@@ -228,13 +261,14 @@ def python_control(case, r, x0):
 RIVALS = {
     "numba": numba_loop,
     "casadi, mapaccum": casadi_accumulated,
-    "JAX, lax.scan over a vector": plain_scan,
+    "JAX, lax.scan over a vector, with our XLA option": plain_scan,
+    "JAX, the same as it comes": jax_as_it_comes,
     "diffrax, Tsit5 in a scan": diffrax_steps,
     "plain Python": plain_python,
     "scipy, LSODA between samples": scipy_lsoda,
     "python-control (law continuous)": python_control,
 }
-WHOLE = (numba_loop, casadi_accumulated, plain_scan)
+WHOLE = (numba_loop, casadi_accumulated, plain_scan, jax_as_it_comes)
 ABSENT = ("jaxonomy", "fugacio")
 
 
