@@ -16,7 +16,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.errors import DataError, InputError
 from jaxtank.tree import get_value, with_values
-from tuning import cli, playback
+from tuning import cli, identifiability, playback
 from tuning.bounds import bounds
 from tuning.coordinates import coordinates
 from tuning.distributions import Draws
@@ -454,6 +454,81 @@ def test_uneven_times_and_logs_of_two_lengths(case, away):
     assert both.validation["samples"] == [72, 112]
     for side in ("fitted", "held_back"):
         np.testing.assert_allclose(both.validation[side]["rmse"], 0.05, rtol=0.35)
+
+
+def test_a_record_shifted_by_the_delay_of_the_pumps():
+    """By hand: samples every 2 s, 3 s of delay: an input reaches the tank at the first sample at least as late, the first one before."""
+    log = tuning.log(t=[0.0, 2, 4, 6, 8], u=[1.0, 2, 3, 4, 5], y=np.zeros(5))
+    np.testing.assert_array_equal(playback.record([log], 3.0).u[0, :, 0], [1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(playback.record([log], 4.0).u[0, :, 0], [1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(playback.record([log]).u[0, :, 0], [1, 2, 3, 4, 5])
+
+
+def test_correlation_of_residuals_against_sums_over_pairs():
+    """The spectrum's autocorrelation, and Newey and West's sum over windows, against their definitions, readings missing."""
+    rng = np.random.default_rng(0)
+    r = rng.standard_normal((2, 50))
+    r[rng.random(r.shape) < 0.1] = np.nan
+    found = identifiability.autocorrelation(r, 10)
+    for k in range(1, 11):
+        assert found[k] == pytest.approx(np.nanmean(r[:, k:] * r[:, :-k]) / np.nanmean(r**2), rel=1e-9)
+    np.testing.assert_array_equal(identifiability.autocorrelation(np.zeros((1, 20)), 3), [1, 0, 0, 0])
+
+
+def test_a_reading_that_never_moves_has_no_fit_percent(case, away, clean):
+    """tank 4's sensor hangs at 2 cm: its percent is null, not minus a large number."""
+    y = clean.y.copy()
+    y[:, 3] = 2.0
+    log = tuning.log(t=clean.t, u=clean.u, y=y)
+    found = tuning.identify(away, log, WIDE, start="case", starts=1, hold_back=0, noise=0.1, substeps=4)
+    assert found.quality["nrmse_percent"][3] is None and found.quality["nrmse_percent"][0] is not None
+    assert json.loads(json.dumps(found.to_json()))["fit"]["nrmse_percent"][3] is None
+
+
+def test_interrupted_between_searches(case, away, clean):
+    """Ctrl-C after two of fifty searches: their best is finished, and said to be that of an interrupted run."""
+    seen = []
+
+    def stop(fit):
+        seen.append(fit)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    options = {"start": "case", "hold_back": 0, "noise": 0.1, "substeps": 4}
+    found = tuning.identify(away, noisy(clean, 1), FREE, starts=50, progress=stop, **options)
+    assert found.status == "interrupted" and len(found.starts) == 2 and "interrupted" in found.message
+    whole = tuning.identify(away, noisy(clean, 1), FREE, starts=1, **options)
+    for name in SPLITS:
+        assert found.parameters[name]["value"] == pytest.approx(whole.parameters[name]["value"], rel=1e-6)
+
+
+def test_what_an_earlier_run_left_goes(tmp_path, resting, case, away, clean):
+    """A refused log after a good one in the same folder: the rig of the first must not stay there as the second's."""
+    (tmp_path / "mine.txt").write_text("kept")
+    options = {"start": "case", "starts": 1, "hold_back": 0, "noise": 0.1}
+    tuning.identify(away, noisy(clean, 1), FREE, substeps=4, **options).save(tmp_path)
+    assert (tmp_path / "rig.toml").exists()
+    warm, log = resting
+    tuning.identify(warm, log, WIDE, starts=1, hold_back=0, noise=0.1).save(tmp_path)
+    assert not (tmp_path / "rig.toml").exists() and (tmp_path / "mine.txt").read_text() == "kept"
+
+
+def test_a_dead_zone_needs_two_voltages():
+    """gouta2022, spec 9's warning: with one voltage a pump's gain takes up the dead zone; with two both are told."""
+    base = presets.load("gouta2022").cases["pi"]
+    t, true = np.arange(120.0), truth(base, ("plant.pump_gain[0]", "actuator.dead_zone[0]"))
+    free = {"plant.pump_gain[0]": (10.0, 100.0), "actuator.dead_zone[0]": (0.5, 6.0)}
+    for low, status in ((8.0, "not_identifiable"), (4.0, "converged")):
+        u = np.stack([np.where(t < 60, 8.0, low), np.full(120, 6.0)], axis=1)
+        y = played(base, t, u, [3.0, 2.0]) + 0.05 * np.random.default_rng(0).standard_normal((120, 2))
+        off = rig.set_values(base, {"plant.pump_gain[0]": 30.0})
+        found = tuning.identify(off, tuning.log(t=t, u=u, y=y), free, starts=2, hold_back=0, noise=0.05, substeps=4)
+        assert found.status == status
+        if status == "converged":
+            for name, value in zip(free, true):
+                assert abs(found.parameters[name]["value"] - value) < 4 * found.parameters[name]["sd"] < 0.05 * value
+        else:
+            assert set(found.directions[0]["parameters"]) == set(free)
 
 
 def test_outliers_and_a_robust_loss(case, away, clean):

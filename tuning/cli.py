@@ -755,7 +755,7 @@ COMMANDS = {
     "simulate": _simulate,
     "tune": _tune_interruptibly,
     "sensitivity": _sensitivity,
-    "identify": identify_command.run,
+    "identify": identify_command.run_interruptibly,
     "init": _init,
     "export": _export,
     "uncertainty": _uncertainty,

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from jaxtank.tree import describe, get_value
@@ -34,7 +35,7 @@ def quality(estimation, fit):
 def percent(residual, y):
     """100 (1 - |residual| / |y - its mean|); None for a reading that never changes. Arrays with NaN where there is no reading."""
     spread = np.sqrt(np.nansum((y - np.nanmean(y)) ** 2))
-    return float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread)) if spread > 0 else None
+    return float(100 * (1 - np.sqrt(np.nansum(residual**2)) / spread)) if spread > 1e-9 * np.sqrt(np.nansum(y**2)) else None
 
 
 def residuals_of(estimation, fit):
@@ -46,12 +47,20 @@ def residuals_of(estimation, fit):
 def autocorrelation(residual, lags=LAGS):
     """(lags + 1,) of residuals (logs, samples), NaN passed over; 0 where nothing is left to correlate."""
     lags = min(lags, residual.shape[-1] - 2)
-    total = np.nanmean(residual**2)
-    found = [1.0]
-    for k in range(1, lags + 1):
-        products = residual[..., k:] * residual[..., :-k]
-        found.append(float(np.nanmean(products) / total) if total > 0 and np.isfinite(products).any() else 0.0)
-    return np.array(found)
+    seen = np.isfinite(residual)
+    products, pairs = (_lagged(v, lags) for v in (np.where(seen, residual, 0.0), seen.astype(float)))
+    total = products[0] / max(pairs[0], 1.0)
+    usable = (np.round(pairs) > 0) & (total > 0)
+    found = np.where(usable, products / np.maximum(np.round(pairs), 1.0) / (total or 1.0), 0.0)
+    found[0] = 1.0
+    return found
+
+
+def _lagged(v, lags):
+    """(lags + 1,) sums over logs and samples of v_k v_{k + lag}, v (logs, samples), by way of its spectrum: a log may be long."""
+    n = v.shape[-1]
+    spectrum = np.fft.rfft(v, 2 * n, axis=-1)
+    return np.fft.irfft(np.sum(np.abs(spectrum) ** 2, axis=tuple(range(v.ndim - 1))), 2 * n)[: lags + 1]
 
 
 class Spread:
@@ -116,12 +125,11 @@ class Spread:
         lags = int(min(2 * forgotten[0] if forgotten.size else longest, longest))
         score = np.zeros((*shape, self.moving.size))
         score[estimation.mask] = self.fit.jacobian[:, self.moving] * self.fit.residual[:, None]
-        score = score.sum(axis=2)
-        total = np.einsum("eki,ekj->ij", score, score)
-        for lag in range(1, lags + 1):
-            one = np.einsum("eki,ekj->ij", score[:, lag:], score[:, :-lag])
-            total += (1 - lag / (lags + 1)) * (one + one.T)
-        return total
+        # Bartlett's weights 1 - lag / (lags + 1) are those of sums over windows of lags + 1 samples
+        score = np.concatenate([score.sum(axis=2), np.zeros((shape[0], lags, self.moving.size))], axis=1)
+        window = np.cumsum(score, axis=1)
+        window[:, lags + 1 :] -= window[:, : -lags - 1].copy()
+        return np.einsum("eki,ekj->ij", window, window) / (lags + 1)
 
     def _first_order(self):
         """J' C J, C the covariance of weighted residuals that follow each other as rho^(time / usual step), anew in each log and channel.
@@ -138,11 +146,16 @@ class Spread:
             rho = autocorrelation(residual[..., c], 1)[1]
             rho = float(np.clip(rho + (1 + 4 * rho) / samples, 0.0, 0.999))
             variance = np.nanmean(residual[..., c] ** 2) * self.fit.residual.size / self.freedom
-            one, before = slopes[:, :, c], np.zeros((shape[0], size))
-            for k in range(shape[1]):  # before: the sum of rho^(time since) J of all earlier samples
-                product = one[:, k].T @ before
-                total += variance * (one[:, k].T @ one[:, k] + product + product.T)
-                before = (before + one[:, k]) * rho ** steps[:, k, None]
+            one = slopes[:, :, c]
+            # the sum of rho^(time since) J of all earlier samples
+            if np.ptp(steps[dt > 0]) < 1e-6:
+                before = lfilter([0.0, rho], [1.0, -rho], one, axis=1)
+            else:
+                before = np.zeros_like(one)
+                for k in range(1, shape[1]):
+                    before[:, k] = (before[:, k - 1] + one[:, k - 1]) * rho ** steps[:, k - 1, None]
+            product = np.einsum("eki,ekj->ij", one, before)
+            total += variance * (np.einsum("eki,ekj->ij", one, one) + product + product.T)
         return total
 
     def _values(self):

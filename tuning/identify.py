@@ -293,7 +293,7 @@ class Identification:
     case: Any  # the case that was given
     estimation: Estimation
     fit: Fit
-    status: str  # converged, not_converged, not_identifiable
+    status: str  # converged, not_converged, not_identifiable, interrupted
     parameters: dict  # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}
     levels: list  # of each log, of each tank: {"value", "interval95"}
     covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
@@ -360,6 +360,7 @@ def identify(
     profile=False,
     iterations=100,
     gap=1.5,
+    progress=None,
 ):
     """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
 
@@ -372,7 +373,8 @@ def identify(
     each log (below 1), or number of samples, at its end on which a fit to the rest is judged before all is fitted; noise: standard
     deviation of each channel in its unit, from the record where None; loss: "linear", "soft_l1" or "huber" (beyond 3 standard deviations);
     substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
-    gap: longest step between samples, in median steps.
+    gap: longest step between samples, in median steps; progress: called with the Fit of each search that has ended; if it raises
+    KeyboardInterrupt, the best of them is gone on with.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
@@ -394,7 +396,16 @@ def identify(
     kept = [_kept(one, hold_back) for one in logs]
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
     partial = Estimation(case, [one.part(0, n) for one, n in zip(logs, kept)], **options)
-    fits = [partial.solve(z, loss, iterations, tolerance=1e-8) for z in partial.begin(starts, seed)]
+    fits, interrupted = [], False
+    try:
+        for z in partial.begin(starts, seed):
+            fits.append(partial.solve(z, loss, iterations, tolerance=1e-8))
+            if progress is not None:
+                progress(fits[-1])
+    except KeyboardInterrupt:
+        if not fits:
+            raise
+        interrupted = True
     ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
     if not ranked:
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
@@ -416,6 +427,8 @@ def identify(
         p["identifiable"] for p in parameters.values()
     ):  # a level at the start that is not told costs nothing but its interval
         status = "not_identifiable"
+    if interrupted:
+        status = "interrupted"
     return Identification(
         case=case,
         estimation=estimation,
@@ -431,7 +444,7 @@ def identify(
             {"cost": f.cost, "evaluations": f.evaluations, "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12)} for f in fits
         ],
         validation=validation,
-        profile=idf.profile(estimation, best, spread, loss) if profile else None,
+        profile=idf.profile(estimation, best, spread, loss) if profile and not interrupted else None,
         wall_s=time.perf_counter() - began,
         seed=seed,
     )

@@ -1,11 +1,14 @@
 """The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make. Imports nothing heavy before it runs."""
 
+import os
+import signal
 import sys
+import threading
 
 from jaxtank.errors import InputError
 from tuning import arguments
 
-STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5}
+STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
 
 def add(commands, parents):
@@ -93,17 +96,49 @@ def run(args):
         profile=args.profile,
         iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
         gap=gap,
+        progress=Between(),
     )
     written = found.save(args.out, args.line) if args.out else []
     print(report.dumps(found.to_json()) if args.json else repr(found))
     if written and not args.quiet:
         print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)
-    if found.status == "not_identifiable":
+    if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(d["words"] for d in found.directions)
         print(f"jaxtank: {', '.join(args.data)}: cannot tell apart {words}: no rig is written", file=sys.stderr)
     elif args.out and not args.quiet:
         print(f"go on with: jaxtank tune {args.out.rstrip('/')}/rig.toml --robust cvar", file=sys.stderr)
     return STATUS[found.status]
+
+
+class Between:
+    """Takes Ctrl-C between two searches: the first ends with the best so far, the second at once."""
+
+    def __init__(self):
+        self.stop = False
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self.interrupt)
+
+    def interrupt(self, *_):
+        """The handler of SIGINT."""
+        if self.stop:
+            os.write(2, b"\njaxtank: stopped at once\n")
+            os._exit(130)
+        self.stop = True
+        os.write(2, b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
+
+    def __call__(self, _):
+        if self.stop:
+            raise KeyboardInterrupt
+
+
+def run_interruptibly(args):
+    """`run`, with the handler of SIGINT put back afterwards."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        return run(args)
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
 
 
 def _column(text):
