@@ -189,6 +189,19 @@ def test_the_log_table_of_a_rig_file(tmp_path, read, case):
     np.testing.assert_allclose(found.u, [[3, 2.8]] * 2)
 
 
+def test_init_shows_a_log_table_that_works(tmp_path, read):
+    """With its comment signs taken away the example is a table for a file of such columns."""
+    code, out, _ = command("init", "mirakhorli/sfc")
+    assert code == 0
+    whole, example = out.split("# Which column", 1)
+    table = "\n".join(line.removeprefix("# ") for line in example.splitlines()[1:])
+    (tmp_path / "rig.toml").write_text(whole + table + "\n")
+    columns = rig.load(tmp_path / "rig.toml").log
+    assert set(columns) == {"t", "pump1", "pump2", "h1", "h2", "h3", "h4"}
+    header = ",".join(name for name, _ in columns.values())
+    assert same(read(text(header), columns=columns), read(text()))
+
+
 @pytest.mark.parametrize(
     ("header", "expected"),
     [

@@ -486,9 +486,10 @@ def _show(args):
 
 def _init(args):
     case = _open(args)
-    from jaxtank import rig
+    from jaxtank import record_tables, rig
 
     print(rig.dump(case), end="")
+    print("".join(f"{line}\n" for line in record_tables.example(case)), end="")
     return 0
 
 

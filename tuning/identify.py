@@ -213,19 +213,20 @@ class Estimation:
             return Fit(
                 p=p.copy(), own=own, cost=np.inf, residual=empty[:, 0], jacobian=empty, evaluations=self.passes - before, status=-1
             )
-        found = least_squares(
-            lambda v: both(v)[0] if pull is None else np.concatenate([both(v)[0], drawn * (v - pull[0][moving])]),
-            np.clip(whole[moving], low, high),
-            lambda v: both(v)[1][:, moving] if pull is None else np.concatenate([both(v)[1][:, moving], np.diag(drawn)]),
-            bounds=(low - 1e-12, high + 1e-12),
-            x_scale=1.0,
-            loss=loss,
-            f_scale=3.0,
-            xtol=min(1e-8, 1e2 * tolerance),
-            ftol=tolerance,
-            gtol=min(1e-8, 1e2 * tolerance),
-            max_nfev=iterations,
-        )
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # a wide range: scipy's step to its edge of trust
+            found = least_squares(
+                lambda v: both(v)[0] if pull is None else np.concatenate([both(v)[0], drawn * (v - pull[0][moving])]),
+                np.clip(whole[moving], low, high),
+                lambda v: both(v)[1][:, moving] if pull is None else np.concatenate([both(v)[1][:, moving], np.diag(drawn)]),
+                bounds=(low - 1e-12, high + 1e-12),
+                x_scale=1.0,
+                loss=loss,
+                f_scale=3.0,
+                xtol=min(1e-8, 1e2 * tolerance),
+                ftol=tolerance,
+                gtol=min(1e-8, 1e2 * tolerance),
+                max_nfev=iterations,
+            )
         whole[moving] = np.clip(found.x, low, high)
         residual, jacobian = self.pass_at(whole)
         p, own = self.parts(whole)
