@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -21,7 +22,10 @@ from tuning_rows import BOUNDS, ROWS, case_of
 
 @functools.cache
 def tuned(name):
-    return tuning_table.tuned(name)
+    """The result of a row; the programs it was compiled to are let go, which over all rows would fill the memory."""
+    result = tuning_table.tuned(name)
+    jax.clear_caches()
+    return result
 
 
 def gain(name):
