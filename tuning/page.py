@@ -165,8 +165,11 @@ def identifier(name):
 def svg(figure, name, caption=""):
     """A matplotlib figure as an <svg> element: no dates, no names of fonts to fetch, ids that begin with `name` and so clash with no other's.
 
-    A picture of more than LARGEST characters has its dense lines made of dots. The figure is left open.
+    A picture of more than LARGEST characters has its dense lines made of dots. The figure is left open, its layout as it is now: what is
+    drawn of it later need not be laid out again.
     """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
     text = _saved(figure, name)
     if len(text) > LARGEST:
         for ax in figure.axes:
