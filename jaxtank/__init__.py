@@ -42,6 +42,7 @@ _HOMES = {
 }
 _ROOMS = (
     "analysis",
+    "animation",
     "actuators",
     "controllers",
     "loop",
@@ -54,6 +55,7 @@ _ROOMS = (
     "records",
     "rig",
     "scheduling",
+    "schematic",
     "sensors",
     "signals",
     "tree",

@@ -14,7 +14,7 @@ from jaxtank.errors import InputError
 from jaxtank.files import write_atomic
 from jaxtank.layout import place
 from jaxtank.plotting import PUMPS, STYLE, WATER
-from jaxtank.schematic import depth, mark, mark_height, schematic
+from jaxtank.schematic import HALO, depth, mark, mark_height, schematic
 
 RATE = 12
 """Pictures a second: enough for liquid, which moves slowly."""
@@ -88,6 +88,8 @@ def _film(loop, trajectory, seconds):
     figure = plt.figure(figsize=(4.6, min(6.0, 4.6 * high / wide + 0.4)))
     ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
     schematic(ax, loop.plant)
+    for words in ax.texts:
+        words.set_path_effects(HALO)
     clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=10)
     water, marks, bars = _moving(ax, loop, where)
     low, top = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))

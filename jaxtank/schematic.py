@@ -10,6 +10,9 @@ from jaxtank.plotting import AFTER, GLASS, PUMPS, REFERENCE, WATER
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
 """Water in free fall."""
 
+HALO = [withStroke(linewidth=2.2, foreground="white")]
+"""Around words that a water line may pass behind."""
+
 
 def schematic(ax, plant, levels=None, setpoints=None):
     """Draw the rig `plant` (TankNetwork): the tanks of each row beside each other, above those that they pour into, heights to scale.
@@ -114,7 +117,8 @@ def _label(ax, plant, tank, box, level, unit):
     words = "\n".join(w for w in (f"tank {tank + 1}", what) if w)
     small = box.width < 0.7
     said = ax.text(box.middle, box.y + 0.5 * box.height, words, ha="center", va="center", fontsize=7 if small else 8, zorder=5)
-    said.set_path_effects([withStroke(linewidth=2.2, foreground="white")])  # a water line may pass behind the words
+    if level is not None:
+        said.set_path_effects(HALO)
     ax.text(
         box.x + box.width + 0.05,
         box.y + box.height,

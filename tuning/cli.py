@@ -84,7 +84,10 @@ def parser():
     run.add_argument("--out", metavar="DIR", help="folder for result.json, CSV, pictures and the rig")
 
     commands.add_parser("list", parents=[common], help="print every case")
-    commands.add_parser("show", parents=[common, case], help="one case: rig, law, every parameter, published numbers, departures")
+    show = commands.add_parser(
+        "show", parents=[common, case], help="one case: rig, law, every parameter, published numbers, departures"
+    )
+    show.add_argument("--out", metavar="DIR", help="folder for rig.png and rig.svg, the rig drawn from its topology")
     simulate = commands.add_parser(
         "simulate", parents=[common, case, run], help="one run: measures; with --out its trajectory and pictures"
     )
@@ -477,10 +480,21 @@ def _list(args):
 
 
 def _show(args):
+    _out(args)
     case = _open(args)
     from tuning import manual, report
 
+    written = []
+    if args.out:
+        from pathlib import Path
+
+        from tuning import page, pictures
+
+        drawn = pictures.rig(case.loop, None, case.name)
+        alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
+        written = report.write_files(Path(args.out), alone | report.pngs(drawn))
     print(report.dumps(manual.json_of(case)) if args.json else manual.text(case))
+    _written(written, args)
     return 0
 
 
