@@ -29,6 +29,11 @@ def test_the_python_example_runs_and_is_short(capsys):
     assert "converged" in said and "0.03987" in said
 
 
+def test_the_rig_it_shows_is_the_one_that_is_tested():
+    (shown,) = blocks("toml")
+    assert shown == (Path(__file__).parent / "rigs" / "watertank.toml").read_text()
+
+
 def test_commands_parse():
     assert len(COMMANDS) >= 10
     for words in COMMANDS:
