@@ -18,7 +18,7 @@ from tuning import cli, compare, page, report
 from tuning.log_file import read_log
 
 NASTY = "a <b>\"rig\"</b> & $x$ 'y' </style><script>alert(1)</script>"
-KINDS = ("tune", "uncertainty", "identify", "compare")
+KINDS = ("tune", "uncertainty", "sensitivity", "identify", "compare")
 VOID = {"meta", "br", "img", "link", "hr", "input"}
 
 
@@ -67,6 +67,7 @@ def results(case, tmp_path_factory):
     """{kind: (what saves itself to a folder, names of its pictures)}."""
     tuned = tuning.tune(case, starts=1, screening=2, iterations=3, validation=4, limits={"max_level": 30.0})
     cloud = tuning.ensemble(case, samples=4, limits={"max_level": 9.0})
+    felt = tuning.sensitivity(case, {"plant.drain[0]": tuning.Uniform(relative=0.05)}, measures=["rms_error_total"])
     folder = tmp_path_factory.mktemp("logs")
     t = np.arange(0.0, 60.0, 2.0)
     level = 5.0 + 2.0 * np.sin(t / 10.0)
@@ -88,6 +89,7 @@ def results(case, tmp_path_factory):
     return {
         "tune": (tuned.save, ["responses", "rig", "margins", "inner", "saturation", "clouds", "convergence", "landscape"]),
         "uncertainty": (cloud.save, ["fan", "violations", "rig"]),
+        "sensitivity": (felt.save, ["tornado"]),
         "identify": (found.save, ["fit", "residuals", "rig"]),
         "compare": (lambda *a: compare.save(pages, *a), ["rig-calofir"]),
     }

@@ -373,7 +373,7 @@ def test_command(tmp_path, method, samples, picture):
         value = said["measures"][row["measure"]]["parameters"][row["parameter"]][key]
         assert float(row[key] or "nan") == pytest.approx(np.nan if value is None else value, rel=1e-9, nan_ok=True)
     assert matplotlib.image.imread(tmp_path / "found" / f"{picture}.png").shape[0] > 100
-    assert {p.name for p in (tmp_path / "found").iterdir()} == {"result.json", "sensitivity.csv", f"{picture}.png"}
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {"result.json", "sensitivity.csv", "report.html", f"{picture}.png"}
     assert ("run " in err) and "written to" in err
 
 

@@ -704,7 +704,7 @@ def _sensitivity(args):
     )
     if terminal and not args.quiet:
         print(file=sys.stderr)
-    written = result.save(args.out) if args.out else []
+    written = result.save(args.out, args.line) if args.out else []
     print(report.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
     _written(written, args)
     return 0

@@ -80,11 +80,11 @@ class SensitivityResult:
 
         return figures(self)
 
-    def save(self, folder):
-        """Write result.json, sensitivity.csv and the picture to a folder; returns their paths."""
+    def save(self, folder, command=None):
+        """Write result.json, sensitivity.csv, the picture and report.html, which says the line `command`, to a folder; returns their paths."""
         from tuning.sensitivity_report import save
 
-        return save(self, folder)
+        return save(self, folder, command)
 
     def __repr__(self):
         return self.text()

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtank.files import check_folder
 from jaxtank.tree import describe, get_value
-from tuning import report, search
+from tuning import page, report, search
 from tuning.distributions import Correlated, Normal
 from tuning.effects import NORMAL_WIDTH
 
@@ -135,6 +135,11 @@ def _column_json(result, c):
 
 def text(result):
     """The result as a page of text."""
+    return "\n".join([*parts_of(result), *(f"- {note}" for note in notes_of(result))])
+
+
+def parts_of(result):
+    """What `text` says but for the notes: a list of lines and tables."""
     asked = "" if result.samples is None else f", {result.samples} {'trajectories' if result.method == 'morris' else 'base points'}"
     runs = f"{result.runs} run{'s' if result.runs > 1 else ''}" + (" with derivatives" if result.method == "local" else "")
     spread = ", ".join(f"{n} {_said(d)}" for n, d in result.distributions.items())
@@ -155,7 +160,7 @@ def text(result):
         if result.method == "sobol":
             tail.append(f"first-order shares sum to {np.sum(c.felt['first']):.3f}; to 1 where nothing interacts")
         parts += [title, report.table(rows, ["parameter", *heads.values()]), *tail, ""]
-    return "\n".join([*parts, *(f"- {note}" for note in notes_of(result))])
+    return parts
 
 
 def _said(distribution):
@@ -211,9 +216,37 @@ def _panel(plotting, method, ax, names, felt, unit, title):
     return plotting.shares(ax, names, felt["first"], felt["total"], felt["first_interval95"], felt["total_interval95"], title)
 
 
-def save(result, folder):
-    """Write result.json, sensitivity.csv and tornado.png or sobol.png to `folder`; returns their paths."""
+def page_of(result, drawn, command=None):
+    """The page report.html of a sensitivity study, with `drawn`, the figures of `figures`; command: the line that made it."""
+    first = next((c for c in result.columns if not c.empty), None)
+    facts = [("parameters", str(len(result.parameters))), ("runs", str(result.runs)), ("time", f"{result.wall_s:.1f} s")]
+    if first is not None:
+        facts.insert(0, (f"what moves {first.label} most", result.parameters[result.order(first)[0]]))
+    return page.document(
+        f"{result.case.name}: sensitivity",
+        result.case.title,
+        f"{result.method}: {result.failed} runs stopped being finite"
+        if result.failed
+        else f"{result.method}: every run stayed finite",
+        not result.failed,
+        facts,
+        notes_of(result),
+        [
+            (n, page.svg(f, n, TITLES[result.method]), TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")
+            for n, f in drawn.items()
+        ],
+        parts_of(result)[1:],
+        command,
+        search.provenance(result.case, result.seed),
+    )
+
+
+def save(result, folder, command=None):
+    """Write result.json, sensitivity.csv, tornado.png or sobol.png, and report.html to `folder`; returns their paths.
+
+    command: the line that made the result, for the report, where there is one.
+    """
     check_folder(folder)
     files = {"result.json": report.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
-    written = report.write_files(Path(folder), files)
-    return written + report.write_files(Path(folder), {f"{n}.png": report._png(f) for n, f in figures(result).items()})
+    written, drawn = report.write_files(Path(folder), files), figures(result)
+    return written + report.write_files(Path(folder), {"report.html": page_of(result, drawn, command)} | report.pngs(drawn))
