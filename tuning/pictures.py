@@ -4,8 +4,6 @@ import numpy as np
 
 from jaxtank.units import local
 
-COLOURS = ("#D55E00", "#0072B2")  # before, after: as in jaxtank.plotting, which is not imported before something is drawn
-
 
 def rig(loop, run=None, title=""):
     """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant that is no network of tanks."""
@@ -40,7 +38,7 @@ def inner(loop, runs):
     tanks = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
     if len(tanks) < 2:
         return {}
-    styles = [(COLOURS[1], "-")] if len(runs) == 1 else [(COLOURS[0], "--"), (COLOURS[1], "-")]
+    styles = [(plotting.AFTER, "-")] if len(runs) == 1 else [(plotting.BEFORE, "--"), (plotting.AFTER, "-")]
     drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
     with plt.rc_context(plotting.STYLE):
         figure, ax = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
