@@ -29,6 +29,8 @@ class Uniform:
     def check(self, name):
         """Raise InputError unless the range is one."""
         _one_kind(self, name, ("low", "high"), "relative")
+        if self.relative is not None and not self.relative > 0:
+            raise InputError(f"{name}: uniform of relative width {self.relative:g} must be wider than 0")
         if self.relative is None and not self.low < self.high:
             raise InputError(f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below its high one")
 
@@ -126,8 +128,13 @@ class Correlated:
 
     def check(self, name):
         """Raise InputError unless the covariance is symmetric and positive definite, one row for each name."""
-        matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)
-        if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T):
+        try:
+            matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)
+        except (TypeError, ValueError):
+            raise InputError(f"{name}: covariance must be a matrix of numbers") from None
+        if not self.cut > 0:
+            raise InputError(f"{name}: cut at {self.cut:g} standard deviations must be above 0")
+        if matrix.shape != (n, n) or not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
             raise InputError(f"{name}: covariance must be a symmetric {n} by {n} matrix")
         try:
             self.factor()
@@ -162,7 +169,7 @@ class Draws:
         for name, distribution in distributions.items():
             distribution.check(name)
             correlated = isinstance(distribution, Correlated)
-            for one in distribution.names if correlated else (name,):
+            for one in map(_spelled, distribution.names if correlated else (name,)):
                 base = split_index(one)[0]
                 if one in taken or base in taken or (not split_index(one)[1] and any(split_index(t)[0] == base for t in taken)):
                     raise InputError(f"uncertain {one} is given twice")
@@ -183,10 +190,14 @@ class Draws:
             self.parts.append((name, distribution, nominal, slice(self.dimensions, self.dimensions + count)))
             self.dimensions += count
             self.labels += labels
+        together = {one for d in distributions.values() if isinstance(d, Correlated) for one in d.names}  # held within their ranges
         for corner in (np.zeros, np.ones):
             for name, value in self.values(corner((1, self.dimensions))).items():
-                if not isinstance(distributions.get(name), Correlated):
+                if name not in together:
                     check_value(f"uncertain {name}", value[0], describe(loop, name))
+        for name, d in distributions.items():
+            if isinstance(d, Discrete):
+                check_value(f"uncertain {name}", np.asarray(d.values, dtype=float), describe(loop, name))
 
     def values(self, p):
         """{name: (draws, ...)} at probabilities p (draws, dimensions)."""
@@ -209,9 +220,16 @@ class Draws:
         return found
 
 
+def _spelled(name):
+    """`name` with its index as numbers are written: "a[00]" is "a[0]"."""
+    base, index = split_index(name)
+    return base + (f"[{','.join(map(str, index))}]" if index else "")
+
+
 def _ends(meta):
-    """(low, high) of a parameter's own range."""
-    return -math.inf if meta["low"] is None else meta["low"], math.inf if meta["high"] is None else meta["high"]
+    """(low, high) of a parameter's own range; just above a low end that does not belong to it."""
+    low = -math.inf if meta["low"] is None else meta["low"] + (1e-9 if meta["strict"] else 0.0)
+    return low, math.inf if meta["high"] is None else meta["high"]
 
 
 def _moves(distribution, nominal):

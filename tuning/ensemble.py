@@ -80,7 +80,8 @@ class Ensemble:
 
     def summary(self):
         """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
-        or pump where the measure has several. cvar95 and max are of the worse side: the lower one for a level's minimum."""
+        or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's interval are
+        None for a single draw."""
         found = {}
         for name, values in self.measures.items():
             kept = values[~self.failed]
@@ -101,8 +102,10 @@ class Ensemble:
                     "p50": p50,
                     "p95": p95,
                     "cvar95": worst.mean(axis=0),
-                    "max": sign * (sign * kept).max(axis=0),
+                    "max": kept.max(axis=0),
                 }
+                if len(kept) == 1:
+                    found[name] |= {"sd": None, "mean_interval95": None}
         return found
 
     def violations(self):
@@ -156,7 +159,10 @@ def probabilities(method, dimensions, samples, seed):
     if method == "latin":
         return stats.qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(samples)
     if method == "sobol":
-        return stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(samples).clip(1e-12, 1 - 1e-12)
+        points = stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random_base2(
+            (samples - 1).bit_length()
+        )
+        return points[:samples].clip(1e-12, 1 - 1e-12)
     raise InputError(f"draws = {method!r}: must be random, latin or sobol")
 
 

@@ -13,6 +13,9 @@ from tuning import page, parts, report, search
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
 
+INTERVALS = "intervals are those of independent draws: exact for random ones, for others an indication that is mostly too wide"
+
+
 def json_of(ensemble):
     """The JSON object of `jaxtank uncertainty --json`."""
     found = {
@@ -30,10 +33,12 @@ def json_of(ensemble):
         "wall_s": ensemble.wall_s,
         "provenance": search.provenance(ensemble.case, ensemble.seed),
     }
+    if ensemble.method != "random":
+        found["intervals"] = INTERVALS
     if ensemble.infeasible is None:
         found["infeasible_reason"] = "the steady states of this rig have no closed form"
     if any(None in np.ravel(np.array(list(m.values()), dtype=object)) for m in found["measures"].values()):
-        found["reason"] = "null: no finite number, as of a settling time where some draw never settles"
+        found["reason"] = "null: no finite number, as of a settling time where some draw never settles, or of a spread of one draw"
     return found
 
 
@@ -65,7 +70,7 @@ def parts_of(ensemble):
                     *shown[1:],
                 ]
             )
-    head = ["measure", "unit", "mean", "95 % of the mean", "sd", "5 %", "median", "95 %", "worst 5 %", "worst"]
+    head = ["measure", "unit", "mean", "95 % of the mean", "sd", "5 %", "median", "95 %", "worst 5 %", "highest"]
     spread = ", ".join(f"{n} {_words(d)}" for n, d in ensemble.distributions.items())
     words = [
         f"{ensemble.case.name}: {ensemble.samples} draws ({ensemble.method}, seed {ensemble.seed}), {ensemble.wall_s:.1f} s",
@@ -86,6 +91,8 @@ def parts_of(ensemble):
             for v in ensemble.violations()
         ]
         words += [report.table(rows, ["limit", "value", "broken in", "probability", "95 % interval"]), ""]
+    if ensemble.method != "random":
+        words.append(f"{INTERVALS} (here draws are {ensemble.method})")
     words.append(
         f"{int(ensemble.failed.sum())} runs left the numbers; they count as breaking every limit and are in no other figure"
     )
@@ -129,7 +136,7 @@ def figures(ensemble):
 
 
 CAPTIONS = {
-    "fan": "Levels over all draws that were kept whole: the median, the middle half, and 9 in 10 of them at each moment.",
+    "fan": "Levels over the draws that were kept whole (at most the first 512): the median, the middle half, and 9 in 10 of them at each moment.",
     "violations": "The probability that a rig of this spread breaks each limit, with its 95 % interval.",
     "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
 }

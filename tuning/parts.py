@@ -60,12 +60,25 @@ class Store:
     def put(self, k, batch):
         """Write batch k, {name: array}."""
         out = io.BytesIO()
-        np.savez(out, **batch)
+        np.savez(out, **batch, seal=np.bytes_(self._seal(k, batch)))
         write_atomic(self.path(k), out.getvalue())
 
     def get(self, k):
-        """Batch k as {name: array}. Raises InputError for a file that is not one of ours."""
-        return read_part(self.path(k), set(self.manifest["measures"]) | {"failed"})
+        """Batch k as {name: array}. Raises InputError for a file that is not one of ours, or not what was written as batch k of this
+        ensemble: its seal says so."""
+        path = self.path(k)
+        found = read_part(path, set(self.manifest["measures"]) | {"failed", "seal"})
+        seal = found.pop("seal")
+        if seal.dtype.kind != "S" or seal.shape != () or bytes(seal).decode("ascii", "replace") != self._seal(k, found):
+            raise InputError(
+                f"{path.name}: is not what was written as batch {k} of this ensemble: remove it and run its share again"
+            )
+        return found
+
+    def _seal(self, k, batch):
+        """Digest of a batch, its number and what it is of: it tells a file that was changed or exchanged, by accident or by hand."""
+        mine = json.dumps({n: v for n, v in self.manifest.items() if n != "told"}, sort_keys=True)
+        return digest([np.frombuffer(f"{mine} {k}".encode(), dtype=np.uint8), *(np.asarray(batch[n]) for n in sorted(batch))])
 
     def clear(self):
         """Remove the batches and the manifest: the result is whole."""

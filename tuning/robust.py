@@ -57,8 +57,10 @@ def scenario_bound(scenarios, support, beta=CONFIDENCE):
     """Largest probability of breaking a limit, with confidence 1 - beta, of an answer that `support` of `scenarios` plants hold in place.
 
     eps(k) = 1 - (beta / (N C(N, k)))^(1 / (N - k)): M. C. Campi, S. Garatti, F. A. Ramponi, A general scenario theory for nonconvex
-    optimization and decision making, IEEE TAC 63(12), 2018. It holds whatever the distribution and however the answer was found; the
-    support is counted here as the plants at a limit or (for the worst case) at the cost, which is an estimate.
+    optimization and decision making, IEEE TAC 63(12), 2018. It holds whatever the distribution and however the answer was found, for
+    independent plants and the support by which the same answer is found. What is counted here are the plants at a limit and (for the worst
+    case) at the cost: for the mean, and in part for cvar, every plant moves the gains a little, by the theorem's letter the support is then all
+    of them and the bound 1, and this figure is an indication. Latin hypercube draws are not independent either. The fresh plants are the proof.
     """
     if not 0 <= support <= scenarios:
         raise InputError(f"support = {support}: must be from 0 to the {scenarios} scenarios")
@@ -116,7 +118,8 @@ def tune_robust(
     certificate = Certificate(samples, support, scenario_bound(samples, support), fresh, broken, interval)
     words = (
         f"on {fresh} fresh plants a limit was broken {broken} times (95 % interval {interval[0]:.2g} to {interval[1]:.2g}); the scenario "
-        f"theory bounds the probability by {certificate.bound:.2g} (N {samples}, support {support}, confidence 1 - 1e-6)"
+        f"theory bounds the probability by {certificate.bound:.2g} (N {samples}, support {support}, confidence 1 - 1e-6"
+        + (")" if risk == "worst" else f"; an indication: plants at no limit move the {risk} too, and count for nothing in it)")
     )
     if back_off:
         words += f"; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
@@ -139,7 +142,7 @@ def _kept_off(case, limits, share):
 
 def _run(case, distributions, limits, names, fresh, seed):
     """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit or leaves the numbers)."""
-    seen = ensemble(case, distributions, samples=fresh, key=HELD_OUT + seed, measures=names, limits=limits, fan=False)
+    seen = ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False)
     past = [
         limit.sign * (seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index] - limit.value) > 0 for limit in seen.limits
     ]
