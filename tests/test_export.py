@@ -26,15 +26,12 @@ QUICK = [
     "gouta2015/ngpc",
     "gouta2015/backstepping-boxqp",
     "gouta2022/chadpc",
-    "gouta2022/pid-ff",
     "gouta2022/fopi",
     "calofir/backstepping",
     "cascaded/pi",
     "mirakhorli/sfc",
     "mirakhorli/hybrid",
     "mirakhorli/smc",
-    "mirakhorli/lqi",
-    "khalid/laguerre",
 ]
 SLOW = [name for name in presets.names() if name not in QUICK and name != "cascaded/open-loop" and "printed" not in name]
 EVERY = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]

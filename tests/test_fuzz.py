@@ -119,7 +119,6 @@ COMMANDS = [
     "sensitivity",
     "identify",
     "merge",
-    "show",
     "init",
     "export",
     "compare",

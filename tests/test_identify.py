@@ -531,19 +531,24 @@ def test_a_dead_zone_needs_two_voltages():
             assert set(found.directions[0]["parameters"]) == set(free)
 
 
-def test_outliers_and_a_robust_loss(case, away, clean):
-    """One reading in twenty is off by 3 cm: huber's answer is nearer the truth, by far."""
-    log = noisy(clean, 11)
-    off = np.random.default_rng(12).random(log.y.shape) < 0.05
-    spoiled = tuning.log(t=log.t, u=log.u, y=log.y + 3.0 * off)
-    error = {}
-    for loss in ("linear", "huber", "soft_l1"):
-        found = tuning.identify(away, spoiled, WIDE, start="case", starts=1, hold_back=0, noise=0.1, substeps=4, loss=loss)
-        error[loss] = np.linalg.norm([found.parameters[n]["value"] / v - 1 for n, v in zip(SPLITS, truth(case, SPLITS))])
-        if loss != "linear":
-            low_high = [found.parameters[n]["interval95"] for n in SPLITS]
-            assert all(low < v < high for (low, high), v in zip(low_high, truth(case, SPLITS)))
-    assert max(error["huber"], error["soft_l1"]) < 0.2 * error["linear"]
+@pytest.mark.parametrize("loss", ["huber", "soft_l1"])
+def test_outliers_and_a_robust_loss(case, away, clean, loss):
+    """One reading in twenty is off by 3 cm, up or down: the answer is nearer the truth, by far, and nine of ten intervals hold it. (Where all
+    are off to the same side the answer is still near, but moved: no interval knows of that.)"""
+    error, held = {"linear": [], loss: []}, []
+    for seed in range(10):
+        log, rng = noisy(clean, seed), np.random.default_rng(100 + seed)
+        off = (rng.random(log.y.shape) < 0.05) * rng.choice([-1.0, 1.0], log.y.shape)
+        spoiled = tuning.log(t=log.t, u=log.u, y=log.y + 3.0 * off)
+        for kind in error:
+            found = tuning.identify(away, spoiled, WIDE, start="case", starts=1, hold_back=0, noise=0.1, substeps=4, loss=kind)
+            error[kind].append(np.linalg.norm([found.parameters[n]["value"] / v - 1 for n, v in zip(SPLITS, truth(case, SPLITS))]))
+        held += [
+            found.parameters[n]["interval95"][0] < v < found.parameters[n]["interval95"][1]
+            for n, v in zip(SPLITS, truth(case, SPLITS))
+        ]
+    assert np.mean(error[loss]) < 0.25 * np.mean(error["linear"])
+    assert 0.85 <= np.mean(held) <= 1.0 and max(found.parameters[n]["sd"] / found.parameters[n]["value"] for n in SPLITS) < 0.003
 
 
 def test_the_profile_agrees_with_the_interval_where_all_is_near_linear(away, clean):
@@ -551,6 +556,58 @@ def test_the_profile_agrees_with_the_interval_where_all_is_near_linear(away, cle
     p = found.parameters[found.profile["name"]]
     np.testing.assert_allclose(found.profile["interval95"], p["interval95"], atol=0.1 * p["sd"])
     assert len(found.profile["values"]) == len(found.profile["rise"]) and min(found.profile["rise"]) < 1e-6
+
+
+def test_an_outlier_of_a_robust_loss_hides_nothing(away, clean):
+    """Readings 25 cm off, as of a loose plug: with the raw residuals all would count as unidentifiable."""
+    log = noisy(clean, 11)
+    rng = np.random.default_rng(12)
+    off = (rng.random(log.y.shape) < 0.025) * rng.choice([-1.0, 1.0], log.y.shape)
+    spoiled = tuning.log(t=log.t, u=log.u, y=np.clip(log.y + 25.0 * off, -5, 40))
+    found = tuning.identify(away, spoiled, WIDE, start="case", starts=1, hold_back=0, substeps=4, loss="huber")
+    assert found.status == "converged" and all(p["sd"] < 0.02 * p["value"] for p in found.parameters.values())
+
+
+def test_ranges_of_gain_and_split_are_kept(case, away, clean):
+    """The truth (27.43, 19.55; 0.42, 0.34) lies outside: the answer stops at a bound, and says so, though branch gains could go on."""
+    free = {"plant.pump_gain": (5.0, 22.0), "plant.split": (0.05, 0.38)}
+    found = tuning.identify(away, noisy(clean, 3), free, start="case", starts=1, hold_back=0, noise=0.1, substeps=4)
+    for p in found.parameters.values():
+        assert p["lower"] * (1 - 1e-9) <= p["value"] <= p["upper"] * (1 + 1e-9)
+    assert found.status == "not_converged" and "at the bound of the search" in found.message
+
+
+def test_sparse_readings_do_not_make_noise(away, clean):
+    """One channel read every twentieth time: its noise is that of the others, not what the level does in between."""
+    log = noisy(clean, 5)
+    y = log.y.copy()
+    y[np.arange(len(y)) % 20 != 0, 2] = np.nan
+    sparse = tuning.log(t=log.t, u=log.u, y=y)
+    noise = tuning.Estimation(away, [sparse], WIDE, start="case", substeps=4).noise
+    assert np.all((noise > 0.07) & (noise < 0.13))
+
+
+def test_a_split_that_does_nothing_is_no_unknown():
+    """Both pumps of gouta2015 feed one tank each."""
+    case = presets.find("gouta2015/backstepping")
+    log = tuning.log(t=np.arange(50.0), u=np.full((50, 2), 3.0), y=np.linspace(3, 6, 200).reshape(50, 4))
+    for free in ({"plant.split[0]": (0.1, 0.9)}, {"plant.split": (0.1, 0.9)}, {"sensor.noise": (0.0, 1.0)}):
+        with pytest.raises(InputError, match=r"changes nothing|change nothing|no reading depends"):
+            tuning.identify(case, log, free)
+    mixed = {"plant.split": (0.1, 0.9), "plant.pump_gain": (1.0, 20.0)}
+    assert tuning.Estimation(case, [log], mixed).coordinates.names == ("plant.pump_gain[0]", "plant.pump_gain[1]")
+
+
+def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
+    from tuning import playback as pb
+
+    rig_of, x0 = pb.rig_of(case.loop), np.zeros((1, 4))
+    dt = np.append(np.ones(50), 0.0)[None]
+    top = float(case.loop.actuator.high[0])
+    levels = [
+        np.asarray(pb.play(rig_of, dt, np.full((1, 51, 2), u), x0, channels=((0, False),), substeps=4)) for u in (top, 1.5 * top)
+    ]
+    np.testing.assert_array_equal(*levels)
 
 
 # At the door

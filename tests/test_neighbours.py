@@ -34,7 +34,7 @@ def test_an_operating_point_is_asked_for():
 
 
 def test_columns_of_a_run_have_units():
-    case = rig.set_values(presets.find("khalid/gpc"), {"clock.duration": 40.0})
+    case = rig.set_values(presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0})
     run = jaxtank.simulate(case.loop, case.clock)
     found = neighbours.columns(run, case.loop.units)
     assert {"t [s]", "h1 [m]", "r1 [m]"} <= set(found) and len({len(v) for v in found.values()}) == 1

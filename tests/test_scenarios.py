@@ -206,6 +206,7 @@ class Quadratic:
     def __init__(self, H, c, a=(), b=(), names=("k", "l")):
         self.H, self.c, self.a, self.b = np.array(H), np.array(c), np.array(a).reshape(-1, len(c)), np.array(b)
         self.limits = [Limit("max_level", i, 1.0) for i in range(len(self.b))]
+        self.rooms = np.ones(len(self.b))
         self.names, self.model, self.objective = list(names), "cost", {"mean_square_error": 1.0}
         self.bounds = [tuning.Bound(n, 0.01, 100.0, "log", "1/s") for n in names]
 

@@ -72,6 +72,7 @@ def quick():
     return rig.set_values(case, {"clock.dt": 0.5})
 
 
+@pytest.mark.slow
 def test_a_search_cut_short_does_not_say_that_limits_cannot_be_met(quick):
     """The same limit is met with the usual number of iterations."""
     hard = {"max_level": 30.0}
@@ -93,6 +94,7 @@ def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure(quick):
     assert share <= before * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_a_staircase_is_not_called_an_optimum(quick):
     result = tuning.tune(quick, objective={"settling_time": 1.0}, limits={}, starts=1, screening=4, validation=0)
     assert result.status == "not_converged" and "changes in steps" in result.message
@@ -113,6 +115,7 @@ def test_what_is_given_twice_or_empty_is_refused(words, capsys):
     assert told.count("\n") == 1 and words[0] in told
 
 
+@pytest.mark.slow
 def test_a_lowest_level_is_told_with_its_time(quick):
     result = tuning.tune(quick, limits={"min_level": 0.2}, starts=1, screening=1, iterations=2, validation=0)
     assert all(0 <= c["time_s"] <= 1200 for c in result.constraints)

@@ -129,6 +129,8 @@ def compare_experiments(
             _jacobian(rig, moved, p, t, u, x0, tanks, start, count)
             / np.tile(np.broadcast_to(noise, (len(tanks),)), len(t))[:, None]
         )
+        if not np.all(np.isfinite(jacobian)):
+            raise InputError(f"{words}: the integration breaks down with samples every {t[1] - t[0]:g} s; take a shorter duration")
         _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
         slopes = moved.slopes(p)
         good = s > 1e-9 * s.max()

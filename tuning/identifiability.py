@@ -63,6 +63,19 @@ def _lagged(v, lags):
     return np.fft.irfft(np.sum(np.abs(spectrum) ** 2, axis=tuple(range(v.ndim - 1))), 2 * n)[: lags + 1]
 
 
+def pseudo(fit):
+    """(rows,) residuals as a robust loss counts them, psi(r) / mean psi'(r) (Huber, Robust Statistics, 1981, sec. 7.6): the residuals themselves
+    for the linear one. An outlier then widens an interval by what it weighs in the fit, and no more."""
+    r, limit = fit.residual, 3.0
+    if fit.loss == "huber":
+        inside = np.abs(r) < limit
+        return np.clip(r, -limit, limit) / max(float(inside.mean()), 1e-3)
+    if fit.loss == "soft_l1":
+        root = np.sqrt(1.0 + (r / limit) ** 2)
+        return r / root / float(np.mean(root**-3))
+    return r
+
+
 class Spread:
     """Standard deviations of a Fit from J'J; directions that the data leave open are taken out first.
 
@@ -73,7 +86,7 @@ class Spread:
     """
 
     def __init__(self, estimation, fit, told):
-        self.estimation, self.fit = estimation, fit
+        self.estimation, self.fit, self.residual = estimation, fit, pseudo(fit)
         z = estimation.unknowns(fit)
         low, high = estimation.box
         edge = 1e-6 * (high - low)
@@ -106,7 +119,7 @@ class Spread:
 
     def _decompose(self, moving):
         """Singular values and axes of the slopes by the unknowns `moving`, and which axes the data leave open."""
-        self.moving, residual = moving, self.fit.residual
+        self.moving, residual = moving, self.residual
         self.freedom = max(residual.size - moving.size, 1)
         self.scale = float(residual @ residual) / self.freedom
         _, self.singular, self.axes = np.linalg.svd(self.fit.jacobian[:, moving], full_matrices=False)
@@ -118,13 +131,13 @@ class Spread:
         """Newey and West's S of the weighted residuals: products of scores up to the lag at which the residuals have forgotten."""
         estimation, shape = self.estimation, self.estimation.mask.shape
         residual = np.full(shape, np.nan)
-        residual[estimation.mask] = self.fit.residual
+        residual[estimation.mask] = self.residual
         longest = shape[1] // 5
         acf = np.mean([np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])], axis=0)
         forgotten = np.flatnonzero(acf < 0.1)
         lags = int(min(2 * forgotten[0] if forgotten.size else longest, longest))
         score = np.zeros((*shape, self.moving.size))
-        score[estimation.mask] = self.fit.jacobian[:, self.moving] * self.fit.residual[:, None]
+        score[estimation.mask] = self.fit.jacobian[:, self.moving] * self.residual[:, None]
         # Bartlett's weights 1 - lag / (lags + 1) are those of sums over windows of lags + 1 samples
         score = np.concatenate([score.sum(axis=2), np.zeros((shape[0], lags, self.moving.size))], axis=1)
         window = np.cumsum(score, axis=1)
@@ -139,7 +152,7 @@ class Spread:
         estimation, size = self.estimation, self.moving.size
         shape, dt = estimation.mask.shape, estimation.record.dt
         residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
-        residual[estimation.mask], slopes[estimation.mask] = self.fit.residual, self.fit.jacobian[:, self.moving]
+        residual[estimation.mask], slopes[estimation.mask] = self.residual, self.fit.jacobian[:, self.moving]
         samples = np.mean([one.samples for one in estimation.logs])
         steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
         for c in range(shape[-1]):

@@ -13,7 +13,7 @@ from scipy.stats import chi2, qmc
 from jaxtank import rig as rigs
 from jaxtank.errors import DataError, InputError
 from jaxtank.plants.base import Plant
-from jaxtank.tree import with_values
+from jaxtank.tree import describe, split_index, with_values
 from tuning import identifiability as idf
 from tuning import logs as lg
 from tuning import playback as pb
@@ -21,6 +21,18 @@ from tuning.bounds import bounds
 from tuning.coordinates import coordinates, nominal, usual
 
 ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
+UNSEEN = (
+    "sensor.noise",
+    "sensor.full_scale",
+    "actuator.low",
+    "actuator.high",
+    "actuator.initial",
+    "actuator.stop",
+    "actuator.pulse",
+)
+ENOUGH = 10
+"""Second differences from which the noise of a channel is told."""
+
 STARTS = ("free", "measured", "case")
 LOSSES = ("linear", "soft_l1", "huber")
 LARGEST = 1e60
@@ -41,6 +53,7 @@ class Fit:
     jacobian: np.ndarray  # (rows, unknowns) of the weighted residual
     evaluations: int
     status: int  # of scipy: above 0 where it has converged
+    loss: str = "linear"
 
     @property
     def vector(self):
@@ -66,7 +79,9 @@ class Estimation:
                 raise InputError(
                     f"free {name}: an identification estimates what begins with {', '.join(ESTIMATED)}; levels with --start"
                 )
-        self.bounds = bounds(loop, spec)
+            if split_index(name)[0] in UNSEEN:
+                raise InputError(f"free {name}: no reading depends on it in a way that could be fitted")
+        self.bounds = _felt(loop, spec, bounds(loop, spec))
         self.coordinates = coordinates(self.bounds)
         self.rig, self.record = pb.rig_of(loop), pb.record(logs, float(loop.actuator.delay), samples)
         self.start = start
@@ -182,7 +197,8 @@ class Estimation:
         jacobian[..., :shared] = slopes[..., :shared]
         for e in range(logs):
             jacobian[e, ..., shared + e * keep : shared + (e + 1) * keep] = slopes[e, ..., shared : shared + keep]
-        jacobian[..., shared:] *= self.level_scale
+        with np.errstate(all="ignore"):
+            jacobian[..., shared:] *= self.level_scale
         residual = (y - np.where(self.mask, self.record.y, 0.0)) / self.noise
         residual, jacobian = residual[self.mask], (jacobian / self.noise[:, None])[self.mask]
         if not np.all(np.abs(jacobian) < LARGEST):  # also where it is not a number: the search turns back from there
@@ -238,6 +254,7 @@ class Estimation:
             jacobian=jacobian,
             evaluations=self.passes - before,
             status=found.status,
+            loss=loss,
         )
 
     def unknowns(self, fit):
@@ -262,6 +279,18 @@ class Estimation:
         return starts
 
 
+def _felt(loop, spec, found):
+    """`found` Bounds less the splits of pumps that feed one tank, which nothing depends on: an array's are left out, one by name refused."""
+    feeds = getattr(loop.plant, "feeds", ())
+    idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
+    for name in idle & set(spec):
+        raise InputError(f"free {name}: this pump feeds one tank alone, its split changes nothing")
+    kept = [b for b in found if b.name not in idle]
+    if not kept:
+        raise InputError(f"free {', '.join(spec)}: these pumps feed one tank each, their splits change nothing")
+    return kept
+
+
 def _given(noise, channels):
     """(channels,) standard deviations that were given, one for all or one each."""
     noise = np.atleast_1d(np.asarray(noise, dtype=float))
@@ -275,15 +304,22 @@ def _given(noise, channels):
 def noise_of(logs, rec):
     """(channels,) standard deviation of the noise in a record, from its second differences, where a level is smooth: median deviation, so
     that steps do not count. At least a thousandth of what the channel ranges over: below that, weights would be those of round-off."""
-    found = []
+    found, floors = [], []
     for c in range(len(rec.channels)):
         bends, spans = [], []
         for e in range(len(logs)):
-            y = rec.y[e, :, c][np.isfinite(rec.y[e, :, c])]
-            bends.append(np.abs(np.diff(y, 2)) / np.sqrt(6.0))
-            spans.append(np.ptp(y) if y.size else 0.0)
+            # readings next to each other: where some are missing a level is not smooth from one to the next
+            bend = np.abs(np.diff(rec.y[e, :, c], 2)) / np.sqrt(6.0)
+            bends.append(bend[np.isfinite(bend)])
+            seen = rec.y[e, :, c][np.isfinite(rec.y[e, :, c])]
+            spans.append(np.ptp(seen) if seen.size else 0.0)
         bends = np.concatenate(bends)
-        found.append(max(1.4826 * float(np.median(bends)) if bends.size else 0.0, 1e-3 * max(spans), 1e-12))
+        floors.append(max(1e-3 * max(spans), 1e-12))
+        found.append(max(1.4826 * float(np.median(bends)), floors[-1]) if bends.size >= ENOUGH else np.nan)
+    for c, (_, volts) in enumerate(rec.channels):
+        if np.isnan(found[c]):  # too sparse to tell: as the other channels of its kind, or a hundredth of what it ranges over
+            alike = [v for v, (_, other) in zip(found, rec.channels) if other == volts and np.isfinite(v)]
+            found[c] = max([*alike, floors[c]]) if alike else max(10 * floors[c], 1e-3 * np.nanmax(np.abs(rec.y[..., c])))
     return np.array(found)
 
 
@@ -415,6 +451,11 @@ def identify(
         estimation = Estimation(case, logs, **(options | {"substeps": partial.substeps, "noise": partial.noise}))
         validation = idf.held_back(estimation, partial, best, kept)
         best = estimation.solve(partial.unknowns(best), loss, iterations)
+    if not _within(estimation, best):  # branch gains may leave the ranges of gain and split: the same search in these themselves
+        plain = estimation.plainly()
+        values = estimation.coordinates.values(best.p)
+        start_at = np.concatenate([plain.coordinates.point(values), best.own.ravel() / plain.level_scale])
+        estimation, best = plain, plain.solve(np.clip(start_at, *plain.box), loss, iterations)
     quality = idf.quality(estimation, best)
     spread = idf.Spread(estimation, best, quality)
     if spread.open.any():
@@ -423,7 +464,7 @@ def identify(
         spread = idf.Spread(estimation, best, quality)
     parameters, levels = spread.parameters(), spread.levels()
     directions = spread.directions()
-    status = "converged" if best.status > 0 else "not_converged"
+    status = "converged" if best.status > 0 and not stopped(case.loop, parameters) else "not_converged"
     if not all(
         p["identifiable"] for p in parameters.values()
     ):  # a level at the start that is not told costs nothing but its interval
@@ -449,6 +490,24 @@ def identify(
         wall_s=time.perf_counter() - began,
         seed=seed,
     )
+
+
+def stopped(loop, parameters):
+    """Names of the parameters that ended at a bound of their search which is not one of nature, as 0 or 1 for a share."""
+    names = []
+    for name, p in parameters.items():
+        meta = describe(loop, name)
+        ends = [v for v in (meta["low"], meta["high"]) if v is not None]
+        reach = 1e-5 * (p["upper"] - p["lower"])
+        if p["at_bound"] and not any(abs(p["value"] - end) <= reach for end in ends):
+            names.append(name)
+    return names
+
+
+def _within(estimation, fit):
+    """Whether every value lies in its range."""
+    values = estimation.coordinates.values(fit.p)
+    return all(b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high) for b in estimation.bounds)
 
 
 def _nearest(estimation, best, scale, loss, iterations):

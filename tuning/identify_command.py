@@ -90,7 +90,7 @@ def run(args):
         start=args.start,
         starts=arguments.whole("--starts", args.starts, 1, 1000),
         seed=seed,
-        hold_back=hold if hold < 1 else int(hold),
+        hold_back=hold if hold < 1 else _samples(args.hold_back),
         noise=noise,
         loss=args.loss,
         profile=args.profile,
@@ -105,7 +105,7 @@ def run(args):
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(d["words"] for d in found.directions)
         print(f"jaxtank: {', '.join(args.data)}: cannot tell apart {words}: no rig is written", file=sys.stderr)
-    elif args.out and not args.quiet:
+    elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
         print(f"go on with: jaxtank tune {args.out.rstrip('/')}/rig.toml --robust cvar", file=sys.stderr)
     return STATUS[found.status]
 
@@ -139,6 +139,13 @@ def run_interruptibly(args):
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)
+
+
+def _samples(text):
+    """A number of samples: a share below 1 has been taken already."""
+    if not float(text).is_integer():
+        raise InputError(f"--hold-back {text!r}: must be a share from 0 to below 1, or a whole number of samples")
+    return int(float(text))
 
 
 def _column(text):

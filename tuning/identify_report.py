@@ -9,6 +9,7 @@ from jaxtank import rig as rigs
 from jaxtank.files import check_folder
 from tuning import identifiability as idf
 from tuning import page, pictures, report, search
+from tuning.identify import stopped
 
 FEW = 0.5
 """Share of the starts that must agree for the answer not to say that few did."""
@@ -25,7 +26,13 @@ def message(found):
     words, names = [], channel_names(found)
     if found.status == "interrupted":
         words.append("interrupted: the best of the searches that had ended")
-    if found.status == "not_converged":
+    ended = stopped(found.case.loop, found.parameters)
+    if found.status == "not_converged" and ended:
+        words.append(
+            f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the search: ranges (--free), units or columns of the log "
+            "are not this rig's"
+        )
+    if found.status == "not_converged" and found.fit.status <= 0:
         words.append("the best search had not converged when its iterations ended: more of them with --iterations")
     for d in found.directions:
         words.append(f"the data cannot tell apart: {d['words']} changes no reading that could be seen")
@@ -278,7 +285,7 @@ def save(found, folder, command=None):
     files = {"result.json": report.dumps(json_of(found)), "fit.csv": fit_csv(found)}
     if all(p["identifiable"] for p in found.parameters.values()):
         files["rig.toml"] = rigs.dump(found.identified)
-    drawn = figures(found) | pictures.rig(found.case.loop, None, found.case.name)
+    drawn = figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
     files["report.html"] = page_of(found, drawn, command)
     files |= report.pngs(drawn)
     for path in _left_over(Path(folder), files):

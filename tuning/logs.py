@@ -153,7 +153,11 @@ def _check_levels_move(found, loop, length):
     rim = np.asarray(loop.plant.rim)
     tops = np.array([float(loop.sensor.full_scale) if v else float(rim[i]) for i, v in zip(found.tanks, found.in_volts)])
     most = np.nanmax(np.abs(found.y), axis=0)
-    if np.all(most < FAINT * tops) and np.any(most > 0):
+    if not np.any(most > 0):
+        raise DataError(
+            f"{found.where(column=1 + found.u.shape[1])}: every level reads 0 throughout: nothing moves that could be fitted"
+        )
+    if np.all(most < FAINT * tops):
         c = int(np.argmax(most / tops))
         column, unit, top = 1 + found.u.shape[1] + c, "V" if found.in_volts[c] else length, tops[c]
         hint = _instead(found, column, most[c : c + 1], unit, 2 * FAINT * top, RIM_MARGIN * top)

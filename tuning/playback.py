@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxtank.actuators import PumpBank
 from jaxtank.invariants import scan
+from jaxtank.numerics import clip
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
 from jaxtank.records import Clock
@@ -89,6 +90,8 @@ def readings(rig, dt, u, channels, substeps):
         x, state = carry
         step, inputs = now
         out = tuple(_reading(rig, x, channel) for channel in channels)
+        # a command past its limits is what a saturated pump was asked for
+        inputs = tuple(clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs))
         held = jnp.where(step > 0, step, 1.0)  # the padding at the end must not divide by nothing
         driven, state = rig.actuator.deliver(state, inputs, held)
         driven, h = rig.actuator.driving(driven), step / substeps
