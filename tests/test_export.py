@@ -29,7 +29,6 @@ QUICK = [
     "gouta2022/fopi",
     "calofir/backstepping",
     "cascaded/pi",
-    "mirakhorli/sfc",
     "mirakhorli/hybrid",
     "mirakhorli/smc",
 ]
@@ -150,7 +149,14 @@ def matlab(text):
 
 
 @pytest.mark.parametrize(
-    "name", ["gouta2015/backstepping", "gouta2022/chadpc", "mirakhorli/hybrid", "cascaded/pi", "khalid/laguerre"]
+    "name",
+    [
+        "gouta2015/backstepping",
+        "gouta2022/chadpc",
+        "mirakhorli/hybrid",
+        "cascaded/pi",
+        pytest.param("khalid/laguerre", marks=pytest.mark.slow),
+    ],
 )
 def test_matlab_gives_the_inputs_of_the_loop(name):
     case, run, signals = replayed(name, noise=0.0)  # it begins with the first readings, the loop with the true levels
