@@ -37,6 +37,19 @@ def to_control(plant, outputs=None, *, levels=None, inputs=None):
     )
 
 
+FIELDS = (
+    ("h", "x", "cm"),
+    ("y", "y", "cm"),
+    ("h_hat", "x_hat", "cm"),
+    ("r", "r", "cm"),
+    ("u", "u", "V"),
+    ("command", "command", "V"),
+    ("spilled", "spilled", "cm^3"),
+    ("d_hat", "d_hat", "cm/s"),
+)
+"""Columns of a run: (name, field of `Trajectory`, unit)."""
+
+
 def columns(run, units=("cm", "V")):
     """{column with its unit: (rows,) array} of a Trajectory: `pandas.DataFrame(columns(run))`, or xarray's variables.
 
@@ -44,16 +57,7 @@ def columns(run, units=("cm", "V")):
     what was lost over the rims.
     """
     found = {"t [s]": np.asarray(run.t)}
-    for name, field, unit in (
-        ("h", "x", "cm"),
-        ("y", "y", "cm"),
-        ("h_hat", "x_hat", "cm"),
-        ("d_hat", "d_hat", "cm/s"),
-        ("r", "r", "cm"),
-        ("u", "u", "V"),
-        ("command", "command", "V"),
-        ("spilled", "spilled", "cm^3"),
-    ):
+    for name, field, unit in FIELDS:
         values = np.asarray(getattr(run, field))
         found |= {f"{name}{i + 1} [{local(unit, units)}]": values[:, i] for i in range(values.shape[1])}
     return found

@@ -8,9 +8,7 @@ import argparse
 import functools
 import os
 import shlex
-import signal
 import sys
-import threading
 
 from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
 from tuning import identify_command
@@ -23,6 +21,7 @@ from tuning.arguments import plain_number as _plain_number
 from tuning.arguments import seed as _seed
 from tuning.arguments import span as _range
 from tuning.arguments import whole as _whole
+from tuning.interrupts import Interrupts, put_back
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -641,26 +640,15 @@ def _tune(args):
     return EXIT[result.status]
 
 
-class Progress:
-    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations, where nothing is half
-    done: the first ends the search with the best point so far, the second ends the program."""
+class Progress(Interrupts):
+    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations."""
 
     def __init__(self, unit, quiet):
-        self.unit, self.quiet, self.last, self.stop, self.terminal = unit, quiet, None, False, sys.stderr.isatty()
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self.interrupt)
-
-    def interrupt(self, *_):
-        """The handler of SIGINT."""
-        if self.stop:
-            os.write(2, b"\njaxtank: stopped at once\n")
-            os._exit(130)
-        self.stop = True
-        os.write(2, b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
+        super().__init__()
+        self.unit, self.quiet, self.last, self.terminal = unit, quiet, None, sys.stderr.isatty()
 
     def __call__(self, event):
-        if self.stop:
-            raise KeyboardInterrupt
+        self.check()
         if self.quiet or (not self.terminal and event["start"] == self.last):
             return
         self.last = event["start"]
@@ -756,12 +744,8 @@ def _compare(args):
 
 def _tune_interruptibly(args):
     """`_tune`, with the handler of SIGINT put back afterwards."""
-    before = signal.getsignal(signal.SIGINT)
-    try:
+    with put_back():
         return _tune(args)
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, before)
 
 
 COMMANDS = {

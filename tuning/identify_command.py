@@ -1,12 +1,10 @@
 """The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make. Imports nothing heavy before it runs."""
 
-import os
-import signal
 import sys
-import threading
 
 from jaxtank.errors import InputError
 from tuning import arguments
+from tuning.interrupts import Interrupts, put_back
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
@@ -96,7 +94,7 @@ def run(args):
         profile=args.profile,
         iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
         gap=gap,
-        progress=Between(),
+        progress=Interrupts().check,  # between two searches
     )
     written = found.save(args.out, args.line) if args.out else []
     print(report.dumps(found.to_json()) if args.json else repr(found))
@@ -110,35 +108,10 @@ def run(args):
     return STATUS[found.status]
 
 
-class Between:
-    """Takes Ctrl-C between two searches: the first ends with the best so far, the second at once."""
-
-    def __init__(self):
-        self.stop = False
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self.interrupt)
-
-    def interrupt(self, *_):
-        """The handler of SIGINT."""
-        if self.stop:
-            os.write(2, b"\njaxtank: stopped at once\n")
-            os._exit(130)
-        self.stop = True
-        os.write(2, b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
-
-    def __call__(self, _):
-        if self.stop:
-            raise KeyboardInterrupt
-
-
 def run_interruptibly(args):
     """`run`, with the handler of SIGINT put back afterwards."""
-    before = signal.getsignal(signal.SIGINT)
-    try:
+    with put_back():
         return run(args)
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, before)
 
 
 def _samples(text):

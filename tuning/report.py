@@ -12,7 +12,8 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.errors import InputError
 from jaxtank.files import check_folder, write_atomic
-from jaxtank.units import DEFAULT, local
+from jaxtank.neighbours import columns
+from jaxtank.units import DEFAULT
 from tuning.objective import LOWER
 
 SHOWN = (
@@ -346,23 +347,11 @@ def objective_unit(terms, rig_units=DEFAULT):
 
 def trajectory_csv(run, rig_units=DEFAULT):
     """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
-    columns = [("t [s]", np.asarray(run.t))]
-    for name, field, unit in (
-        ("h", "x", "cm"),
-        ("y", "y", "cm"),
-        ("r", "r", "cm"),
-        ("u", "u", "V"),
-        ("command", "command", "V"),
-        ("spilled", "spilled", "cm^3"),
-        ("d_hat", "d_hat", "cm/s"),
-    ):
-        values, unit = np.asarray(getattr(run, field)), local(unit, rig_units)
-        if field == "d_hat" and not values.any():
-            continue
-        columns += [(f"{name}{i + 1} [{unit}]", values[:, i]) for i in range(values.shape[1])]
+    known = bool(np.asarray(run.d_hat).any())
+    kept = {n: v for n, v in columns(run, rig_units).items() if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))}
     out = io.StringIO()
-    out.write(",".join(head for head, _ in columns) + "\n")
-    np.savetxt(out, np.column_stack([values for _, values in columns]), delimiter=",", fmt="%.10g")
+    out.write(",".join(kept) + "\n")
+    np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
     return out.getvalue()
 
 
