@@ -2,10 +2,12 @@
 
     python notebooks/run.py            in full, and keep the outputs in the files
     python notebooks/run.py --fast     with JAXTANK_NOTEBOOK_FAST=1 (coarse steps, few starts), outputs thrown away
+    python notebooks/run.py 05 08      those alone, by the beginnings of their names
 """
 
 import os
 import sys
+import time
 from pathlib import Path
 
 import nbformat
@@ -14,11 +16,16 @@ from nbclient import NotebookClient
 
 def main():
     fast = "--fast" in sys.argv[1:]
+    wanted = tuple(a for a in sys.argv[1:] if a != "--fast")
+    paths = [p for p in sorted(Path(__file__).parent.glob("*.ipynb")) if not wanted or p.name.startswith(wanted)]
+    if not paths:
+        sys.exit(f"no notebook here begins with {' or '.join(wanted)}")
     os.environ["JAXTANK_NOTEBOOK_FAST"] = "1" if fast else "0"
-    for path in sorted(Path(__file__).parent.glob("*.ipynb")):
+    for path in paths:
+        began = time.perf_counter()
         notebook = nbformat.read(path, as_version=4)
         NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}).execute()
-        print(f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells ran")
+        print(f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells ran in {time.perf_counter() - began:.0f} s")
         if not fast:
             for cell in notebook.cells:
                 cell.metadata.pop("execution", None)
