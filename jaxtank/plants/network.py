@@ -95,10 +95,8 @@ class TankNetwork(Plant):
         if not self.overflow:
             return x, tuple(lost)
         x = list(x)
-        for i in [
-            *(a for a, _ in self.spills),
-            *range(self.tanks),
-        ]:  # an upper tank first, so that what it sheds is there to be shed
+        order, ring = _downwards(self.spills, self.tanks)
+        for i in order:
             held = clip(x[i], -self.rim[i], self.rim[i])
             over = self.area[i] * (x[i] - held)
             lost[i], x[i] = lost[i] + over, held
@@ -106,7 +104,23 @@ class TankNetwork(Plant):
                 if source == i:
                     lost[i] = lost[i] - self.caught[k] * over
                     x[sink] = x[sink] + self.caught[k] * over / self.area[sink]
+        for i in ring:  # what has come back to a full tank is lost there
+            held = clip(x[i], -self.rim[i], self.rim[i])
+            lost[i], x[i] = lost[i] + self.area[i] * (x[i] - held), held
         return tuple(x), tuple(lost)
+
+
+def _downwards(spills, tanks):
+    """(every tank, after those that shed into it; the tanks of rings, where there is no such order): what a tank is given by one above
+    must be there when it is its turn to shed."""
+    order, left = [], list(range(tanks))
+    while left:
+        free = [i for i in left if not any(sink == i and source in left for source, sink in spills)]
+        if not free:
+            return [*order, *left], left
+        order += free
+        left = [i for i in left if i not in free]
+    return order, []
 
 
 def network(
