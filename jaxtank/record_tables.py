@@ -44,31 +44,3 @@ def check_covariance(loop, table):
             f"covariance.matrix: must be a symmetric, positive definite {len(names)} by {len(names)} matrix of finite numbers"
         )
     return tuple(names), tuple(tuple(map(float, row)) for row in rows)
-
-
-def example(case):
-    """Comment lines for a rig file without a [log] table: what one would look like for this rig."""
-    if case.log:
-        return []
-    length, drive = case.loop.units
-    return [
-        "",
-        "# Which column of a log is what, for jaxtank identify, where its header does not say so (h1 [cm], pump1_V, t [s]): [header, unit].",
-        "# [log]",
-        '# t = ["time", "s"]',
-        *(f'# pump{j + 1} = ["u{j + 1}", "{drive}"]' for j in range(case.loop.plant.pumps)),
-        *(f'# h{i + 1} = ["level {i + 1}", "{length}"]' for i in range(case.loop.plant.tanks)),
-    ]
-
-
-def lines(case, toml):
-    """The lines of both tables in a rig file; toml: how a value is written."""
-    out = []
-    if case.covariance is not None:
-        names, rows = case.covariance
-        out += ["", "[covariance]", f"names = {toml(list(names))}", "matrix = ["]
-        out += [f"  {toml(list(map(float, row)))}," for row in rows] + ["]"]
-    if case.log:
-        out += ["", "[log]"]
-        out += [f"{slot} = {toml(spec if isinstance(spec, str) else list(spec))}" for slot, spec in case.log.items()]
-    return out

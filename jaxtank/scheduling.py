@@ -62,6 +62,17 @@ def check_not_scheduled(loop, name):
         raise InputError(f"{name} is scheduled: it is controller.values[{law.gains.index(inner)},j] at knot j, counted from 0")
 
 
+def names_of(loop, name):
+    """Where `name`, as the law has it without a schedule, is found in `loop`: at every knot of a scheduled gain, else under its new name."""
+    law, inner = loop.controller, name.removeprefix(LAW)
+    if not isinstance(law, Scheduled) or not name.startswith(LAW) or inner.split("[")[0] in ("law", "values", "knots"):
+        return [name]
+    rows = [i for i, gain in enumerate(law.gains) if gain == inner or gain.split("[")[0] == inner]
+    if rows:
+        return [f"{LAW}values[{i},{j}]" for i in rows for j in range(np.size(law.knots))]
+    return [f"{LAW}law.{inner}"]
+
+
 def table_of(loop):
     """{"gains", "variable", "knots"} of a scheduled loop, as in a rig file; empty where there is no schedule."""
     law = loop.controller
@@ -141,4 +152,4 @@ def _free(case, gains, knots):
     return free
 
 
-__all__ = ["check_not_scheduled", "from_table", "known", "schedule", "table_of", "unscheduled"]
+__all__ = ["check_not_scheduled", "from_table", "known", "names_of", "schedule", "table_of", "unscheduled"]

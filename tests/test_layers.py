@@ -19,7 +19,7 @@ LAYERS = [
     {"loop"},
     {"presets"},
     {"scheduling"},
-    {"record_tables", "rig_build", "layout"},
+    {"record_tables", "layout"},
     {"rig", "plotting"},
     {"record_plots", "run_plots", "schematic", "codegen", "neighbours", "environment"},
     {"export", "animation"},

@@ -194,7 +194,7 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
     code, out, _ = command("init", "mirakhorli/sfc")
     assert code == 0
     whole, example = out.split("# Which column", 1)
-    table = "\n".join(line.removeprefix("# ") for line in example.splitlines()[1:])
+    table = "\n".join(line.removeprefix("#") for line in example.splitlines()[1:])
     (tmp_path / "rig.toml").write_text(whole + table + "\n")
     columns = rig.load(tmp_path / "rig.toml").log
     assert set(columns) == {"t", "pump1", "pump2", "h1", "h2", "h3", "h4"}

@@ -175,7 +175,7 @@ def test_a_law_of_a_paper_on_a_rig_of_ones_own():
     """Backstepping of gouta2015 on its own rig, written tank by tank: the run of the preset."""
     case = presets.find("gouta2015/backstepping")
     case = rig.set_values(case, {"clock.dt": 0.1, "clock.duration": 200.0})
-    lines = "\n".join(rig.rig_build.tables(case, rig._toml))
+    lines = rig.dump(case, tankwise=True)
     built = rig.from_table(
         {**tomllib.loads(lines), "reference": {"initial": [3.0, 3.0], "changes": [[20.0, 1, 8.0], [20.0, 2, 6.0]], "ramp": 60.0}}
     )

@@ -202,7 +202,9 @@ def parser():
         help="a measure to look at (default: those of the objective, rms_error_total, max_level); repeatable",
     )
     identify_command.add(commands, [common, case, run])
-    commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit")
+    init = commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit: every key, its unit and range")
+    init.add_argument("--short", action="store_true", help="only what differs from the preset, and what is tuned")
+    init.add_argument("--tanks", action="store_true", help="described tank by tank, without its preset")
     exported = commands.add_parser(
         "export", parents=[common, case], help="the law and its observer as one C99 file or MATLAB function"
     )
@@ -498,11 +500,14 @@ def _show(args):
 
 
 def _init(args):
+    if args.short and args.tanks:
+        raise InputError("--short and --tanks: the short file names its preset; give one of the two")
     case = _open(args)
-    from jaxtank import record_tables, rig
+    from jaxtank import rig
+    from tuning import report
 
-    print(rig.dump(case), end="")
-    print("".join(f"{line}\n" for line in record_tables.example(case)), end="")
+    text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
+    print(report.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
     return 0
 
 

@@ -1,69 +1,112 @@
-"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]], [plant], [law], [observer]; no Python."""
-
-import dataclasses
+"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]], [plant]; no Python."""
 
 import numpy as np
 
-from jaxtank import controllers, observers
 from jaxtank.actuators import PumpBank
-from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError, unknown
+from jaxtank.errors import InputError, unknown
 from jaxtank.loop import ClosedLoop
+from jaxtank.observers import Direct
 from jaxtank.plants.hydraulics import GRAVITY
-from jaxtank.plants.network import network
+from jaxtank.plants.network import TankNetwork, network
 from jaxtank.presets.base import Case
 from jaxtank.records import Clock
+from jaxtank.rig.parts import law_of, observer_of
+from jaxtank.rig.signals import INFLOW, meta_of
+from jaxtank.rig.words import is_numeric
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, Ramps, ramps
-from jaxtank.tree import _short, number
-from jaxtank.units import DEFAULT
+from jaxtank.signals import Constant, ramps
+from jaxtank.tree import _short, check_value, number
+from jaxtank.units import DEFAULT, local
 
-LAWS = {
-    "pid": controllers.PID,
-    "state-feedback": controllers.StateFeedback,
-    "lqi": controllers.LQI,
-    "ngpc": controllers.NGPC,
-    "backstepping": controllers.Backstepping,
-    "enmpc": controllers.ENMPC,
-    "two-tank-backstepping": controllers.TwoTankBackstepping,
-    "sliding-mode": controllers.SlidingMode,
-    "fuzzy": controllers.FuzzyBlend,
-    "gpc": controllers.GPC,
-    "laguerre": controllers.Laguerre,
-}
-OBSERVERS = {"direct": observers.Direct, "disturbance": observers.DisturbanceObserver}
-TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant", "law", "observer")
+TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")
 TANK = {"name": "", "area": None, "rim": None, "drain": 0.0, "level": 0.0, "inflow": 0.0, "noise": 0.0}
 PUMP = {"name": "", "gain": None, "to": None, "split": 1.0, "low": 0.0, "high": None, "initial": 0.0}
 LINK = {"from": None, "to": None, "area": None}
 PIPE = {"between": None, "area": None}
 SPILL = {"from": None, "to": None, "caught": 1.0}
 PLANT = {"gravity": None, "overflow": False, "bottom": False, "knee": None, "outputs": None}
-# what a law needs and a file may leave out: by field
-USUAL = {"level_floor": 0.01, "difference_floor": 0.01, "Tt": 30.0}
+
+
+def _says(doc):
+    return {"unit": "-", "doc": doc}
+
+
+def _like(cls, field, doc=None):
+    return {**meta_of(cls, field), **({} if doc is None else {"doc": doc})}
+
+
+# what each key is, its unit and its range
+METAS = {
+    "tank": {
+        "name": _says("what other tables may call it, instead of its number from 1"),
+        "area": _like(TankNetwork, "area", "cross-section A"),
+        "rim": _like(TankNetwork, "rim", "height"),
+        "drain": _like(TankNetwork, "drain", "effective orifice area to the basin; 0: closed"),
+        "level": _like(ClosedLoop, "x0", "level at t = 0"),
+        "inflow": {**INFLOW, "doc": "steady inflow that no pump brings; negative: a leak"},
+        "noise": _like(LevelSensor, "noise", "standard deviation of the noise of its sensor"),
+    },
+    "pump": {
+        "name": _says("a note; nothing refers to it"),
+        "gain": _like(TankNetwork, "pump_gain", "flow per unit of the pump's input (Kp)"),
+        "to": _says("the tank that it fills, or [first, second]"),
+        "split": _like(TankNetwork, "split", "share that goes to the first of two tanks"),
+        "low": _like(PumpBank, "low", "lower limit"),
+        "high": _like(PumpBank, "high", "upper limit"),
+        "initial": _like(PumpBank, "initial", "input at which it ran before t = 0"),
+    },
+    "orifice": {
+        "from": _says("the tank that it leaves, by name or number from 1"),
+        "to": _says("the tank that it pours into"),
+        "area": _like(TankNetwork, "orifice", "effective area"),
+    },
+    "pipe": {
+        "between": _says("the two tanks that it joins, below the surface"),
+        "area": _like(TankNetwork, "pipe", "effective area"),
+    },
+    "spill": {
+        "from": _says("the tank whose rim is passed"),
+        "to": _says("the tank that it falls into"),
+        "caught": _like(TankNetwork, "caught", "share that falls into it"),
+    },
+    "plant": {
+        "outputs": _says("the tanks whose levels are controlled; left out: those that the pumps fill first"),
+        **{k: meta_of(TankNetwork, k) for k in ("gravity", "overflow", "bottom", "knee")},
+    },
+}
+
+
+def tank_index(value, where, named, count):
+    """Index of a tank given by its name or its number from 1; InputError, naming `where`, for another. named: {name: index}."""
+    if isinstance(value, str):
+        if value not in named:
+            raise unknown(f"tank of {where}", value, named or ["1"])
+        return named[value]
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= count:
+        raise InputError(f"{where} = {_short(value)}: must be a tank, by its name or its number from 1 to {count}")
+    return value - 1
+
+
+def names_in(table):
+    """{name: index} of the [[tank]] tables that have a name."""
+    return {t["name"]: i for i, t in enumerate(table.get("tank", [])) if isinstance(t, dict) and t.get("name")}
 
 
 def build(table):
     """The Case of a table of a rig file that has [[tank]]; reference, values, limits and the rest come after (`rig.from_table`)."""
-    length, drive = _units(table.get("units", list(DEFAULT)))
-    tanks = [_entry("tank", i, e, TANK) for i, e in enumerate(_list(table, "tank", at_least=1))]
-    pumps = [_entry("pump", i, e, PUMP) for i, e in enumerate(_list(table, "pump", at_least=1))]
-    links = [_entry("orifice", i, e, LINK) for i, e in enumerate(_list(table, "orifice"))]
-    pipes = [_entry("pipe", i, e, PIPE) for i, e in enumerate(_list(table, "pipe"))]
-    spills = [_entry("spill", i, e, SPILL) for i, e in enumerate(_list(table, "spill"))]
-    more = _entry("plant", None, table.get("plant", {}), PLANT)
-    named = {t["name"]: i for i, t in enumerate(tanks) if t["name"]}
+    units = length, drive = _units(table.get("units", list(DEFAULT)))
+    tanks = [_entry("tank", i, e, TANK, units) for i, e in enumerate(_list(table, "tank", at_least=1))]
+    pumps = [_entry("pump", i, e, PUMP, units) for i, e in enumerate(_list(table, "pump", at_least=1))]
+    links = [_entry("orifice", i, e, LINK, units) for i, e in enumerate(_list(table, "orifice"))]
+    pipes = [_entry("pipe", i, e, PIPE, units) for i, e in enumerate(_list(table, "pipe"))]
+    spills = [_entry("spill", i, e, SPILL, units) for i, e in enumerate(_list(table, "spill"))]
+    more = _entry("plant", None, table.get("plant", {}), PLANT, units)
+    named = names_in(table)
     if len(named) < sum(bool(t["name"]) for t in tanks):
         raise InputError("two tanks have the same name")
 
     def tank(value, where):
-        if isinstance(value, str):
-            if value not in named:
-                raise unknown(f"tank of {where}", value, named or ["1"])
-            return named[value]
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= len(tanks):
-            raise InputError(f"{where} = {_short(value)}: must be a tank, by its name or its number from 1 to {len(tanks)}")
-        return value - 1
+        return tank_index(value, where, named, len(tanks))
 
     def pair(value, where, short=False):
         entries = value if isinstance(value, list) else [value]
@@ -101,15 +144,14 @@ def build(table):
     levels = number([t["level"] for t in tanks])
     initial = number([p["initial"] for p in pumps])
     start = [float(levels[i]) for i in plant.outputs]
-    law = _component("law", table.get("law", {}), LAWS, plant, {"bias": _resting(plant, start, initial)})
     inflow = [t["inflow"] for t in tanks]
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(
             gain=number(np.ones(len(tanks))), noise=number([t["noise"] for t in tanks]), full_scale=number(np.max(plant.rim))
         ),
-        observer=_component("observer", table.get("observer", {"kind": "direct"}), OBSERVERS, plant, {}),
-        controller=law,
+        observer=observer_of(table["observer"], plant, levels, initial) if "observer" in table else Direct(),
+        controller=law_of(table.get("law", {}), plant, start, initial),
         actuator=PumpBank(
             low=number([p["low"] for p in pumps]),
             high=number([p["high"] for p in pumps]),
@@ -153,8 +195,8 @@ def _list(table, key, at_least=0):
     return entries
 
 
-def _entry(kind, index, entry, fields):
-    """`entry` with what it leaves out; InputError for an unknown key, one that is missing, and what is no number."""
+def _entry(kind, index, entry, fields, units):
+    """`entry` with what it leaves out; InputError for an unknown key, one that is missing, what is no number, and what is out of range."""
     where = kind if index is None else f"{kind} {index + 1}"
     if not isinstance(entry, dict):
         raise InputError(f"{where}: must be a table")
@@ -163,116 +205,43 @@ def _entry(kind, index, entry, fields):
             raise unknown(f"key of [[{kind}]]" if index is not None else f"key of [{kind}]", key, fields)
         if key == "name" and not isinstance(value, str):
             raise InputError(f"{where}: name = {_short(value)}: must be a text")
-        free = key in ("name", "to", "from", "between", "outputs")
-        truth = isinstance(fields[key], bool)
+        if key in ("name", "to", "from", "between", "outputs"):
+            continue
+        truth, meta = isinstance(fields[key], bool), METAS[kind][key]
         good = isinstance(value, bool) if truth else not isinstance(value, bool) and isinstance(value, (int, float))
-        if not free and not (good and abs(value) <= 1e300):
+        if not (good and is_numeric(float(value) if truth else value) and abs(value) <= 1e300):
             raise InputError(f"{where}: {key} = {_short(value)}: must be {'true or false' if truth else 'a finite number'}")
+        if not truth:
+            check_value(f"{where}: {key}", value, {"low": None, "high": None, **meta, "unit": local(meta["unit"], units)})
     for key, value in fields.items():
         if value is None and key not in entry and kind != "plant":
             raise InputError(f"{where}: {key} is missing")
     return {**fields, **entry}
 
 
-def _component(kind, table, known, plant, offered):
-    """The law or observer of a table: kind, then the fields of the component by their names."""
-    if not isinstance(table, dict):
-        raise InputError(f"[{kind}]: must be a table")
-    if "kind" not in table:
-        raise InputError(f"[{kind}] needs kind = one of {', '.join(known)}")
-    if table["kind"] not in known:
-        raise unknown(f"{kind} kind", str(table["kind"]), known)
-    cls, values = known[table["kind"]], {}
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    settable = {n: f for n, f in fields.items() if n != "model"}
-    for key in table:
-        if key != "kind" and key not in settable:
-            raise unknown(f"key of [{kind}]", key, ["kind", *settable])
-    if "model" in fields:
-        values["model"] = plant
-    for name, field in settable.items():
-        meta = field.metadata
-        if name in table:
-            value = table[name]
-        elif name in offered:
-            value = offered[name]
-        elif name in USUAL:
-            value = USUAL[name]
-        elif field.default is not dataclasses.MISSING:
-            continue
-        else:
-            unit = "" if meta.get("unit", "-") == "-" else f" [{meta['unit']}]"
-            raise InputError(f"[{kind}] {table['kind']} needs {name}{unit}: {meta.get('doc', '')}")
-        values[name] = _shaped(kind, name, value, meta, plant) if meta.get("kind") == "leaf" else value
-    return cls(**values)
-
-
-def _shaped(kind, name, value, meta, plant):
-    """A leaf's value as an array; one number for an array of one entry per pump, tank or output fills it."""
-    try:
-        array = number(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{kind}.{name} = {_short(value)}: must be a number or a list of numbers") from None
-    first = meta["doc"].split(")")[0]
-    sizes = {"(m,": plant.pumps, "(n,": plant.tanks, "(outputs,": len(plant.outputs), "(pumps,": plant.pumps, "(2,": 2}
-    size = next((n for start, n in sizes.items() if first.startswith(start)), None)
-    return np.full(size, array) if size is not None and array.ndim == 0 else array
-
-
-def _resting(plant, levels, initial):
-    """(pumps,) inputs at which the outputs rest where they start; `initial` where they cannot."""
-    if len(levels) != plant.pumps:
-        return initial
-    try:
-        return number(equilibrium(plant, np.asarray(levels))[1])
-    except (EquilibriumError, InputError, FloatingPointError):
-        return initial
-
-
-def tables(case, toml):
-    """The lines that describe the rig of a case tank by tank; toml: how a value is written."""
-    loop, plant = case.loop, case.loop.plant
-    for part, kind, words in (
-        (loop.reference, Ramps, "reference"),
-        (loop.disturbance, (Constant, type(None)), "disturbance"),
-        (loop.faults, type(None), "fault"),
-    ):
-        if not isinstance(part, kind):
-            raise InputError(
-                f"{case.name}: no preset has these components and its {words} has no table, so the case cannot be written as a rig file"
-            )
-    lines = [f"units = {toml(list(plant.units))}", ""]
-    inflow = np.zeros(plant.tanks) if loop.disturbance is None else np.asarray(loop.disturbance.level)
+def entries_of(loop):
+    """[(title, kind, {key: value})] that describe the rig of a loop tank by tank. A steady inflow is the tanks' own."""
+    plant, bank, found = loop.plant, loop.actuator, []
+    steady = np.asarray(loop.disturbance.level) if isinstance(loop.disturbance, Constant) else np.zeros(plant.tanks)
+    columns = {
+        "area": plant.area,
+        "rim": plant.rim,
+        "drain": plant.drain,
+        "level": loop.x0,
+        "inflow": steady,
+        "noise": loop.sensor.noise,
+    }
     for i in range(plant.tanks):
-        lines += ["[[tank]]", f"area = {toml(float(plant.area[i]))}", f"rim = {toml(float(plant.rim[i]))}"]
-        lines += [f"drain = {toml(float(plant.drain[i]))}", f"level = {toml(float(loop.x0[i]))}"]
-        lines += [f"inflow = {toml(float(inflow[i]))}"] if inflow[i] else []
-        lines += [""]
-    for key, pairs, values, words in (
-        ("orifice", plant.links, plant.orifice, "area"),
-        ("spill", plant.spills, plant.caught, "caught"),
-    ):
-        for (a, b), v in zip(pairs, np.asarray(values)):
-            lines += [f"[[{key}]]", f"from = {a + 1}", f"to = {b + 1}", f"{words} = {toml(float(v))}", ""]
-    for (a, b), v in zip(plant.pipes, np.asarray(plant.pipe)):
-        lines += ["[[pipe]]", f"between = [{a + 1}, {b + 1}]", f"area = {toml(float(v))}", ""]
+        found.append(("[[tank]]", "tank", {k: float(np.asarray(v)[i]) for k, v in columns.items()}))
+    for (a, b), area in zip(plant.links, np.asarray(plant.orifice).tolist()):
+        found.append(("[[orifice]]", "orifice", {"from": a + 1, "to": b + 1, "area": area}))
+    for (a, b), area in zip(plant.pipes, np.asarray(plant.pipe).tolist()):
+        found.append(("[[pipe]]", "pipe", {"between": [a + 1, b + 1], "area": area}))
+    for (a, b), caught in zip(plant.spills, np.asarray(plant.caught).tolist()):
+        found.append(("[[spill]]", "spill", {"from": a + 1, "to": b + 1, "caught": caught}))
     for j, (first, second) in enumerate(plant.feeds):
-        to = first + 1 if second is None else [first + 1, second + 1]
-        lines += ["[[pump]]", f"gain = {toml(float(plant.pump_gain[j]))}", f"to = {toml(to)}"]
-        lines += [f"split = {toml(float(plant.split[j]))}"] if second is not None else []
-        lines += [f"{n} = {toml(float(np.asarray(getattr(loop.actuator, n))[j]))}" for n in ("low", "high", "initial")] + [""]
-    lines += ["[plant]", f"outputs = {toml([i + 1 for i in plant.outputs])}", f"gravity = {toml(float(plant.gravity))}"]
-    lines += [f"overflow = {toml(plant.overflow)}", f"bottom = {toml(plant.bottom)}", f"knee = {toml(plant.knee)}", ""]
-    for kind, known, part in (("law", LAWS, loop.controller), ("observer", OBSERVERS, loop.observer)):
-        name = next((n for n, cls in known.items() if cls is type(part)), None)
-        if name is None:
-            raise InputError(f"{case.name}: its {kind} has no name in a rig file, so the case cannot be written as one")
-        lines += [f"[{kind}]", f"kind = {toml(name)}"]
-        for f in dataclasses.fields(part):
-            value = getattr(part, f.name)
-            if f.name == "model" or value is None:
-                continue
-            if f.metadata.get("kind") in ("leaf", "static") and not isinstance(value, tuple):
-                lines.append(f"{f.name} = {toml(np.asarray(value).tolist() if f.metadata['kind'] == 'leaf' else value)}")
-        lines += [""]
-    return lines
+        own = {"gain": float(plant.pump_gain[j]), "to": first + 1 if second is None else [first + 1, second + 1]}
+        own |= {} if second is None else {"split": float(plant.split[j])}
+        found.append(("[[pump]]", "pump", own | {k: float(np.asarray(getattr(bank, k))[j]) for k in ("low", "high", "initial")}))
+    more = {"outputs": [i + 1 for i in plant.outputs], "gravity": float(plant.gravity)}
+    return [*found, ("[plant]", "plant", more | {k: getattr(plant, k) for k in ("overflow", "bottom", "knee")})]

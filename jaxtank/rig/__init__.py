@@ -1,0 +1,96 @@
+"""A rig as a TOML file: a case of a paper and what is different about yours.
+
+case = "gouta2015/backstepping"
+
+[values]                     # any parameter by its dotted name
+"controller.k1" = 0.01
+"plant.area" = [21.2, 21.2, 21.2, 21.2]
+"clock.dt" = 0.01
+
+[reference]                  # ramps between plateaus
+initial = [3.0, 3.0]
+changes = [[20.0, 1, 8.0]]   # time [s], output (from 1), level
+ramp = 60.0
+
+[reference.sine]             # a sine on top, for a while
+amplitude = 1.0
+period = 100.0
+output = 1
+
+[observer]                   # another one than the preset's, or [law]: kind, and its fields
+kind = "extended-kalman"
+process = 1e-4
+measurement = 1e-4
+
+[[pour]]                     # what disturbs: volumes poured, or [disturbance] inflow = [one per tank]
+time = 500.0
+duration = 1.0
+tank = 2
+volume = 500.0
+
+[[fault]]                    # what breaks, untold to the law
+of = "pump_gain[0]"
+start = 300.0
+end = 400.0
+factor = 0.6
+
+[schedule]                   # gains that follow a setpoint (r1, r2 ..) or a level (h1, h2 ..); their values are "controller.values"
+gains = ["controller.k", "controller.k1"]
+variable = "r1"
+knots = [5.0, 10.0, 15.0]
+
+[limits]                     # hard limits of `tune`
+max_level = "rim"
+
+[free]                       # what `tune` may change: [low, high] or [low, high, "log" or "linear"]
+"controller.k1" = [0.001, 5.0]
+
+[objective]                  # what it makes small: measure = weight
+rms_error_total = 1.0
+
+[uncertain]                  # spread of the plant's parameters, as a share: what answers are validated on
+"plant.drain" = 0.05
+
+[covariance]                 # of parameters that vary together, as `identify` writes it
+names = ["plant.drain[0]", "plant.drain[1]"]
+matrix = [[1e-6, 0.0], [0.0, 1e-6]]
+
+[log]                        # columns of a log of this rig, with their units: a header, or [header, unit]
+pump1 = ["pump speed", "V"]
+h1 = "level 1 [mm]"
+
+[[scenario]]                 # runs that `tune` judges by, instead of the case's own; scenario = [] at the top: none
+name = "noisy"
+seed = 1
+weight = 2.0
+values = { "sensor.noise" = 0.02, "reference.ramp" = 40.0 }
+"""
+
+from jaxtank.presets.base import Case
+from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered
+from jaxtank.rig.reading import from_table, load, loads, open_case
+from jaxtank.rig.values import has, set_and_schedule, set_values
+from jaxtank.rig.words import toml
+from jaxtank.rig.writing import complete, dump, save, short
+
+__all__ = [
+    "Case",
+    "check",
+    "check_free",
+    "check_limits",
+    "check_objective",
+    "check_uncertain",
+    "complete",
+    "dump",
+    "from_table",
+    "has",
+    "load",
+    "loads",
+    "open_case",
+    "save",
+    "set_and_schedule",
+    "set_values",
+    "short",
+    "toml",
+    "uncovered",
+]

@@ -1,0 +1,135 @@
+"""Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain, scenarios."""
+
+import math
+
+import jax
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank import scheduling
+from jaxtank.analysis import equilibrium
+from jaxtank.errors import EquilibriumError, InputError, unknown
+from jaxtank.measures import check_names, entries
+from jaxtank.measures import unit as measure_unit
+from jaxtank.presets.base import Free, Scenario
+from jaxtank.records import CLOCK_UNITS
+from jaxtank.rig.values import set_values
+from jaxtank.rig.words import is_numeric
+from jaxtank.signals import Ramps
+from jaxtank.tree import _short, check_value, describe, get_value, split_index
+
+SCENARIO_KEYS = ("name", "values", "seed", "weight")
+
+
+def check(case):
+    """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
+    lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
+    if case.reachable and isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
+        for values in case.loop.reference.plateaus(case.clock.duration):
+            try:
+                equilibrium(case.loop.plant, values)
+            except EquilibriumError as error:
+                raise EquilibriumError(f"reference: {error}") from None
+    return case
+
+
+def check_uncertain(loop, uncertain):
+    """`uncertain` as a dict, if every one is a parameter in use with a spread above 0 and below 1."""
+    for name, share in uncertain.items():
+        get_value(loop, name)
+        if not (is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
+            raise InputError(f"uncertain {name} = {_short(share)}: must be a share between 0 and 1")
+    return {name: float(share) for name, share in uncertain.items()}
+
+
+def uncovered(loop, name, share, covered):
+    """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry where that is part of an array; a
+    share of nothing is left out."""
+    if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
+        return {name: share}
+    if "[" in name:
+        return {} if name in covered else {name: share}
+    value = np.asarray(get_value(loop, name))
+    entries = [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(value.shape) if value[i] != 0] if value.shape else []
+    return {n: share for n in entries if n not in covered}
+
+
+def check_limits(loop, limits):
+    """`limits` as a dict, if every one is a measure with a finite number, one for each of its entries, or "rim" for max_level."""
+    check_names(limits)
+    for measure, value in limits.items():
+        count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
+        if isinstance(value, str) and value == "rim" and measure == "max_level":
+            continue
+        good = is_numeric(value) and np.shape(value) in ((), (count,))
+        if not good or not np.all(np.isfinite(np.asarray(value, dtype=float))):
+            many = f", or {count} of them" if count > 1 else ""
+            rim = ', or "rim"' if measure == "max_level" else ""
+            raise InputError(f"limit {measure} = {_short(value)}: must be a finite number [{unit}]{many}{rim}")
+    return dict(limits)
+
+
+def check_objective(objective):
+    """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one of them above."""
+    check_names(objective)
+    for measure, weight in objective.items():
+        if not (is_numeric(weight) and np.ndim(weight) == 0 and np.isfinite(weight) and weight >= 0):
+            raise InputError(f"objective {measure} = {_short(weight)}: must be a finite weight at or above 0")
+    if not any(objective.values()):
+        raise InputError("the objective has no measure with a weight above 0")
+    return {measure: float(weight) for measure, weight in objective.items()}
+
+
+def check_free(loop, name, low, high, scale="log"):
+    """The Free of a parameter, if it is a leaf in use and its range lies within what it allows."""
+    if name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS:
+        meta = {"kind": "static"}
+    else:
+        meta = describe(loop, name)
+    if meta["kind"] == "static":
+        raise InputError(f"free {name}: cannot be tuned, it is part of the compiled program and not a number with a derivative")
+    scheduling.check_not_scheduled(loop, name)
+    get_value(loop, name)
+    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise InputError(f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
+    for end in (low, high):
+        for row in meta.get("rows") or (meta,):  # an array whose rows are different things
+            check_value(f"free {name}", end, row)
+    if scale not in ("log", "linear"):
+        raise InputError(f"free {name}: scale {scale!r} must be log or linear")
+    return Free(float(low), float(high), scale if low > 0 else "linear")
+
+
+def free_of(loop, table):
+    """{name: Free} of a [free] table. A gain that a schedule gives is free at every knot, and other names of the scheduled law are found."""
+    found = {}
+    for name, spec in table.items():
+        good = isinstance(spec, list) and len(spec) in (2, 3) and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
+        if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
+            raise InputError(f'free {name} = {_short(spec)}: must be [low, high] or [low, high, "log" or "linear"]')
+        for own in scheduling.names_of(loop, name):
+            found[own] = check_free(loop, own, *spec)
+    return found
+
+
+def scenario(case, entry, index):
+    """The Scenario of one [[scenario]] table, if it can be run."""
+    if not isinstance(entry, dict):
+        raise InputError(f"scenario {index + 1} = {_short(entry)}: must be a table")
+    for key in entry:
+        if key not in SCENARIO_KEYS:
+            raise unknown("key of [[scenario]]", key, SCENARIO_KEYS)
+    name, values = entry.get("name", f"scenario {index + 1}"), entry.get("values", {})
+    seed, weight = entry.get("seed", 0), entry.get("weight", 1.0)
+    if not isinstance(name, str) or not isinstance(values, dict):
+        raise InputError(f"scenario {index + 1}: name must be a text, and values a table")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError(f"scenario {name!r}: seed = {_short(seed)} must be a whole number from 0 to {2**31 - 1}")
+    if not is_numeric(weight) or np.ndim(weight) or not (np.isfinite(weight) and weight > 0):
+        raise InputError(f"scenario {name!r}: weight = {_short(weight)} must be a finite number above 0")
+    try:
+        set_values(case, values)
+    except InputError as error:
+        raise type(error)(f"scenario {name!r}: {error}") from None
+    return Scenario(name, {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}, seed, float(weight))

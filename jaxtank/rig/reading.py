@@ -1,0 +1,140 @@
+"""From a rig file to a Case."""
+
+import dataclasses
+import tomllib
+
+import numpy as np
+
+from jaxtank import presets, record_tables
+from jaxtank.errors import InputError, unknown
+from jaxtank.files import read_text
+from jaxtank.rig import checks, parts, signals, tanks
+from jaxtank.rig.values import has, set_and_schedule
+from jaxtank.tree import _short
+
+TABLES = (
+    "case",
+    "name",
+    "reachable",
+    *tanks.TABLES,
+    "law",
+    "observer",
+    "schedule",
+    "values",
+    "reference",
+    "disturbance",
+    "pour",
+    "fault",
+    "limits",
+    "free",
+    "objective",
+    "uncertain",
+    "covariance",
+    "log",
+    "scenario",
+)
+LISTS = ("scenario", "tank", "orifice", "pipe", "spill", "pump", "pour", "fault")
+KINDS = {
+    "case": (str, "a text"),
+    "name": (str, "a text"),
+    "reachable": (bool, "true or false"),
+    "units": (list, "a list"),
+    **{k: (list, f"a list of tables, [[{k}]]") for k in LISTS},
+}
+
+
+def open_case(name):
+    """The Case of "paper/case", or of a rig file where `name` ends in .toml, checked."""
+    return load(name) if name.endswith(".toml") else presets.find(name)
+
+
+def load(path):
+    """The Case of a rig file. Raises InputError, naming the file, for anything in it that is unknown, misshapen or out of range."""
+    return loads(read_text(path, "rig file"), f"rig file {str(path)!r}")
+
+
+def loads(text, words="rig file"):
+    """The Case of the text of a rig file, called `words` in errors."""
+    try:
+        table = tomllib.loads(text)
+    except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
+        raise InputError(f"{words} is not TOML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
+    try:
+        return from_table(table)
+    except InputError as error:
+        raise type(error)(f"{words}: {error}") from None
+    except RecursionError:
+        raise InputError(f"{words}: a value is nested too deeply") from None
+
+
+def from_table(table):
+    """The Case described by a table of the form of a rig file."""
+    case = start_of(table)
+    case = set_and_schedule(case, table.get("values", {}), table.get("schedule", {}))
+    if "limits" in table:
+        case = case.replace(limits=checks.check_limits(case.loop, table["limits"]))
+    if "objective" in table:
+        case = case.replace(objective=checks.check_objective(table["objective"]))
+    if "free" in table:
+        case = case.replace(free=checks.free_of(case.loop, table["free"]))
+    if "uncertain" in table:
+        case = case.replace(uncertain=checks.check_uncertain(case.loop, table["uncertain"]))
+    if "covariance" in table:
+        case = case.replace(covariance=record_tables.check_covariance(case.loop, table["covariance"]))
+    if "log" in table:
+        case = case.replace(log=record_tables.check_log(case.loop.plant, table["log"]))
+    if "scenario" in table:
+        case = case.replace(scenarios=tuple(checks.scenario(case, entry, i) for i, entry in enumerate(table["scenario"])))
+    return checks.check(case)
+
+
+def start_of(table):
+    """The Case of the tables that build: case or tanks, law, observer, reference, what disturbs; before any value is set."""
+    for key, value in table.items():
+        if key not in TABLES:
+            raise unknown("key", key, TABLES)
+        wanted, words = KINDS.get(key, (dict, "a table"))
+        if not isinstance(value, wanted):
+            raise InputError(f"{key} = {_short(value)}: must be {words}")
+    if "case" in table and (given := [k for k in tanks.TABLES if k in table]):
+        raise InputError(
+            f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out case, or [{given[0]}]"
+        )
+    if "case" not in table and "tank" not in table:
+        raise InputError(
+            'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or [[tank]] to describe a rig'
+        )
+    case = _with_parts(presets.find(table["case"]), table) if "case" in table else tanks.build(table)
+    loop, changed = case.loop, {}
+    if "reference" in table:
+        changed["reference"] = signals.reference_of(table["reference"], loop.reference)
+    if "disturbance" in table or "pour" in table:
+        named = tanks.names_in(table)
+        changed["disturbance"] = signals.disturbance_of(
+            table, loop, lambda value, where: tanks.tank_index(value, where, named, loop.plant.tanks)
+        )
+    if "fault" in table:
+        changed["faults"] = signals.faults_of(table["fault"], loop.plant)
+    if changed:
+        case = case.replace(loop=dataclasses.replace(loop, **changed))
+    return case.replace(name=table.get("name", case.name), reachable=table.get("reachable", case.reachable))
+
+
+def _with_parts(case, table):
+    """A case with the law or observer of a table in the place of its own. What its own could be tuned by goes with a law."""
+    loop, changed = case.loop, {}
+    levels, initial = np.asarray(loop.x0), loop.actuator.initial
+    if "law" in table:
+        start = [float(levels[i]) for i in loop.plant.outputs]
+        changed["controller"] = parts.law_of(table["law"], loop.plant, start, initial)
+        if type(changed["controller"]) is not type(loop.controller):
+            case = case.replace(mirror=None)
+    if "observer" in table:
+        changed["observer"] = parts.observer_of(table["observer"], loop.plant, levels, initial)
+    if not changed:
+        return case
+    prefix = tuple(f"{name}." for name in changed)
+    free = {n: f for n, f in case.free.items() if not n.startswith(prefix) or has(dataclasses.replace(loop, **changed), n)}
+    return case.replace(loop=dataclasses.replace(loop, **changed), free=free)

@@ -1,0 +1,202 @@
+"""What a rig file says of a case, table by table and key by key: the one source of `dump` and of the commented file of `init`."""
+
+import tomllib
+
+import numpy as np
+
+from jaxtank import scheduling
+from jaxtank.errors import InputError
+from jaxtank.presets.base import Free
+from jaxtank.records import CLOCK
+from jaxtank.rig import examples, parts, signals, tanks
+from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of
+from jaxtank.rig.origin import origin_of, structures
+from jaxtank.rig.reading import start_of
+from jaxtank.rig.words import toml
+from jaxtank.signals import Ramps, Sum
+from jaxtank.tree import walk
+
+# leaves and statics that the tables of a rig described tank by tank set
+TANKWISE = {"x0", "sensor.noise", "actuator.low", "actuator.high", "actuator.initial"}
+
+
+def sections(case, tankwise=False):
+    """The Sections of a case, from the preset it came from, or tank by tank where there is none or `tankwise`."""
+    origin, same = (None, ()) if tankwise else origin_of(case)
+    try:
+        built = _building(case, origin, same)
+        base = start_of(tomllib.loads("\n".join(line for s in built if s.on for line in lines_of(s))))
+    except InputError as error:
+        raise InputError(f"{case.name}: cannot be written as a rig file: {error}") from None
+    if structures(scheduling.unscheduled(case.loop)) != structures(base.loop):
+        raise InputError(f"{case.name}: cannot be written as a rig file: its law or observer has another model than its rig")
+    top = [
+        *built[0].keys,
+        *([Key("reachable", case.reachable, REACHABLE)] if case.reachable != base.reachable else []),
+        *([Key("scenario", [], {**BARE, "doc": "none of the preset's runs"})] if base.scenarios and not case.scenarios else []),
+    ]
+    found = [
+        built[0]._replace(keys=top),
+        *built[1:],
+        *_schedule(case),
+        *_values(case, base, origin is None, same),
+        *_tuning(case),
+    ]
+    have = {f.title for f in found} - {"[[pour]]", "[[fault]]", "[[scenario]]"} | {k.name for k in top}
+    if any(k.name == "sine" for f in found for k in f.keys):
+        have.add("[reference.sine]")
+    return [*found, *examples.sections(case, have)]
+
+
+def _building(case, origin, same):
+    """The Sections that build a case before any value is set."""
+    loop, units = scheduling.unscheduled(case.loop), case.loop.units
+    start = None if origin is None else origin.loop
+    name = Key("name", case.name, {**BARE, "doc": "what reports call it"})
+    if origin is None:
+        top = Section("", [name, Key("units", list(units), {**BARE, "doc": "[length, pump input]"})])
+        found = [
+            Section(t, keys_of([(k, tanks.METAS[kind][k], v) for k, v in own.items()], units))
+            for t, kind, own in tanks.entries_of(loop)
+        ]
+    else:
+        top = Section("", [Key("case", origin.name, {**BARE, "doc": "the preset that this file starts from"}), name])
+        found = []
+    for kind, known, part in (("law", parts.LAWS, loop.controller), ("observer", parts.OBSERVERS, loop.observer)):
+        if kind not in same:
+            keys = keys_of(((n, m, v) for n, m, v in parts.keys_of(part, known)), units)
+            found.append(Section(f"[{kind}]", [k for k in keys if k.value is not None]))
+    found += _reference(loop, start)
+    disturbing = signals.disturbance_tables(loop.disturbance)
+    if disturbing is None:
+        raise InputError("its disturbance has no table")
+    if origin is None and disturbing and disturbing[0][1][0][0] == "inflow":
+        disturbing = []  # the tanks say it
+    for title, rows in [*disturbing, *signals.fault_tables(loop.faults)]:
+        found.append(Section(title, keys_of(rows, units)))
+    dropped = [("pour", "disturbance"), ("fault", "faults")]
+    none = [
+        Key(k, [], {**BARE, "doc": "none"}) for k, f in dropped if getattr(loop, f) is None and getattr(start, f, None) is not None
+    ]
+    return [top._replace(keys=[*top.keys, *none]), *found]
+
+
+def _reference(loop, start):
+    reference, length = signals.steps(loop.reference), loop.units[0]
+    if reference is None:
+        if start is None:
+            raise InputError("its reference has no table")
+        return []
+    keys = [
+        Key(
+            "initial",
+            np.asarray(reference.initial).tolist(),
+            {"unit": length, "doc": "setpoint of each output before the first change"},
+        )
+    ]
+    keys += [
+        Key(
+            "changes",
+            signals.changes_of(reference),
+            {"unit": "-", "doc": f"[time [s], output (from 1), setpoint [{length}]] of each change"},
+        )
+    ]
+    keys += [Key(k, getattr(reference, k), signals.meta_of(Ramps, k)) for k in ("ramp", "shape", "band")]
+    if isinstance(loop.reference, Sum):
+        more = Section("[reference.sine]", keys_of(signals.sine_keys(loop.reference.second), loop.units))
+        return [Section("[reference]", keys), more]
+    if start is not None and isinstance(start.reference, Sum):
+        keys.append(Key("sine", {}, {**BARE, "doc": "none"}))
+    return [Section("[reference]", keys)]
+
+
+def _schedule(case):
+    table = scheduling.table_of(case.loop)
+    docs = {"gains": "gains that follow the variable", "variable": "a setpoint, r1 .., or a level, h1 ..", "knots": "where"}
+    return [Section("[schedule]", [Key(k, v, {**BARE, "doc": docs[k]}) for k, v in table.items()])] if table else []
+
+
+def _values(case, base, tankwise, same):
+    """[values]: every leaf and static field that the tables before it have not set, a Section for each part of the loop."""
+    loop, groups = case.loop, {}
+    scheduled = bool(scheduling.table_of(loop))
+    fields = [*walk(base.loop), *walk(base.loop, kind="static")]
+    known = {
+        name: None if value is None else toml(np.asarray(value).tolist())
+        for name, value, _ in fields
+        if not isinstance(value, tuple)
+    }
+    described = ("reference.", "disturbance.", "faults.") if signals.steps(loop.reference) else ("disturbance.", "faults.")
+    for name, value, meta in [*walk(loop), *walk(loop, kind="static")]:
+        if (
+            isinstance(value, tuple)
+            or name.startswith(described)
+            or (scheduled and name in ("controller.knots", "controller.variable"))
+        ):
+            continue
+        part, _, rest = name.partition(".")
+        built = {"controller": "law" not in same, "observer": "observer" not in same, "plant": tankwise}.get(part, False)
+        built = built or (tankwise and name in TANKWISE)
+        value = None if value is None else np.asarray(value).tolist()
+        if value is None:
+            if not (scheduled and part == "controller"):
+                groups.setdefault(part, []).append(Key(toml(name), examples.absent(loop, name, meta), meta, False))
+        elif not built or known.get(name) != toml(value):
+            groups.setdefault(part, []).append(Key(toml(name), value, meta))
+        elif rest.startswith("model."):
+            groups.setdefault(part, []).append(Key(toml(name), value, meta, False))
+    clock = [Key(toml(f"clock.{k}"), getattr(case.clock, k), meta) for k, meta in CLOCK.items()]
+    return [
+        Section("[values]", []),
+        *(Section("", keys, (PARTS[part],)) for part, keys in groups.items()),
+        Section("", clock, (PARTS["clock"],)),
+    ]
+
+
+def _tuning(case):
+    """[limits] to [[scenario]]: what is tuned, by what, and what is uncertain."""
+    plain = lambda v: np.asarray(v).tolist() if not isinstance(v, str) else v
+    found = [
+        Section(
+            "[limits]", [*(Key(m, plain(v), examples.of_measure(case, m)) for m, v in case.limits.items()), *examples.limits(case)]
+        ),
+        Section(
+            "[free]",
+            [*(Key(toml(n), list(Free(*spec)), examples.of_free(case, n)) for n, spec in case.free.items()), *examples.free(case)],
+        ),
+        Section(
+            "[objective]",
+            [*(Key(m, float(w), examples.of_measure(case, m)) for m, w in case.objective.items()), *examples.objective(case)],
+        ),
+        Section(
+            "[uncertain]",
+            [
+                *(Key(toml(n), float(v), examples.of_uncertain(case, n)) for n, v in case.uncertain.items()),
+                *examples.uncertain(case),
+            ],
+        ),
+    ]
+    if case.covariance is not None:
+        names, rows = case.covariance
+        found.append(Section("[covariance]", [Key("names", list(names)), Key("matrix", [list(map(float, row)) for row in rows])]))
+    if case.log:
+        found.append(
+            Section("[log]", [Key(slot, spec if isinstance(spec, str) else list(spec)) for slot, spec in case.log.items()])
+        )
+    for s in case.scenarios:
+        keys = [Key("name", s.name), Key("seed", s.seed), Key("weight", float(s.weight)), Key("values", dict(s.values))]
+        found.append(Section("[[scenario]]", keys))
+    return found
+
+
+REACHABLE = {**BARE, "doc": "whether every plateau of the reference must have a steady state", "choices": (True, False)}
+PARTS = {
+    "plant": "plant: the rig as it is",
+    "sensor": "sensor: what the computer sees of the levels",
+    "observer": "observer: what the law believes the levels are; observer.model is its own copy of the plant",
+    "controller": "controller: the law; controller.model is its own copy of the plant, and what it believes need not be what is",
+    "actuator": "actuator: the pumps",
+    "reference": "reference",
+    "x0": "start",
+    "clock": "clock: when the law samples, and for how long",
+}

@@ -1,0 +1,81 @@
+"""How values are written in a rig file, and what may be said of them: numbers, ranges, units."""
+
+import numpy as np
+
+from jaxtank.errors import InputError
+from jaxtank.tree import _short, check_value
+
+SMALL_INT = (int, np.integer)
+
+
+def toml(value):
+    """`value` as TOML: numbers to their last digit, texts escaped, lists and tuples as arrays."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(toml(v) for v in value) + "]"
+    if isinstance(value, dict):
+        inside = ", ".join(f"{toml(k)} = {toml(v)}" for k, v in value.items())
+        return f"{{ {inside} }}" if inside else "{}"
+    return repr(value)
+
+
+def is_numeric(value):
+    """True for a number that a float can hold, and for lists of such numbers and arrays of a regular shape."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return np.issubdtype(value.dtype, np.number)
+    if isinstance(value, (list, tuple)):
+        return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+    try:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and float(value) is not None
+    except OverflowError:
+        return False
+
+
+def plain(name, value):
+    """`value` as a float; InputError, naming it `name`, unless it is a number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):
+        raise InputError(f"{name} = {_short(value)}: must be a number")
+    return float(value)
+
+
+def static_value(name, value, meta, kind):
+    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is another, out of range, or no choice."""
+    if meta["choices"] is not None:
+        if isinstance(value, (list, dict)) or value not in meta["choices"] or isinstance(value, bool) != (kind is bool):
+            raise InputError(f"{name} = {_short(value)}: must be one of {_choices(meta['choices'])}")
+        return value
+    if kind is str:  # a text of which the component itself knows what it may be
+        if not isinstance(value, str):
+            raise InputError(f"{name} = {_short(value)}: must be a text")
+        return value
+    value = plain(name, value)
+    check_value(name, value, meta)
+    if kind is int and not value.is_integer():
+        raise InputError(f"{name} = {value:g}: must be a whole number")
+    return kind(value)
+
+
+def _choices(choices):
+    return ", ".join(str(c).lower() if isinstance(c, bool) else c for c in choices)
+
+
+def unit(meta):
+    """ " [cm]" of metadata, or nothing where there is no unit."""
+    return "" if meta["unit"] == "-" else f" [{meta['unit']}]"
+
+
+def allowed(meta, value=0.0):
+    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another. Empty where all numbers are allowed."""
+    if meta.get("choices") is not None:
+        return " or ".join(toml(c) for c in meta["choices"])
+    low, high = meta.get("low"), meta.get("high")
+    above = "" if low is None else f"{'above' if meta['strict'] else 'at least'} {low:g}"
+    below = "" if high is None else f"at most {high:g}"
+    whole = "whole number" if isinstance(value, SMALL_INT) and not isinstance(value, bool) else ""
+    return ", ".join(filter(None, [whole, above, below]))
