@@ -1,6 +1,7 @@
-"""What a limit costs: the problem solved again for a row of values of one limit, each search begun where the last one ended."""
+"""What a limit costs: the problem solved again for a row of values of one limit, each search begun where a neighbour's ended."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,10 @@ MANY = 50
 
 def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, scenarios=None, seed=0, iterations=60, start=None):
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
+
+    Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
+    limit) and from that of the next tighter one, and the best is kept: a tighter limit's answer holds a looser one too, so that the
+    objective never falls as the limit is drawn in.
 
     case, free, objective, limits, scenarios, seed, iterations: as in `tune`; the limit holds for every entry of the measure, the other
     limits stay; start: {name: value} to begin at, the case's own where None. Returns {"measure", "points": [{"limit", "status" ("converged",
@@ -31,30 +36,62 @@ def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, s
     z = problem.start()
     if start is not None:
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
-    points = []
+    found, begin = [], z
     for value in values:
-        problem.limits = [
-            limit
-            for i, lane in enumerate(problem.lanes)
-            for limit in resolve_limits(lane.case, {**others, measure: value}, i, lane.name)
-        ]
-        problem.rooms = np.array([room_of(limit, problem.loop) for limit in problem.limits])
-        problem.memo = type(problem.memo)()  # margins are of the limits: what is remembered would be of the last ones
-        search = Search(problem, problem.point(problem.start()), lambda s: None)
-        converged = slsqp(search, z, iterations)
-        if search.best is not None and search.violation(search.best) > 0:
-            restore(search, search.best.z, iterations)
-            converged = slsqp(search, search.best.z, iterations)
-        best = search.best
-        broken = np.inf if best is None else search.violation(best)
-        z = z if best is None else best.z
-        points.append(
-            {
-                "limit": value,
-                "status": "infeasible" if broken > 0 else "converged" if converged else "not_converged",
-                "objective": np.nan if best is None else float(best.cost),
-                "violation": float(broken),
-                "parameters": problem.values(z),
-            }
-        )
-    return {"measure": measure, "points": points}
+        found.append(_solve(problem, {**others, measure: value}, z, iterations))
+        if found[-1].broken and z is not begin:
+            found[-1] = _better(found[-1], _solve(problem, {**others, measure: value}, begin, iterations))
+        z = z if found[-1].best is None else found[-1].best.z
+    for k in reversed(range(len(values) - 1)):
+        if not found[k + 1].broken:
+            again = _solve(problem, {**others, measure: values[k]}, found[k + 1].best.z, iterations)
+            found[k] = _better(found[k], again)
+    return {"measure": measure, "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)]}
+
+
+class _Answer(NamedTuple):
+    """What a search for one value of the limit came to."""
+
+    search: Search
+    converged: bool
+
+    @property
+    def best(self):
+        return self.search.best
+
+    @property
+    def broken(self):
+        """Largest share by which a limit is broken; infinite where nothing finite was found."""
+        return np.inf if self.best is None else self.search.violation(self.best)
+
+
+def _better(one, other):
+    """The _Answer to keep of two for the same limits."""
+    if one.best is None or other.best is None:
+        return other if one.best is None else one
+    return other if one.search.better(other.best, one.best) else one
+
+
+def _solve(problem, limits, z, iterations):
+    """The _Answer of `problem` under `limits` {measure: value}, searched from z (P,)."""
+    problem.limits = [limit for i, lane in enumerate(problem.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
+    problem.rooms = np.array([room_of(limit, problem.loop) for limit in problem.limits])
+    problem.memo = type(problem.memo)()  # margins are of the limits: what is remembered would be of the last ones
+    search = Search(problem, problem.point(problem.start()), lambda s: None)
+    converged = slsqp(search, z, iterations)
+    if search.best is not None and search.violation(search.best) > 0:
+        restore(search, search.best.z, iterations)
+        converged = slsqp(search, search.best.z, iterations)
+    return _Answer(search, converged)
+
+
+def _told(problem, value, answer, z):
+    """One row of `tradeoff`'s points; z: (P,) what to name where nothing finite was found."""
+    best, broken = answer.best, answer.broken
+    return {
+        "limit": value,
+        "status": "infeasible" if broken > 0 else "converged" if answer.converged else "not_converged",
+        "objective": np.nan if best is None else float(best.cost),
+        "violation": float(broken),
+        "parameters": problem.values(z if best is None else best.z),
+    }
