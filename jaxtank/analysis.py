@@ -113,14 +113,20 @@ def equilibrium(plant, y):
     return x, np.maximum(u, 0.0)
 
 
+@jax.jit
+def _rate(plant, x, u):
+    """Rates (n) [cm/s] at levels x (n) and inputs u (m); the plant is an argument, so that rigs of one topology share a program."""
+    return jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None))
+
+
+_slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
+
+
 def _balanced(plant, y, words):
     """(levels, inputs) at which a network with pipes stands still, by damped Gauss-Newton in the roots of the unknown levels."""
     free = [i for i in range(plant.tanks) if i not in plant.outputs]
     if plant.pumps != len(plant.outputs):
         raise InputError(f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and {len(plant.outputs)}")
-    with jax.enable_x64(True):
-        rate = jax.jit(lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None)))
-        slope = jax.jit(jax.jacfwd(rate, argnums=(0, 1)))
     scale = float(np.max(y)) or 1.0
     gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))  # level rate per unit of input
 
@@ -131,11 +137,11 @@ def _balanced(plant, y, words):
 
     def residual(z):
         with jax.enable_x64(True):
-            return np.asarray(rate(*split(z)))
+            return np.asarray(_rate(plant, *split(z)))
 
     def jacobian(z):
         with jax.enable_x64(True):
-            by_x, by_u = (np.asarray(a) for a in slope(*split(z)))
+            by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])

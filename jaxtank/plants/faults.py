@@ -43,7 +43,7 @@ def faults(plant, entries):
     Raises InputError for an entry that the plant does not have, and for a window that ends before it starts.
     """
     for name, start, end, _, _ in entries:
-        if np.ndim(get_value(plant, name)) != 0:
+        if np.ndim(get_value(plant, name)) != 0 or not split_index(name)[1]:
             raise InputError(f"fault of {name}: name one entry, as in {name}[0]")
         if not 0 <= start < end:
             raise InputError(f"fault of {name} from {start} s to {end} s: must start at or after 0 s and end later")

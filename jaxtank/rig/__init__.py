@@ -63,7 +63,7 @@ h1 = "level 1 [mm]"
 name = "noisy"
 seed = 1
 weight = 2.0
-values = { "sensor.noise" = 0.02, "reference.ramp" = 40.0 }
+values = { "sensor.noise" = 0.02, "plant.pump_gain" = 7.5 }
 """
 
 from jaxtank.presets.base import Case

@@ -138,7 +138,7 @@ def sections(case, have):
                 'Theirs are then "controller.values", a row per gain; [free] may name the gain for all its knots.',
             )
     add("[observer]", _observer(loop), f"Another observer than the preset's: {', '.join(parts.OBSERVERS)}.")
-    if signals.steps(loop.reference) is loop.reference and isinstance(loop.reference, Ramps):
+    if signals.steps(loop.reference) is loop.reference and isinstance(loop.reference, Ramps) and not _refers(case):
         start = signals.Sine(
             amplitude=np.float64(0.0),
             offset=np.float64(0.0),
@@ -149,7 +149,11 @@ def sections(case, have):
             channel=0,
             width=1,
         )
-        add("[reference.sine]", signals.sine_keys(start), "A sine on top of the ramps of one output, for a while.")
+        add(
+            "[reference.sine]",
+            signals.sine_keys(start),
+            "A sine on top of the ramps of one output, for a while; names are then reference.first.ramp and so on.",
+        )
     if loop.disturbance is None:
         flows = [0.0] * loop.plant.tanks
         add("[disturbance]", [("inflow", signals.INFLOW, flows)], "A steady inflow, or volumes that are poured: one of the two.")
@@ -195,6 +199,11 @@ def sections(case, have):
         prose = "Which column of a log is what, for jaxtank identify, where its header does not say so (h1 [cm], pump1_V, t [s]): [header, unit]."
         add("[log]", rows, prose, local_units=False)
     return found
+
+
+def _refers(case):
+    """Whether a scenario names the reference, whose names change where a sine is added."""
+    return any(name.startswith("reference.") for s in case.scenarios for name in s.values)
 
 
 def _observer(loop):

@@ -134,6 +134,8 @@ def _values(case, base, tankwise, same):
             or (scheduled and name in ("controller.knots", "controller.variable"))
         ):
             continue
+        if value is not None and np.size(value) == 0:
+            continue  # of a rig without pipes, say: there is nothing to set
         part, _, rest = name.partition(".")
         built = {"controller": "law" not in same, "observer": "observer" not in same, "plant": tankwise}.get(part, False)
         built = built or (tankwise and name in TANKWISE)

@@ -69,8 +69,6 @@ def _commented(section):
     lines += [line for sentence in section.prose for line in _wrapped(sentence)]
     lines += [("" if section.on else "#") + section.title] * bool(section.title)
     for key in section.keys:
-        if key.value == [] and key.name.startswith('"'):
-            continue  # of a rig without pipes, what they could be set to is nothing
         lines += [line for line in _wrapped(_about(key))] if _about(key) else []
         lines.append(("" if section.on and key.on else "#") + f"{key.name} = {toml(key.value)}")
     return lines

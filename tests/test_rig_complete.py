@@ -1,0 +1,253 @@
+"""The complete rig file of `init`: it is the case, every suggestion in it can be used, and a rig is described without Python."""
+
+import re
+import tomllib
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import parameters, presets, rig
+from jaxtank.errors import InputError
+from jaxtank.measures import MEASURES, TIMES
+from jaxtank.tree import walk
+from tuning import cli
+
+HEAD = 'case = "gouta2015/backstepping"\n'
+# one case of each law, reference, disturbance and fault
+KINDS = list(
+    {
+        (
+            n.split("/")[0],
+            *(type(getattr(presets.find(n).loop, f)) for f in ("controller", "observer", "reference", "disturbance", "faults")),
+        ): n
+        for n in reversed(presets.names())
+    }.values()
+)
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop) and a.clock == b.clock
+    for one, other in zip(jax.tree.leaves(a.loop), jax.tree.leaves(b.loop)):
+        np.testing.assert_array_equal(one, other)
+
+
+def used(text):
+    """A block of a rig file with its suggestions taken."""
+    return re.sub(r"(?m)^#(?=\S)", "", text)
+
+
+@pytest.mark.parametrize("name", presets.names())
+def test_the_complete_file_is_the_case(name):
+    case = presets.find(name)
+    text, terse = rig.complete(case), rig.dump(case)
+    assert tomllib.loads(text) == tomllib.loads(terse)  # what is not a suggestion is what `dump` says
+    again = rig.loads(text)
+    assert_same(again, case)
+    assert rig.dump(again) == terse and rig.complete(again) == text
+    assert dict(again.uncertain) == dict(case.uncertain) and len(again.scenarios) == len(case.scenarios)
+    assert again.reachable == case.reachable and (again.mirror is None) == (case.mirror is None)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_suggestion_can_be_used(name):
+    """Tables one by one; the lines of a table that is there, all of them at once."""
+    blocks, tried = rig.complete(presets.find(name)).split("\n\n"), []
+    for i, block in enumerate(blocks):
+        taken = used(block)
+        if taken != block:
+            rig.loads("\n\n".join([*blocks[:i], taken, *blocks[i + 1 :]]))
+            tried += re.findall(r"(?m)^#(\S.*)", block)
+    assert {"[observer]", "[[fault]]", "[covariance]", "[[scenario]]", "rms_error = 1.0"} <= {
+        *tried,
+        *"\n".join(blocks).splitlines(),
+    }
+    assert len(tried) > 60
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_tank_by_tank_it_is_the_same_rig(name):
+    case = presets.find(name)
+    text = rig.complete(case, tankwise=True)
+    again = rig.loads(text)
+    assert "case" not in tomllib.loads(text) and len(tomllib.loads(text)["tank"]) == case.loop.plant.tanks
+    assert_same(again, case)
+    assert again.reachable == case.reachable and dict(again.limits) == dict(case.limits)
+
+
+def test_the_cost_is_the_same_to_the_last_bit():
+    for name in ("gouta2015/backstepping", "gouta2022/chadpc"):
+        case = rig.set_values(presets.find(name), {"clock.dt": 0.1, "clock.duration": 600.0})
+        for text in (rig.complete(case), rig.dump(case), rig.short(case), rig.complete(case, tankwise=True)):
+            again = rig.loads(text)
+            ours, theirs = (jaxtank.evaluate(c.loop, c.clock, ["rms_error_total", "input_travel"]) for c in (again, case))
+            for measure in ours:
+                np.testing.assert_array_equal(ours[measure], theirs[measure])
+
+
+def test_every_name_stands_in_the_file_with_its_unit_and_range():
+    case = presets.find("gouta2022/pid")
+    text = rig.complete(case)
+    for kind in ("leaf", "static"):
+        for name, value, meta in walk(case.loop, kind=kind):
+            if isinstance(value, tuple) or np.size(value) == 0 or name.startswith(("reference.", "disturbance.")):
+                continue
+            above = re.search(rf'(?m)^(# .*)\n#?"{re.escape(name)}" = ', text)
+            assert above, name
+            shown = re.findall(rf'(?ms)((?:^# [^\n]*\n)+)#?"{re.escape(name)}" = ', text)[0].replace("\n# ", " ")
+            assert meta["doc"] in shown and (meta["unit"] == "-" or f"[{meta['unit']}]" in shown)
+            if meta["low"] is not None:
+                assert f"{'above' if meta['strict'] else 'at least'} {meta['low']:g}" in shown
+    for measure in MEASURES:
+        assert measure in TIMES.values() or len(re.findall(rf"(?m)^#?{measure} = ", text)) == 2  # to limit, and to make small
+
+
+def test_the_short_file_has_what_differs_and_what_is_tuned():
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"plant.area[1]": 20.0, "plant.overflow": True})
+    text = rig.short(case)
+    table = tomllib.loads(text)
+    assert set(table["values"]) == {"plant.area", "plant.overflow"} and set(table) == {
+        "case",
+        "name",
+        "values",
+        "limits",
+        "free",
+        "objective",
+    }
+    assert_same(rig.loads(text), case)
+    rig.loads(used(text))
+    assert len(text.splitlines()) < 50
+
+
+def test_the_example_of_the_module_can_be_used():
+    again = rig.loads(rig.__doc__.partition("\n\n")[2])
+    assert type(again.loop.observer).__name__ == "ExtendedKalman" and again.loop.faults.windows == (("pump_gain[0]", 300.0, 400.0),)
+    assert set(again.free) == {f"controller.values[1,{j}]" for j in range(3)}
+
+
+def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
+    from jaxtank.plants.faults import faults
+    from jaxtank.signals import Sine, pours
+
+    text = (
+        HEAD + "[reference.sine]\namplitude = 0.5\nperiod = 100.0\noutput = 2\nstart = 50.0\nend = 150.0\n"
+        "[[pour]]\ntime = 30.0\nduration = 2.0\ntank = 2\nvolume = 40.0\n"
+        '[[fault]]\nof = "plant.pump_gain[1]"\nstart = 10.0\nend = 20.0\nfactor = 0.6\n'
+    )
+    loop = rig.loads(text).loop
+    old = presets.find("gouta2015/backstepping").loop
+    sine = Sine(amplitude=0.5, offset=0.0, period=100.0, zero=0.0, start=50.0, end=150.0, channel=1, width=2)
+    assert jax.tree.structure(loop.reference.second) == jax.tree.structure(sine)
+    np.testing.assert_array_equal(jax.tree.leaves(loop.reference.second), jax.tree.leaves(sine))
+    assert jax.tree.structure(loop.reference.first) == jax.tree.structure(old.reference)
+    for ours, theirs in (
+        (loop.disturbance, pours(4, [(30.0, 2.0, 1, 40.0)])),
+        (loop.faults, faults(old.plant, [("pump_gain[1]", 10, 20, 0.6, 0.0)])),
+    ):
+        assert jax.tree.structure(ours) == jax.tree.structure(theirs)
+        np.testing.assert_array_equal(jax.tree.leaves(ours), jax.tree.leaves(theirs))
+    # and are read back, over the preset and tank by tank
+    case = rig.loads(text)
+    for tankwise in (False, True):
+        again = rig.loads(rig.dump(case, tankwise))
+        assert_same(again, case)
+        assert rig.dump(again) == rig.dump(case)
+
+
+def test_what_a_preset_has_can_be_taken_away():
+    text = 'case = "gouta2022/chadpc"\npour = []\nscenario = []\nreachable = false\n[reference]\nsine = {}\n'
+    case = rig.loads(text)
+    assert case.loop.disturbance is None and case.scenarios == () and type(case.loop.reference).__name__ == "Ramps"
+    assert_same(rig.loads(rig.dump(case)), case)
+    assert rig.loads('case = "calofir/backstepping-perturbed"\nfault = []\n').loop.faults is None
+
+
+def test_another_law_and_observer_over_a_preset():
+    text = (
+        'case = "gouta2022/pi"\n[law]\nkind = "enmpc"\nTp = 0.5\ncompensation = "single"\n[observer]\nkind = "disturbance"\nl = 2.0\n'
+        '[values]\n"controller.Tp" = 0.4\n[free]\n"observer.l" = [0.1, 9.0]\n'
+    )
+    case, preset = rig.loads(text), presets.find("gouta2022/chadpc")
+    values = {"controller.Tp": 0.4, "observer.l": 2.0}
+    assert_same(case, rig.set_values(preset, values))  # the same loop, another way
+    kalman = rig.loads(
+        'case = "mirakhorli/sfc"\n[observer]\nkind = "kalman"\nprocess = 1e-3\nmeasurement = 0.01\nmeasured = [1, 2]\n'
+    )
+    assert kalman.loop.observer.measured == (0, 1) and np.shape(kalman.loop.observer.process) == (4,)
+    assert_same(rig.loads(rig.dump(kalman)), kalman)
+
+
+def test_a_case_without_an_optional_part_of_its_preset_is_read_back():
+    """gouta2022's pumps have a dead zone: a rig without one is not written as that preset."""
+    import dataclasses
+
+    case = presets.find("gouta2022/pi")
+    case = case.replace(
+        uncertain={}, loop=dataclasses.replace(case.loop, actuator=dataclasses.replace(case.loop.actuator, dead_zone=None))
+    )
+    assert_same(rig.loads(rig.dump(case)), case)
+
+
+TANK = "[[tank]]\narea = 20.0\nrim = 30.0\ndrain = 1.0\nlevel = 3.0\n[[pump]]\ngain = 5.0\nto = 1\nhigh = 12.0\n"
+TANK += '[law]\nkind = "pid"\nKc = 1.0\nTi = 9.0\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 9\nvolume = 1.0\n", r"pour 1: tank = 9: .* from 1 to 4"),
+        (HEAD + "[[pour]]\ntime = 1.0\nduration = 0.0\ntank = 1\nvolume = 1.0\n", "duration above 0"),
+        (HEAD + "[[pour]]\ntime = 1.0\nvolum = 1.0\n", r"unknown key of \[\[pour\]\] 'volum'; nearest: volume"),
+        (HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 1\n", "pour 1: volume is missing"),
+        (
+            HEAD + '[[fault]]\nof = "pump_gian[0]"\nstart = 1.0\nend = 2.0\n',
+            "fault 1: unknown parameter 'pump_gian.*nearest: pump_gain",
+        ),
+        (HEAD + '[[fault]]\nof = "pump_gain"\nstart = 1.0\nend = 2.0\n', r"fault 1: fault of pump_gain: name one entry"),
+        (HEAD + '[[fault]]\nof = "gravity"\nstart = 1.0\nend = 2.0\n', r"fault 1: fault of gravity: name one entry"),
+        (HEAD + '[[fault]]\nof = "drain[0]"\nstart = 3.0\nend = 2.0\n', "must start at or after 0 s and end later"),
+        (HEAD + '[[fault]]\nof = "drain[0]"\nstart = 1.0\nend = 2.0\nfactor = -1.0\n', "fault 1: factor = -1: must be at least 0"),
+        (HEAD + "[disturbance]\ninflow = [1.0]\n", "disturbance.inflow = .1.0.: must be a list of 4 finite flows"),
+        (HEAD + "[disturbance]\ninflw = [1.0]\n", r"unknown key of \[disturbance\] 'inflw'; nearest: inflow"),
+        (HEAD + "[disturbance]\nwindow = 3.0\n", "there is none"),
+        (HEAD + "[reference.sine]\nperiod = 3.0\n", r"\[reference.sine\] needs amplitude"),
+        (HEAD + "[reference.sine]\namplitude = 1.0\nperiod = 0.0\noutput = 1\n", "reference.sine.period = 0 s: must be above 0"),
+        (HEAD + "[reference.sine]\namplitude = 1.0\nperiod = 3.0\noutput = 3\n", "from 1 to 2"),
+        (HEAD + '[observer]\nkind = "kalmn"\n', "unknown observer kind 'kalmn'; nearest: kalman"),
+        (HEAD + '[observer]\nkind = "kalman"\nprocess = 1.0\n', r"needs measurement \[cm\^2\]"),
+        (HEAD + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = 1.0\nmeasured = [0]\n', "counted from 1 to 4"),
+        (
+            HEAD + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = -1.0\n',
+            r"observer.measurement\[0\] = -1 cm\^2",
+        ),
+        (
+            HEAD + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = 1.0\nsubsteps = 2.5\n',
+            "substeps = 2.5: must be a whole",
+        ),
+        (
+            HEAD + '[law]\nkind = "backstepping"\nk = 1.0\nk1 = 1.0\nreference_rates = 3\n',
+            "reference_rates = 3: must be one of false, true",
+        ),
+        (HEAD + "reachable = 1\n", "reachable = 1: must be true or false"),
+        (TANK.replace("area = 20.0", "area = -20.0"), r"tank 1: area = -20 cm\^2: must be above 0 cm\^2"),
+        (TANK.replace("gain = 5.0", "gain = 0.0"), r"pump 1: gain = 0 cm\^3/\(s V\): must be above 0"),
+        (TANK.replace("drain = 1.0", "drian = 1.0"), r"unknown key of \[\[tank\]\] 'drian'; nearest: drain"),
+        (TANK.replace("level = 3.0", "level = nan"), "tank 1: level = nan"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_unit_and_range(text, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(text)
+
+
+def test_init_of_the_command(tmp_path, capsys):
+    def said(*args):
+        code = cli.main(["init", "gouta2015/backstepping", *args])
+        return code, capsys.readouterr().out
+
+    case = presets.find("gouta2015/backstepping")
+    assert said() == (0, rig.complete(case)) and said("--short") == (0, rig.short(case))
+    assert said("--tanks") == (0, rig.complete(case, tankwise=True))
+    assert cli.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
+    assert parameters(case.loop)
