@@ -41,7 +41,7 @@ ABOVE = [
     {"report"},
     {"manual", "sensitivity_report", "ensemble_report", "identify_report"},
     {"bench", "compare"},
-    {"arguments", "interrupts"},
+    {"arguments", "interrupts", "completion"},
     {"identify_command"},
     {"cli"},
 ]

@@ -202,7 +202,9 @@ def parser():
         help="a measure to look at (default: those of the objective, rms_error_total, max_level); repeatable",
     )
     identify_command.add(commands, [common, case, run])
-    init = commands.add_parser("init", parents=[common, case], help="print a complete rig file to edit: every key, its unit and range")
+    init = commands.add_parser(
+        "init", parents=[common, case], help="print a complete rig file to edit: every key, its unit and range"
+    )
     init.add_argument("--short", action="store_true", help="only what differs from the preset, and what is tuned")
     init.add_argument("--tanks", action="store_true", help="described tank by tank, without its preset")
     exported = commands.add_parser(
@@ -218,6 +220,10 @@ def parser():
     compare.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
     compare.add_argument("--out", metavar="DIR", help="folder for report.html, result.json and the rigs as pictures")
     compare.add_argument("--markdown", action="store_true", help="as the table of the README")
+    completed = commands.add_parser(
+        "completion", help="a script that completes commands, options, cases and parameters: bash, zsh or fish"
+    )
+    completed.add_argument("shell", metavar="SHELL", help='as in: eval "$(jaxtank completion bash)"')
     bench = commands.add_parser("bench", parents=[common], help="ns per closed-loop step here, beside a C loop")
     bench.add_argument("cases", nargs="*", metavar="CASE", help='cases to time instead, or "all"')
     bench.add_argument("--rounds", default="7", metavar="N", help="interleaved rounds to take the median of (default 7)")
@@ -722,6 +728,13 @@ def _bench(args):
     return 0
 
 
+def _completion(args):
+    from tuning import completion
+
+    print(completion.script(args.shell, parser()), end="")
+    return 0
+
+
 def _compare(args):
     _out(args)
     import jax
@@ -765,6 +778,7 @@ COMMANDS = {
     "uncertainty": _uncertainty,
     "merge": _merge,
     "compare": _compare,
+    "completion": _completion,
     "bench": _bench,
 }
 

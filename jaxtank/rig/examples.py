@@ -196,7 +196,7 @@ def sections(case, have):
         slots += [(f"pump{j + 1}", [f"u{j + 1}", units[1]]) for j in range(loop.plant.pumps)]
         slots += [(f"h{i + 1}", [f"level {i + 1}", units[0]]) for i in range(loop.plant.tanks)]
         rows = [Key(slot, value) for slot, value in slots]
-        prose = "Which column of a log is what, for jaxtank identify, where its header does not say so (h1 [cm], pump1_V, t [s]): [header, unit]."
+        prose = "Which column of a log is what, for jaxtank identify, where its header does not say so: [header, unit]."
         add("[log]", rows, prose, local_units=False)
     return found
 
