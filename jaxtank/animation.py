@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from jaxtank.errors import InputError
 from jaxtank.files import write_atomic
 from jaxtank.layout import place
-from jaxtank.plotting import PUMPS, STYLE, WATER
+from jaxtank.plotting import PUMPS, WATER, styled
 from jaxtank.schematic import HALO, depth, mark, mark_height, schematic
 
 RATE = 12
@@ -32,7 +32,7 @@ def animate(loop, trajectory, path, seconds=6):
     path = Path(path)
     if path.suffix.lower() != ".gif":
         raise InputError(f"animation {str(path)!r}: is written as a GIF; let its name end in .gif")
-    with tempfile.TemporaryDirectory() as folder, plt.rc_context(STYLE):
+    with tempfile.TemporaryDirectory() as folder, styled():
         film = _film(loop, trajectory, seconds)
         film.save(Path(folder) / "run.gif", writer=PillowWriter(fps=RATE), dpi=80)
         plt.close(film._fig)
@@ -45,7 +45,7 @@ def to_html(loop, trajectory, seconds=6):
 
     Everything is in it: no network is asked for fonts or scripts. Arguments and errors as in `animate`.
     """
-    with plt.rc_context(STYLE | {"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
+    with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
         film = _film(loop, trajectory, seconds)
         page = film.to_jshtml(fps=RATE)
         plt.close(film._fig)

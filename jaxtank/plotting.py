@@ -1,5 +1,6 @@
 """Pictures: one function each, drawn on given matplotlib axes and returning them. The only room here that imports matplotlib."""
 
+import contextlib
 import textwrap
 
 import matplotlib.pyplot as plt
@@ -34,6 +35,22 @@ STYLE = {
     "savefig.dpi": 130,
     "svg.fonttype": "none",
 }
+
+
+@contextlib.contextmanager
+def styled(more=None):
+    """STYLE, and `more` {setting: value} of matplotlib's, for what is drawn inside.
+
+    Afterwards these settings are as before, and only these: `plt.rc_context` puts all of them back. Where the first figure of a notebook is
+    drawn inside it, that takes back the interactive mode which the notebook's backend has just switched on, and no later figure is shown.
+    """
+    settings = STYLE | (more or {})
+    before = {name: plt.rcParams[name] for name in settings}
+    plt.rcParams.update(settings)
+    try:
+        yield
+    finally:
+        plt.rcParams.update(before)
 
 
 def plain(text):
@@ -111,7 +128,7 @@ def responses(loop, trajectories, title="", limits=None):
     rows = [row for row in rows if row]
     columns = max(len(row) for row in rows)
     width = max(4.6 * columns, 6.4)
-    with plt.rc_context(STYLE):
+    with styled():
         figure, axes = plt.subplots(
             len(rows), columns, figsize=(width, 2.05 * len(rows) + 0.5), sharex=True, squeeze=False, layout="constrained"
         )
@@ -253,7 +270,7 @@ def panels(draw, title, rows):
     """A figure with one panel for each function in `draw`, which is given the axes; `rows` bars in each; one legend for all."""
     columns = min(3, len(draw))
     lines = -(-len(draw) // columns)
-    with plt.rc_context(STYLE):
+    with styled():
         size = (4.3 * columns, (0.9 + 0.26 * rows) * lines + 0.7)
         figure, axes = plt.subplots(lines, columns, figsize=size, squeeze=False, layout="constrained")
         for one, ax in zip(draw, axes.flat):
@@ -292,7 +309,7 @@ def fan(loop, bands, title):
     bands: {"t" (rows,) [s], "r" (rows, outputs), "x" (5, rows, tanks)}: quantiles 5, 25, 50, 75, 95 %.
     """
     tanks, rims = loop.plant.tanks, np.asarray(loop.plant.rim)
-    with plt.rc_context(STYLE):
+    with styled():
         rows, columns = -(-tanks // 2), min(2, tanks)
         figure, axes = plt.subplots(rows, columns, figsize=(9.6, 2.7 * rows), sharex=True, layout="constrained", squeeze=False)
         for i, ax in enumerate(axes.ravel()[:tanks]):
@@ -361,7 +378,7 @@ def cloud(ax, pairs, held, name, unit, limit=None):
 
 def violations(rows, samples):
     """A figure of the probability that each limit is broken, with its 95 % interval. rows: as `Ensemble.violations` gives them."""
-    with plt.rc_context(STYLE):
+    with styled():
         figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
         y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
         ends = np.array([r["interval95"] for r in rows])

@@ -28,6 +28,23 @@ def columns(*values):
     return np.stack(values, axis=1)
 
 
+def test_a_style_takes_back_its_own_settings_and_no_others():
+    """A notebook's backend starts with the first figure and switches the interactive mode on; where that is inside, it must stay on."""
+    before = dict(plt.rcParams)
+    try:
+        with plotting.styled({"lines.linewidth": 7.0}):
+            assert plt.rcParams["figure.dpi"] == plotting.STYLE["figure.dpi"] != before["figure.dpi"]
+            assert plt.rcParams["lines.linewidth"] == 7.0
+            plt.rcParams["interactive"] = True
+        assert plt.rcParams["interactive"] is True
+        assert {**plt.rcParams, "interactive": before["interactive"]} == before
+        with pytest.raises(ValueError), plotting.styled():
+            raise ValueError
+        assert plt.rcParams["figure.dpi"] == before["figure.dpi"]
+    finally:
+        plt.rcParams.update({"interactive": before["interactive"]})
+
+
 def test_phase_is_one_level_over_the_other_with_both_rims(ax):
     t = np.linspace(0.0, 1.0, 1001)
     run = made(x=columns(t, t, 5 * t, 29 * t**2))

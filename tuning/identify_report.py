@@ -173,7 +173,7 @@ def figures(found):
     est, made = found.estimation, {}
     told = est.predicted(est.unknowns(found.fit))
     names = channel_names(found)
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         for e, one in enumerate(est.logs):
             count = len(names) + 1
             figure, axes = plt.subplots(count, 1, figsize=(7.0, 1.0 + 1.7 * count), sharex=True, layout="constrained")

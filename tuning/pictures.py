@@ -17,7 +17,7 @@ def rig(loop, run=None, title=""):
         return {}
     where = place(loop.plant)
     wide, high = where.right - where.left, where.top - where.bottom
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
         levels, setpoints = (None, None) if run is None or not np.all(np.isfinite(run.x[-1])) else (run.x[-1], run.r[-1])
@@ -40,7 +40,7 @@ def inner(loop, runs):
         return {}
     styles = [(plotting.AFTER, "-")] if len(runs) == 1 else [(plotting.BEFORE, "--"), (plotting.AFTER, "-")]
     drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure, ax = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
         run_plots.phase(ax, drawn, tanks[:2], np.asarray(loop.plant.rim), loop.units[0])
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
@@ -56,7 +56,7 @@ def saturation(loop, runs):
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         return {}
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure, ax = plt.subplots(figsize=(6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps), layout="constrained")
         run_plots.saturation(ax, runs, low, high)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
@@ -78,7 +78,7 @@ def estimates(loop, clock, run, title=""):
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
         known = np.stack([np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1) / np.asarray(loop.plant.area)
     rows = 2 if disturbed else 1
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure, axes = plt.subplots(
             rows, tanks, figsize=(max(6.4, 3.2 * tanks), 2.3 * rows + 0.5), sharex=True, squeeze=False, layout="constrained"
         )
@@ -104,7 +104,7 @@ def margins(rows):
 
     if not rows:
         return {}
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.42 * min(len(rows), run_plots.MANY)), layout="constrained")
         run_plots.margins(ax, rows)
     return {"margins": figure}
@@ -118,7 +118,7 @@ def tradeoff(found, unit, cost_unit):
 
     if not found:
         return {}
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         figure, ax = plt.subplots(figsize=(6.0, 3.6), layout="constrained")
         run_plots.tradeoff(ax, found["points"], found["measure"], unit, cost_unit)
     return {"tradeoff": figure}

@@ -423,7 +423,7 @@ def figures(result, runs=None):
             result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
         ),
     }
-    with plt.rc_context(plotting.STYLE):
+    with plotting.styled():
         if result.cloud is not None and len(result.cloud["objective"]):
             drawn["clouds"] = _clouds(plt, result, unit)
         if result.history:
