@@ -1,15 +1,23 @@
-"""`jaxtank show`: one case as a page of its manual."""
+"""`jaxtank show`: one case as the manual of it, 100 columns wide."""
 
 import dataclasses
+import inspect
+import textwrap
 
 import numpy as np
 
 from jaxtank import presets
+from jaxtank.equations import equations, physics
+from jaxtank.measures import MEASURES, TIMES
+from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free
-from jaxtank.records import CLOCK_UNITS
+from jaxtank.records import CLOCK
 from jaxtank.tree import walk
-from tuning import report
+from tuning import manual_parts, report
 from tuning.objective import LOWER
+
+WIDTH = 100
+BELIEFS = ("controller.model.", "controller.law.model.", "observer.model.")
 
 
 def noisy(case):
@@ -43,20 +51,16 @@ def json_of(case):
                 "static": kind == "static",
                 "about": meta["doc"],
             }
-    for name, unit in CLOCK_UNITS.items():
-        parameters[f"clock.{name}"] = {
-            "value": getattr(case.clock, name),
-            "unit": unit,
-            "low": None,
-            "high": None,
-            "static": True,
-            "about": "",
-        }
+    for name, meta in CLOCK.items():
+        value = getattr(case.clock, name)
+        more = {"low": None, "high": None, "static": True, "about": meta["doc"]}
+        parameters[f"clock.{name}"] = {"value": value, "unit": meta["unit"], **more}
     return {
         "case": case.name,
         "title": case.title,
         "citation": preset.citation if preset else None,
         "plant": type(case.loop.plant).__name__,
+        "equations": equations(case.loop.plant, case.loop.disturbance is not None),
         "law": _law(case.loop.controller),
         "observer": type(case.loop.observer).__name__,
         "parameters": parameters,
@@ -72,49 +76,153 @@ def json_of(case):
 
 def text(case):
     """The page of `jaxtank show`."""
-    page = json_of(case)
-    rows = []
-    for name, p in page["parameters"].items():
-        if name.startswith(("controller.model.", "controller.law.model.")):
-            continue
-        value = p["value"]
-        shown = _shown(value, p["static"])
-        rows.append(
-            [
-                name + ("*" if p["static"] else ""),
-                shown,
-                p["unit"],
-                f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else "",
-                p["about"],
-            ]
-        )
-    law = (type(case.loop.controller).__doc__ or "").strip().split("\n\n")[0]
-    parts = [
-        f"{page['case']}: {page['title']}",
-        page["citation"] or "",
-        "",
-        f"plant {page['plant']}, observer {page['observer']}, law {page['law']}: {' '.join(law.split())}",
-        "",
-        report.table(rows, ["parameter", "value", "unit", "tunable in", "what it is"]),
-        "",
-        "* part of the compiled program: --set and rig files reach it, derivatives do not.",
-        "controller.model.* is the law's own copy of the plant, with the same names; --set plant.* changes the rig and leaves the law's belief.",
-        "",
-        "limits of tune: "
-        + (", ".join(f"{m} at {'least' if m in LOWER else 'most'} {v}" for m, v in page["limits"].items()) or "none"),
-        "objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()),
+    page, preset, loop = json_of(case), _preset(case), case.loop
+    parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
+    outputs = ", ".join(f"h{i + 1}" for i in loop.plant.outputs)
+    parts += _chapter(f"The rig: {loop.plant.tanks} tanks, {loop.plant.pumps} pumps; controlled: {outputs}")
+    parts += [
+        line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
     ]
-    if page["published"]:
-        rows = [[n, v, where] for n, (v, where) in page["published"].items()]
-        parts += ["", report.table(rows, ["published", "value", "where"])]
+    parts += ["", *_sentences(physics(loop.plant))]
+    parts += _chapter("The loop")
+    parts += _sentences(
+        [*manual_parts.sensor(loop), *manual_parts.actuator(loop), *manual_parts.moved(loop), *manual_parts.sampled(case)]
+    )
+    parts += _chapter(f"The law: {page['law']}") + _docstring(getattr(loop.controller, "law", loop.controller))
+    if hasattr(loop.controller, "law"):
+        parts += ["", *_docstring(loop.controller)]
+    parts += _chapter(f"The observer: {page['observer']}") + _docstring(loop.observer)
+    parts += _chapter("What is tuned")
+    parts += [grid(_tuned(case, preset), ["parameter", "value", "published", "unit", "range", "what it is"], (26, 18, 12, 8, 14))]
+    limited = (f"{m} at {'least' if m in LOWER else 'most'} {v}" for m, v in page["limits"].items())
+    parts += ["", *textwrap.wrap("limits of tune: " + (", ".join(limited) or "none"), WIDTH)]
+    parts += textwrap.wrap("objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()), WIDTH)
+    if case.scenarios:
+        parts += textwrap.wrap("judged by: " + "; ".join(s.name for s in case.scenarios), WIDTH)
+    parts += _chapter("Every parameter")
+    parts += [grid(_every(page), ["parameter", "value", "unit", "tunable in", "what it is"], (30, 18, 11, 13)), ""]
+    parts += _sentences(
+        [
+            "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
+            "controller.model.* and observer.model.* are what law and observer believe of the plant, with the same names; --set plant.* changes "
+            "the rig and leaves the belief. `jaxtank init CASE` writes them all into a rig file.",
+        ]
+    )
+    parts += _chapter("What is measured") + [grid(_measures(case), ["measure", "unit", "of each", "what it is"], (22, 9, 8))]
+    if preset and preset.published:
+        parts += _chapter(f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)")
+        parts += [grid(_published(case, preset), ["published", "value", "here", "where"], (34, 22, 16))]
+    if preset and (preset.uncertain or case.uncertain):
+        parts += _chapter("What is uncertain")
+        parts += _sentences(f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in preset.uncertain.items())
     if page["departures"]:
-        parts += ["", "departures from the paper", *(f"- {d}" for d in page["departures"])]
+        parts += ["", "departures from the paper", *_sentences(page["departures"])]
     return "\n".join(parts)
+
+
+def grid(rows, head, widths):
+    """Rows as a table whose cells are wrapped: widths of all columns but the last, which has what is left of WIDTH."""
+    rows = [[str(c) for c in row] for row in rows]
+    widths = [min(w, max(len(row[i]) for row in [head, *rows])) for i, w in enumerate(widths)]
+    widths = [*widths, WIDTH - sum(widths) - 2 * len(widths)]
+    lines = ["  ".join(h.ljust(w) for h, w in zip(head, widths)).rstrip(), "-" * WIDTH]
+    for row in rows:
+        cells = [textwrap.wrap(cell, w) or [""] for cell, w in zip(row, widths)]
+        for i in range(max(map(len, cells))):
+            lines.append("  ".join((c[i] if i < len(c) else "").ljust(w) for c, w in zip(cells, widths)).rstrip())
+    return "\n".join(lines)
+
+
+def _chapter(title):
+    return ["", *textwrap.wrap(title, WIDTH), "=" * min(WIDTH, len(title))]
+
+
+def _sentences(found):
+    """Each sentence as an item, under the first line of which the others stand."""
+    return [line for sentence in found for line in _item(sentence)]
+
+
+def _item(sentence):
+    return textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False)
+
+
+def _docstring(part):
+    """The docstring of a component's class: prose wrapped anew, equations (indented lines) as they stand."""
+    lines, prose = [], []
+
+    def flush():
+        lines.extend(textwrap.wrap(" ".join(prose), WIDTH))
+        prose.clear()
+
+    for line in inspect.cleandoc(type(part).__doc__ or "").splitlines():
+        if not line.strip() or line.startswith("  "):
+            flush()
+            lines.extend(
+                [line.rstrip()]
+                if len(line) <= WIDTH
+                else textwrap.wrap(line.strip(), WIDTH, initial_indent="    ", subsequent_indent="        ")
+            )
+        else:
+            prose.append(line.strip())
+    flush()
+    return lines
 
 
 def _law(law):
     inner = getattr(law, "law", None)
     return type(law).__name__ + (f"({type(inner).__name__})" if inner is not None else "")
+
+
+def _tuned(case, preset):
+    """What the case tunes, then what else could be: value, published, unit, range, what it is."""
+    page, rows = json_of(case)["parameters"], []
+    ranges = {**case.free, **{n: f for n, f in (preset.tunable if preset else {}).items() if n not in case.free and n in page}}
+    for name, spec in ranges.items():
+        free, own = Free(*spec), page.get(name.split("[")[0])
+        if own is None or own["value"] is None:
+            continue
+        printed = preset.published.get(name) if preset else None
+        shown = "" if printed is None else _plain(printed.value)
+        words = "" if name in case.free else " (not by this case)"
+        rows.append([name, _shown(own["value"], False), shown, own["unit"], f"{free.low:g} : {free.high:g}", own["about"] + words])
+    return rows or [["none", "", "", "", "", ""]]
+
+
+def _every(page):
+    rows = []
+    for name, p in page["parameters"].items():
+        if name.startswith(BELIEFS) or (isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])):
+            continue  # topology is told by the equations, and a rig without pipes has none to set
+        span = f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else ""
+        rows.append([name + "*" * p["static"], _shown(p["value"], p["static"]), p["unit"], span, p["about"]])
+    return rows
+
+
+def _measures(case):
+    """The measures that a run of the case has."""
+    poured, stepped = hasattr(case.loop.disturbance, "since"), hasattr(case.loop.reference, "windows")
+    known = {
+        m: s for m, s in MEASURES.items() if m not in TIMES.values() and (poured or not s.pours) and (stepped or not s.windows)
+    }
+    return [[m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc] for m, s in known.items()]
+
+
+def _published(case, preset):
+    """What the paper prints, and beside it what this case has where it is a parameter."""
+    page, rows = json_of(case)["parameters"], []
+    for name, p in preset.published.items():
+        own = page.get(name)
+        here = _shown(own["value"], False) if own is not None and own["value"] is not None and not own["static"] else ""
+        here = here or ("" if own is None or own["value"] is None else str(own["value"]))
+        why = f"; {p.reason}" if p.reason else ""
+        rows.append([name, f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip(), here, p.where + why])
+    return rows
+
+
+def _plain(value):
+    if isinstance(value, (tuple, list)):
+        return " ".join(_plain(v) for v in value)
+    return report.number(value, 6) if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
 def _shown(value, is_static):
