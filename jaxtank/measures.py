@@ -450,7 +450,7 @@ def serves(name, loop):
     """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into, its steady inputs
     are known in closed form."""
     spec = MEASURES[name]
-    if spec.rests and (loop.plant.pipes or loop.plant.pumps != len(loop.plant.outputs)):
+    if spec.rests and (getattr(loop.plant, "pipes", None) != () or loop.plant.pumps != len(loop.plant.outputs)):
         return False
     return (not spec.windows or hasattr(loop.reference, "windows")) and (not spec.pours or hasattr(loop.disturbance, "since"))
 

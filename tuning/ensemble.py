@@ -32,6 +32,9 @@ NOISE = 1 << 27
 TAIL = 0.05
 """Share of the draws that the conditional value at risk is the mean of [-]."""
 
+RESTS = 1 << 14
+"""Draws whose steady states are looked for at once: a plateau takes some 100 bytes a draw."""
+
 FAN_DRAWS, FAN_ROWS = 512, 240
 """Draws and time stamps of a fan chart."""
 
@@ -342,10 +345,15 @@ def _share(count, most):
 def _infeasible(case, values):
     """(N,) True where a plateau of the reference has no steady state within rims and pumps; None where the plant has no closed form."""
     plant = case.loop.plant
-    if plant.pipes or plant.pumps != len(plant.outputs) or not hasattr(case.loop.reference, "plateaus"):
+    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs) or not hasattr(case.loop.reference, "plateaus"):
         return None
     plateaus = jnp.asarray(np.array(case.loop.reference.plateaus(case.clock.duration)))
-    return np.asarray(_no_rest(case.loop, values, plateaus))
+    count = len(next(iter(values.values())))
+    size, found = min(count, RESTS), []
+    for start in range(0, count, size):  # the last draw repeated past the end, so that every block is of one size
+        index = np.minimum(np.arange(start, start + size), count - 1)
+        found.append(np.asarray(_no_rest(case.loop, {n: v[index] for n, v in values.items()}, plateaus)))
+    return np.concatenate(found)[:count]
 
 
 @jax.jit

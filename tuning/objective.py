@@ -75,13 +75,11 @@ class Limit(NamedTuple):
 def room_of(limit, loop):
     """The size by which a limit's margin counts: the limit's own, but no less than a thousandth of what its measure is about (the tanks' height
     or volume, 1 for a share, 100 for percent), which matters where a limit is 0 or nearly."""
-    length, plant = loop.units[0], loop.plant
-    own = {
-        length: float(np.max(np.asarray(plant.rim))),
-        f"{length}^3": float(np.max(np.asarray(plant.rim) * np.asarray(plant.area))),
-        "%": 100.0,
-        "-": 1.0,
-    }.get(ms.unit(limit.measure, loop.units))
+    length, rim = loop.units[0], np.asarray(loop.plant.rim)
+    area = np.asarray(loop.plant.area) if loop.plant.overflow else 1.0  # no other plant spills, and some have no area to name
+    own = {length: float(np.max(rim)), f"{length}^3": float(np.max(rim * area)), "%": 100.0, "-": 1.0}.get(
+        ms.unit(limit.measure, loop.units)
+    )
     return max(abs(limit.value), NOTHING * own) if own is not None else abs(limit.value) or 1.0
 
 

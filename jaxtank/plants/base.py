@@ -2,9 +2,21 @@
 
 import abc
 
+from jaxtank.units import DEFAULT
+
 
 class Plant(abc.ABC):
-    """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of scalars."""
+    """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of scalars.
+
+    Beside what follows a plant has two fields: `outputs`, the tanks (counted from 0) whose levels are controlled, and `rim`, (n,) the height
+    of each tank [cm]. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
+    """
+
+    units = DEFAULT
+    """(length, pump input): the units that this plant counts in."""
+
+    overflow = False
+    """True where a level stops at its rim and what would rise past it is lost."""
 
     @property
     @abc.abstractmethod
@@ -20,9 +32,9 @@ class Plant(abc.ABC):
     def derivative(self, t, x, u, d):
         """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or None; returns (n) [cm/s]."""
 
-    @abc.abstractmethod
     def spill(self, x):
         """(levels held at their rims, volume lost over each rim [cm^3]); unchanged and zeros where rims are not physics."""
+        return x, (0.0,) * len(x)
 
     def output(self, x):
         """The levels that are controlled: those of the tanks in `outputs`, in that order."""
