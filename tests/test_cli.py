@@ -19,7 +19,7 @@ import tuning
 from jaxtank import measures, presets, rig
 from jaxtank.records import Clock
 from jaxtank.tree import parameters
-from tuning import cli
+from tuning import cli, tune_command
 
 CASE = "gouta2015/backstepping"
 SHORT = ("--set", "clock.duration=200", "--dt", "0.1")
@@ -437,12 +437,12 @@ def test_too_few_iterations_end_with_3():
 
 
 def test_an_interrupted_search_ends_with_130_and_its_best_point_is_written(here, monkeypatch):
-    class Impatient(cli.Progress):
+    class Impatient(tune_command.Progress):
         def __call__(self, event):
             if event["evaluations"] == 3:
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "Progress", Impatient)
+    monkeypatch.setattr(tune_command, "Progress", Impatient)
     said = say("tune", "gouta2015/ngpc", *SHORT, *SEARCH, "--json", "--out", "out")
     assert said.code == 130
     found = said.json

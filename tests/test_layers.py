@@ -43,7 +43,10 @@ ABOVE = [
     {"manual", "sensitivity_report", "ensemble_report", "identify_report"},
     {"bench", "compare"},
     {"arguments", "interrupts", "completion"},
-    {"identify_command"},
+    {"options"},
+    {"identify_command", "tune_command", "batch_commands"},
+    {"parser"},
+    {"case_commands"},
     {"cli"},
 ]
 RANK = {f"jaxtank.{room}": i for i, layer in enumerate(LAYERS) for room in layer}

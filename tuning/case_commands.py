@@ -1,0 +1,156 @@
+"""`jaxtank list`, `show`, `init`, `export`, `simulate`, `compare`, `bench`, `completion`: a case as it is."""
+
+import sys
+
+from jaxtank.errors import InputError
+from tuning.arguments import check_out, open_case, whole
+from tuning.arguments import seed as seed_of
+from tuning.options import tell_written
+
+
+def list_cases(args):
+    from jaxtank import presets
+    from tuning import report
+
+    cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
+    print(report.dumps(cases) if args.json else report.table([[n, t] for n, t in cases.items()], ["case", ""]))
+    return 0
+
+
+def show(args):
+    check_out(args)
+    case = open_case(args)
+    from tuning import manual, report
+
+    written = []
+    if args.out:
+        from pathlib import Path
+
+        from tuning import page, pictures
+
+        drawn = pictures.rig(case.loop, None, case.name)
+        alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
+        written = report.write_files(Path(args.out), alone | report.pngs(drawn))
+    print(report.dumps(manual.json_of(case)) if args.json else manual.text(case))
+    tell_written(written, args)
+    return 0
+
+
+def init(args):
+    if args.short and args.tanks:
+        raise InputError("--short and --tanks: the short file names its preset; give one of the two")
+    case = open_case(args)
+    from jaxtank import rig
+    from tuning import report
+
+    text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
+    print(report.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
+    return 0
+
+
+def export_law(args):
+    check_out(args)
+    case = open_case(args)
+    from pathlib import Path
+
+    from jaxtank.export import export
+    from tuning import report
+
+    text = export(case, args.lang, args.precision, args.name)
+    name = args.name or case.name.replace("/", "_").replace("-", "_").replace(" ", "_")
+    if args.json:
+        print(report.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
+    if args.out:
+        tell_written(report.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
+    elif not args.json:
+        print(text, end="")
+    return 0
+
+
+def simulate(args):
+    check_out(args)
+    if args.gif and not args.out:
+        raise InputError("--gif needs --out DIR, where run.gif is written")
+    seed, case = seed_of(args), open_case(args)
+    import jax
+
+    from jaxtank import loop
+    from jaxtank import measures as ms
+    from tuning import manual, report, search
+
+    key = jax.random.key(seed) if manual.noisy(case) else None
+    values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
+    payload = {
+        "case": case.name,
+        "measures": report.measures_json(values),
+        "units": report.units(case.loop.units),
+        "reasons": report.reasons(values),
+        "clock": manual.clock(case.clock),
+        "parameters": report.clean(loop.parameters(case.loop)),
+        "provenance": search.provenance(case, seed),
+    }
+    written = report.save_run(case, report.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
+    if args.json:
+        print(report.dumps(payload))
+    else:
+        print(f"{case.name}: {case.title}\n")
+        rows = [
+            [m, ms.unit(m, case.loop.units), report.numbers(values[m]), s.doc]
+            for m, s in ms.MEASURES.items()
+            if m in values and m not in ms.TIMES.values()
+        ]
+        print(report.table(rows, ["measure", "unit", "value", ""]))
+    tell_written(written, args)
+    return 0
+
+
+def compare(args):
+    check_out(args)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxtank import presets
+    from tuning import compare, report
+
+    papers = presets.PAPERS if args.paper == "all" else (args.paper,)
+    for paper in papers:
+        presets.load(paper)  # an unknown one is told before anything runs
+    found = {}
+    for paper in papers:
+        if not args.quiet:
+            print(f"running {paper}", file=sys.stderr, flush=True)
+        found[paper] = compare.measure(paper)
+    written = compare.save(found, args.out, args.line) if args.out else []
+    if args.json:
+        print(report.dumps(found if args.paper == "all" else found[args.paper]))
+    else:
+        print(compare.markdown(found) if args.markdown else "\n\n".join(compare.text(page) for page in found.values()))
+    tell_written(written, args)
+    return 0
+
+
+def bench(args):
+    rounds = whole("--rounds", args.rounds, 1, 1000)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from tuning import bench, report
+
+    if args.cases:
+        from jaxtank import presets, rig
+
+        names = presets.names() if args.cases == ["all"] else args.cases
+        result = bench.measure_cases({name: rig.open_case(name) for name in names}, rounds)
+        print(report.dumps(result) if args.json else bench.text_of_cases(result))
+        return 0
+    result = bench.measure(rounds)
+    print(report.dumps(result) if args.json else bench.text(result))
+    return 0
+
+
+def completion(args):
+    from tuning import completion
+    from tuning.parser import parser
+
+    print(completion.script(args.shell, parser()), end="")
+    return 0

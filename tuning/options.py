@@ -1,0 +1,128 @@
+"""What the options that several commands share mean, and what every command says of the files it wrote."""
+
+import sys
+
+from jaxtank.errors import InputError
+from tuning.arguments import number, pair, parse_value, plain_number, whole
+
+
+def limits_of(args, case):
+    limits, given = dict(case.limits), [text.partition("=")[0].strip() for text in args.limit]
+    for name in given:
+        if given.count(name) > 1:
+            raise InputError(f"--limit {name} is given {given.count(name)} times: give it once (several tanks: {name}=30,28)")
+    for text in args.limit:
+        if text == "none":
+            limits = {}
+            continue
+        measure, value = pair("--limit", text, parse_value)
+        from jaxtank.measures import check_names
+
+        check_names([measure])
+        if value == "none":
+            limits.pop(measure, None)
+        else:
+            limits[measure] = value
+    return limits
+
+
+def once(option, pairs):
+    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is given twice."""
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{option} {name} is given {names.count(name)} times: give it once")
+    return dict(pairs) or None
+
+
+def scenarios_of(args):
+    from jaxtank.presets import Scenario
+
+    if not args.scenario:
+        return None
+    if args.scenario == ["none"]:
+        return ()
+    found = []
+    for i, text in enumerate(args.scenario):
+        values = dict(pair("--scenario", part, parse_value) for part in text.split(";") if part.strip())
+        seed = values.pop("seed", i)
+        weight = values.pop("weight", 1.0)
+        found.append(Scenario(values.pop("name", text), values, seed, weight))
+    return tuple(found)
+
+
+def choices_of(args):
+    found = {}
+    for text in args.choose:
+        name, values = pair("--choose", text, lambda v: [parse_value(p.strip()) for p in v.split(",") if p.strip()])
+        found[name] = values
+    return found or None
+
+
+def tradeoff_of(args):
+    """(measure, values) of --tradeoff."""
+    if args.tradeoff is None:
+        return None
+    measure, text = pair("--tradeoff", args.tradeoff, str)
+    parts = text.split(":")
+    try:
+        low, high = (float(plain_number(p)) for p in parts[:2])
+        count = int(parts[2]) if len(parts) > 2 else 6
+        good = len(parts) <= 3 and low < high and 2 <= count <= 50
+    except ValueError:
+        good = False
+    if not good:
+        raise InputError(
+            f"--tradeoff {args.tradeoff!r}: must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW below HIGH, N from 2 to 50"
+        )
+    from jaxtank.measures import check_names
+
+    check_names([measure])
+    return measure, [low + (high - low) * i / (count - 1) for i in range(count)]
+
+
+def distributions_of(args, case):
+    """What varies, by --vary or --spread; None for the case's own."""
+    from tuning.ensemble import spread_of
+
+    if args.vary and args.spread is not None:
+        raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
+    if args.vary:
+        varied = [_pair_of(text, case) for text in args.vary]
+        if len({name for name, _ in varied}) < len(varied):
+            raise InputError("--vary: a parameter is given twice")
+        return dict(varied)
+    if args.spread is None:
+        return None
+    share = number("--spread", args.spread)
+    if not 0 < share < 1:
+        raise InputError(f"--spread {args.spread!r}: must be a share between 0 and 1")
+    return spread_of(case, share)
+
+
+def _pair_of(text, case):
+    """(name, distribution) of one --vary, if every draw of it is a value that the case may have."""
+    from tuning.distributions import Draws, parse
+
+    name, value = pair("--vary", text, str)
+    try:
+        found = parse(name, value)
+        Draws(case.loop, {name: found})
+    except InputError as error:
+        raise InputError(f"--vary {text}: {error}") from None
+    return name, found
+
+
+def devices_of(args):
+    """The number of --devices, which jax is told before it starts."""
+    devices = whole("--devices", args.devices, 1, 1024)
+    if devices > 1:
+        import jax
+
+        jax.config.update("jax_num_cpu_devices", devices)
+    return devices
+
+
+def tell_written(paths, args):
+    if paths and not args.quiet:
+        print(f"written to {args.out}: " + ", ".join(p.name for p in paths), file=sys.stderr)

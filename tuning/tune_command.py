@@ -1,0 +1,114 @@
+"""`jaxtank tune`."""
+
+import functools
+import sys
+
+from jaxtank.errors import InputError
+from tuning.arguments import check_out, number, open_case, pair, span, whole
+from tuning.arguments import seed as seed_of
+from tuning.interrupts import Interrupts, put_back
+from tuning.options import choices_of, distributions_of, limits_of, once, scenarios_of, tell_written, tradeoff_of
+
+EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
+
+
+def tune(args):
+    """`_tune`, with the handler of SIGINT put back afterwards."""
+    with put_back():
+        return _tune(args)
+
+
+def _tune(args):
+    check_out(args)
+    seed, case = seed_of(args), open_case(args)
+    from jaxtank.rig import check_objective
+    from tuning import report, search
+
+    free = once("--free", [pair("--free", text, span) for text in args.free])
+    objective = once("--objective", [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective])
+    if objective:
+        objective = check_objective(objective)
+    limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
+    if args.resume and args.out and args.resume != args.out:
+        raise InputError("--resume and --out name different folders: a run is continued in its own")
+    if args.resume is not None and not args.resume.strip():
+        raise InputError("--resume '': must name a folder")
+    folder = args.resume or args.out
+    choices, varied = choices_of(args), distributions_of(args, case)
+    only = (args.samples, args.fresh, args.back_off)
+    if (varied is not None or any(v is not None for v in only)) and args.robust is None:
+        raise InputError("--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust")
+    finder, more = search.tune, {"choices": choices}
+    if args.robust is not None:
+        from tuning.robust import tune_robust
+
+        if choices or args.scenario:
+            raise InputError("--robust makes scenarios of its own: no --scenario, no --choose beside it")
+        finder = functools.partial(
+            tune_robust,
+            distributions=varied,
+            risk=args.robust,
+            samples=whole("--samples", args.samples or "64", 2, 100_000),
+            fresh=whole("--fresh", args.fresh or "1024", 1, 100_000),
+            back_off=number("--back-off", args.back_off or "0"),
+        )
+        scenarios, more = None, {}
+    result = finder(
+        case,
+        method=args.method,
+        free=free,
+        objective=objective,
+        limits=limits,
+        **({} if args.robust else {"scenarios": scenarios}),
+        **more,
+        batch=None if args.batch is None else whole("--batch", args.batch, 1, 100_000),
+        validation=whole("--validation", args.validation, 0, 100_000),
+        log=folder,
+        resume=args.resume is not None,
+        starts=whole("--starts", args.starts, 1, 1000),
+        seed=seed,
+        screening=whole("--screening", args.screening, 1, 65536),
+        iterations=whole("--iterations", args.iterations, 1, 100_000),
+        progress=Progress(report.objective_unit(objective or case.objective, case.loop.units), args.quiet),
+    )
+    if not args.quiet and sys.stderr.isatty():
+        print(file=sys.stderr)
+    if sweep and result.status != "interrupted":
+        from tuning.tradeoff import tradeoff
+
+        answer = {n: p["after"] for n, p in result.parameters.items()}
+        options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}
+        result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, **options))
+    if args.bound and result.status != "interrupted":
+        from tuning.bound import bound
+
+        result = result.replace(bound=bound(result.tuned, objective, limits))
+    written = result.save(folder, args.line) if folder else []
+    args.out = folder
+    if folder and result.status != "interrupted":
+        from tuning.memo import discard
+
+        discard(folder)  # the result is whole: there is nothing left to go on with
+    print(report.dumps(report.json_of(result)) if args.json else report.text(result))
+    tell_written(written, args)
+    if not args.out and not args.json and not args.quiet:
+        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
+    return EXIT[result.status]
+
+
+class Progress(Interrupts):
+    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations."""
+
+    def __init__(self, unit, quiet):
+        super().__init__()
+        self.unit, self.quiet, self.last, self.terminal = unit, quiet, None, sys.stderr.isatty()
+
+    def __call__(self, event):
+        self.check()
+        if self.quiet or (not self.terminal and event["start"] == self.last):
+            return
+        self.last = event["start"]
+        breaks = " (breaks a limit)" if event["best_violation"] else ""
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}{breaks}"
+        line = f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation {event['evaluations']}  best {best}"
+        print(f"\r{line:<70}" if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
