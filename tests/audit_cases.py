@@ -1,0 +1,107 @@
+"""Every case of `jaxtank list` as a subject of the audit: a short run from levels of every kind, by every leaf of the loop at once."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from audit_subjects import scales_of
+from gradient_audit import Subject
+from jax.flatten_util import ravel_pytree
+
+from jaxtank import loop as lp
+from jaxtank import presets, rig
+from jaxtank.signals import Ramps
+
+MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")
+SAMPLES = 60
+POINTS = 8
+STARTS = ("near", "far", "dry", "empty", "equal", "full", "over", "far")
+ROUGH = {}
+"""{case: (tolerance, why)} where differences, or the run, are good to less."""
+
+
+def start(kind, rng, loop):
+    """(n,) levels at t = 0 of a kind."""
+    plant = loop.plant
+    rim, x0 = np.asarray(plant.rim, dtype=float), np.asarray(loop.x0, dtype=float)
+    x = {
+        "near": np.clip(x0 * rng.uniform(0.8, 1.2, x0.size), 0.05 * rim, 0.9 * rim),
+        "far": rim * rng.uniform(0.1, 0.9, x0.size),
+        "dry": rim * rng.uniform(0.1, 0.9, x0.size),
+        "empty": np.zeros(x0.size),
+        "equal": rim * rng.uniform(0.2, 0.8),
+        "full": rim * rng.uniform(0.97, 1.0, x0.size),
+        "over": rim * rng.uniform(1.01, 1.05, x0.size),
+    }[kind] * np.ones(x0.size)
+    if kind == "dry":
+        x[rng.integers(x0.size)] = rng.uniform(0, 0.9) * plant.knee
+    return x
+
+
+def short(name):
+    """The case with a run of SAMPLES: changes of the setpoint come at once, for there is no time to wait for them."""
+    case = presets.find(name)
+    dt = max(case.clock.dt, 0.05)  # 60 samples of 0.01 s are too short for the levels to move
+    changes = {"clock.dt": dt, "clock.duration": (SAMPLES - 1) * dt}
+    reference = case.loop.reference
+    if isinstance(reference, Ramps):
+        soon = tuple((10.0 * dt, i) for _, i in reference.changes[:2])
+        reference = dataclasses.replace(reference, changes=soon, targets=np.asarray(reference.targets)[:2], ramp=20.0 * dt)
+        case = case.replace(loop=dataclasses.replace(case.loop, reference=reference))
+    return rig.set_values(case, changes)
+
+
+def points_of(loop, rng):
+    """(points, scales) of one case, POINTS of each."""
+    points, scales = [], []
+    for kind in STARTS[:POINTS]:
+        here = jax.tree.map(lambda a: np.asarray(a, dtype=float) * (1.0 + 0.02 * rng.standard_normal(np.shape(a))), loop)
+        here = dataclasses.replace(here, x0=start(kind, rng, loop))
+        points.append(np.asarray(ravel_pytree(here)[0]))
+        scales.append(scales_of(dataclasses.replace(here, x0=np.maximum(here.x0, 0.01 * np.asarray(loop.plant.rim)))))
+    return points, scales
+
+
+def subject(names, seed=0):
+    """The Subject of cases that differ in their numbers alone: one program, points of each."""
+    cases, rng = [short(name) for name in names], np.random.default_rng(seed)
+    loop, clock = cases[0].loop, cases[0].clock
+    points, scales = (np.concatenate(column) for column in zip(*(points_of(case.loop, rng) for case in cases)))
+    unravel = ravel_pytree(jax.tree.map(lambda a: np.asarray(a, dtype=float), loop))[1]
+
+    def value(run, theta):
+        found = run(unravel(theta), clock, MEASURES)
+        found = found[0] if isinstance(found, tuple) else found
+        return jnp.concatenate([jnp.ravel(found[m]) for m in MEASURES])
+
+    tolerance, why = ROUGH.get(names[0], (1e-5, "runs of 60 samples amplify rounding"))
+    return Subject(
+        label(names),
+        functools.partial(value, lp.evaluate_and_flag),
+        points,
+        scales,
+        directions=6,
+        tolerance=tolerance,
+        why=why,
+        backwards=functools.partial(value, lp.evaluate_for_reverse),
+    )
+
+
+def label(names):
+    return f"case {names[0]}" + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+
+
+def groups():
+    """Names of cases, those together whose short runs are one program."""
+    found = {}
+    for paper in presets.PAPERS:
+        for name in presets.load(paper).cases:
+            case = short(f"{paper}/{name}")
+            sizes = tuple(np.shape(a) for a in jax.tree.leaves(case.loop))
+            found.setdefault((paper, jax.tree.structure(case.loop), sizes, case.clock), []).append(f"{paper}/{name}")
+    return list(found.values())
+
+
+SUBJECTS = {label(names): functools.partial(subject, names) for names in groups()}
