@@ -30,7 +30,7 @@ def start(kind, rng, loop):
         "near": np.clip(x0 * rng.uniform(0.8, 1.2, x0.size), 0.05 * rim, 0.9 * rim),
         "far": rim * rng.uniform(0.1, 0.9, x0.size),
         "dry": rim * rng.uniform(0.1, 0.9, x0.size),
-        "empty": np.zeros(x0.size),
+        "empty": plant.knee * rng.uniform(0.1, 1.5, x0.size),  # not at 0, where a law may have a kink
         "equal": rim * rng.uniform(0.2, 0.8),
         "full": rim * rng.uniform(0.97, 1.0, x0.size),
         "over": rim * rng.uniform(1.01, 1.05, x0.size),
