@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtank import measures as ms
 from jaxtank.dependence import reached
 from jaxtank.invariants import scan
+from jaxtank.materialise import materialised
 from jaxtank.stepping import initial, inputs, is_broken, run_of, step
 from jaxtank.tree import with_values
 
@@ -17,9 +18,11 @@ OUTER = 12
 anew for each entry (20 parameters, one run: 62 of 80 ms, with the product 5 of 23; 8 parameters, 7 lanes: 11 against 53 ms)."""
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "order", "squares"))  # a dict would come back with its keys sorted
-def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),)):
-    """What `loop.sensitivities` returns, unchecked."""
+@functools.partial(
+    jax.jit, static_argnames=("clock", "names", "order", "squares", "lanes")
+)  # a dict would come back with its keys sorted
+def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),), lanes=False):
+    """What `loop.sensitivities` returns, unchecked. `lanes`: this will be one of several runs side by side."""
     flat, unflatten = ravel_pytree(values)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
 
@@ -31,6 +34,13 @@ def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_squar
     def pushed(f, point, *tangents):
         """(f(point), tangents of f with the P directions as the last axis)."""
         return jax.vmap(lambda *t: jax.jvp(f, point, t, has_aux=True), in_axes=-1, out_axes=(None, -1, None))(*tangents)
+
+    def pushed_apart(f, point, *tangents):
+        """`pushed`, where what the tangents are multiplied by is made once and kept. For many lanes: alone, fetching costs more."""
+        value, linear, rest = jax.linearize(f, *point, has_aux=True)
+        linear, slopes = jax.closure_convert(linear, *point)
+        slopes = materialised(slopes)
+        return value, jax.vmap(lambda *t: linear(*t, *slopes), in_axes=-1, out_axes=-1)(*tangents), rest
 
     carried, structure = jax.tree.flatten(jax.eval_shape(lambda: (initial(loop, clock), ms.start(run_of(loop, clock), kept))))
     moves = tuple(jnp.issubdtype(v.dtype, jnp.floating) for v in carried)  # only floats have derivatives
@@ -73,7 +83,10 @@ def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_squar
             floats, others = split((state, ms.update(run, acc, sample, now.window, now.since, now.rest)))
             return (floats, errors), others
 
-        (floats, _), (dfloats, derrors), rest = pushed(advance, (floats, flat, felt), dfloats, basis, dfelt)
+        if lanes:
+            (floats, _), (dfloats, derrors), rest = pushed_apart(advance, (floats, flat, felt), dfloats, basis, dfelt)
+        else:
+            (floats, _), (dfloats, derrors), rest = pushed(advance, (floats, flat, felt), dfloats, basis, dfelt)
         if flat.size > OUTER:
             rows = jnp.stack(derrors)
             gauss_newton = gauss_newton + (rows.T * jnp.asarray(weights, rows.dtype)) @ rows

@@ -61,7 +61,8 @@ def _run(eqns, values, same):
     for eqn in eqns:
         bound = eqn.primitive.get_bind_params(eqn.params)
         functions, params = bound if isinstance(bound, tuple) else ((), bound)  # a pair in older releases of jax
-        out = eqn.primitive.bind(*functions, *(_read(v, values, same) for v in eqn.invars), **params)
+        with eqn.ctx.manager:  # what `materialised` says of a call
+            out = eqn.primitive.bind(*functions, *(_read(v, values, same) for v in eqn.invars), **params)
         values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out]))
 
 

@@ -34,7 +34,14 @@ CLOCK = {  # what each field is, as metadata of a component's fields
     "dt": {"unit": "s", "doc": "sampling period of the law (Ts)", "low": 0.0, "high": None, "strict": True, "choices": None},
     "duration": {"unit": "s", "doc": "length of the run", "low": 0.0, "high": None, "strict": True, "choices": None},
     "substeps": {"unit": "-", "doc": "integrator steps per sample", "low": 1, "high": 10, "strict": False, "choices": None},
-    "integrator": {"unit": "-", "doc": "fourth order, or second", "low": None, "high": None, "strict": False, "choices": INTEGRATORS},
+    "integrator": {
+        "unit": "-",
+        "doc": "fourth order, or second",
+        "low": None,
+        "high": None,
+        "strict": False,
+        "choices": INTEGRATORS,
+    },
 }
 CLOCK_UNITS = {name: meta["unit"] for name, meta in CLOCK.items()}
 LARGEST_RUN = 100_000_000  # samples

@@ -65,7 +65,11 @@ def check_not_scheduled(loop, name):
 def names_of(loop, name):
     """Where `name`, as the law has it without a schedule, is found in `loop`: at every knot of a scheduled gain, else under its new name."""
     law, inner = loop.controller, name.removeprefix(LAW)
-    if not isinstance(law, Scheduled) or not name.startswith(LAW) or inner.split("[")[0].split(".")[0] in ("law", "values", "knots"):
+    if (
+        not isinstance(law, Scheduled)
+        or not name.startswith(LAW)
+        or inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
+    ):
         return [name]
     rows = [i for i, gain in enumerate(law.gains) if gain == inner or gain.split("[")[0] == inner]
     if rows:

@@ -13,6 +13,7 @@ from jaxtank.actuators import PumpBank
 from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
+from jaxtank.materialise import materialised
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
@@ -136,7 +137,7 @@ def step(loop, clock, state, now):
     controller = loop.controller.track(controller, tick, command, applied)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, spilled = _advance(plant, clock, t, state.x, loop.actuator.driving(u), now.d)
+    x, spilled = _advance(plant, clock, t, state.x, materialised(loop.actuator.driving(u)), now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
         t=t,

@@ -1,6 +1,7 @@
 """The structural causes of speed, and that no transformation changes a result."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import pytest
 import jaxtank
 from jaxtank import _xla, invariants
 from jaxtank.loop import _evaluate, _sensitivities, evaluate_for_reverse
+from jaxtank.materialise import materialised
 from jaxtank.records import Clock
 
 MEASURES = ("rms_error_total", "max_level")
@@ -217,3 +219,40 @@ def test_float32_runs_and_says_that_it_is_wrong():
     out, err = python(code)
     assert out == "float32"
     assert "float32" in err and "jax_enable_x64" in err
+
+
+def operations_in_lanes(program, lanes):
+    """Arithmetic on all lanes in the fused parts of a compiled program's largest loop body, and how many calls wall them off."""
+    text = program.as_text()
+    parts = {piece.split()[0]: piece for piece in text.split("\n\n") if piece.startswith("%")}
+    body = max((parts[name] for name in re.findall(r"body=(%[\w.-]+)", text)), key=len)
+    fused = [parts[name] for name in re.findall(r"calls=(%[\w.-]+)", body)]
+    done = re.findall(rf"= f64\[{lanes}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused))
+    return len(done), sum(" call(" in line and 'inlineable="false"' in line for line in body.splitlines())
+
+
+def test_what_several_read_is_made_once(gouta):
+    """Without the walls the parts of this loop repeat most of the step: about 1000 operations on every lane instead of 550."""
+    case = gouta("backstepping", {"clock.duration": 2.0})
+    gains = {"controller.k": np.full(64, 0.03), "plant.drain": np.tile(case.loop.plant.drain, (64, 1))}
+    run = jax.vmap(lambda v: _evaluate(jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False))
+    count, walls = operations_in_lanes(jax.jit(run).lower(gains).compile(), 64)
+    assert walls == 4  # the voltages, and the rates of three Runge-Kutta stages
+    assert 250 < count < 650
+
+
+def test_materialised_values_pass_every_transformation():
+    f = lambda x: materialised({"a": jnp.sin(x), "b": (x * x,)})
+    g = lambda x: f(x)["a"] * f(x)["b"][0]
+    x = 0.7
+    slope = np.cos(x) * x * x + 2 * x * np.sin(x)
+    assert jax.jit(g)(x) == pytest.approx(np.sin(x) * x * x, rel=1e-15)
+    looped = lambda y: jax.lax.scan(lambda c, _: (g(c), None), y, None, 1)[0]
+    for found in (
+        jax.grad(g)(x),
+        jax.jacfwd(g)(x),
+        jax.vmap(jax.grad(g))(jnp.array([x]))[0],
+        jax.grad(looped)(x),
+        jax.jacfwd(looped)(x),
+    ):
+        assert found == pytest.approx(slope, rel=1e-14)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank import _xla, rig
 from jaxtank import loop as lp
-from jaxtank import rig
 from jaxtank.derivatives import _sensitivities
 from jaxtank.errors import InputError
 from jaxtank.presets.base import Scenario
@@ -155,7 +155,7 @@ def _mapped(function, leaves, keys, shape):
     )(leaves, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names"))
+@functools.partial(jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=_xla.WIDE)
 def _values(leaves, keys, shape, clock, names, points):
     def at(values):
         return _mapped(lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key), leaves, keys, shape)
@@ -163,9 +163,10 @@ def _values(leaves, keys, shape, clock, names, points):
     return jax.vmap(at)(points)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"))
+@functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"), compiler_options=_xla.WIDE)
 def _slopes(leaves, keys, shape, clock, names, order, values, squares):
-    return _mapped(lambda loop, key: _sensitivities(loop, clock, names, order, values, key, squares), leaves, keys, shape)
+    several = shape[-1] > 1
+    return _mapped(lambda loop, key: _sensitivities(loop, clock, names, order, values, key, squares, several), leaves, keys, shape)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order"))
