@@ -1,0 +1,250 @@
+"""How far this machine's runs are from a C loop, what derivatives cost beside the run, and what a first use waits for.
+
+    python tests/benchmarks/speed.py [rounds] [--markdown]
+
+Within a block every line is measured in turn, round by round, in one process: medians of core time, and of the ratio to its rival in the
+same round, with the range. Compilation is apart. "at most" is what we set out to reach (see the notes under the table in README).
+Nothing is asserted: machines differ. The structural causes are pinned in tests/test_compiled_loop.py.
+"""
+
+import dataclasses
+import re
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import ensemble
+import jax
+import numpy as np
+
+from jaxtank import _xla, loop, presets
+from jaxtank.derivatives import _sensitivities
+from jaxtank.files import write_atomic
+from jaxtank.tree import with_values
+from tuning import bench, report
+from tuning.manual import noisy
+
+README = Path(__file__).parents[2] / "README.md"
+BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"
+HEADS = ["what", "measured", "ratio (range)", "to", "at most"]
+NAMES = bench.MEASURES
+COST = ("rms_error_total",)
+LANES = 16
+
+
+def timed(calls, rounds):
+    """{name: [core time of each round, s]}: every call once a round, in turn, after one that compiles."""
+    for call in calls.values():
+        jax.block_until_ready(call())
+    seconds = {name: [] for name in calls}
+    for _ in range(rounds):
+        for name, call in calls.items():
+            began = time.process_time()
+            jax.block_until_ready(call())
+            seconds[name].append(time.process_time() - began)
+    return seconds
+
+
+def ratio(seconds, name, rival):
+    """Words: median of the ratio in the same round, and its range."""
+    of = [a / b for a, b in zip(seconds[name], seconds[rival])]
+    return f"{statistics.median(of):.2f} ({min(of):.2f} to {max(of):.2f})"
+
+
+def parameters(case):
+    """Values of 2, 8 and 30 parameters of the four-tank: gains; areas and pumps; every coefficient of the plant and of the law's model."""
+    law, plant = case.loop.controller, case.loop.plant
+    two = {"controller.k": np.float64(law.k), "controller.k1": np.float64(law.k1)}
+    eight = {**two, "plant.area": np.array(plant.area), "plant.pump_gain": np.array(plant.pump_gain)}
+    of = {"plant": plant, "controller.model": law.model}
+    every = {
+        f"{where}.{n}": np.array(getattr(part, n)) for where, part in of.items() for n in ("area", "drain", "orifice", "pump_gain")
+    }
+    return {2: two, 8: eight, 30: {**two, **every}}
+
+
+def gradient(case, values):
+    """(call, MB of temporary memory) of the gradient of the RMS error by `values`, forward mode."""
+    call = (
+        jax.jit(jax.jacfwd(lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]])).lower(values).compile()
+    )
+    return (lambda: call(values)), call.memory_analysis().temp_size_in_bytes / 1e6
+
+
+def one_run(rounds):
+    """Rows of a single run of the four-tank and of its gradients."""
+    case = presets.find("gouta2015/backstepping")
+    midpoint = case.replace(clock=dataclasses.replace(case.clock, integrator="midpoint"))
+    calls = {
+        "run": lambda: loop.evaluate(case.loop, case.clock, NAMES),
+        "midpoint": lambda: loop.evaluate(midpoint.loop, midpoint.clock, NAMES),
+        "cost": lambda: loop.evaluate(case.loop, case.clock, COST),
+    }
+    memory = {}
+    for count, values in parameters(case).items():
+        assert sum(np.size(v) for v in values.values()) == count
+        calls[count], memory[count] = gradient(case, values)
+    with tempfile.TemporaryDirectory() as folder:
+        function = bench.c_loop(folder)
+        if function is not None:
+            calls["C"], calls["C midpoint"] = bench.c_runner(function, case), bench.c_runner(function, case, rk4=False)
+        seconds = timed(calls, rounds)
+        if function is not None:
+            rms, top = calls["C"]()
+            ours = calls["run"]()
+            apart = max(abs(rms - float(ours[COST[0]])), float(np.max(np.abs(top - np.asarray(ours["max_level"])))))
+            print(f"jaxtank and the C loop agree to {apart:.1e} cm on the error and the highest levels")
+    per = {name: f"{1e9 * statistics.median(spent) / case.clock.samples:.0f} ns per step" for name, spent in seconds.items()}
+    rows = []
+    if function is None:
+        print("no gcc here: no C loop")
+    else:
+        c = f"C loop, {per['C']}"
+        rows.append(["one run, 120,001 steps, RK4", per["run"], ratio(seconds, "run", "C"), c, "1.25"])
+        rows.append(["the same, midpoint", per["midpoint"], ratio(seconds, "midpoint", "C"), "RK4 C loop", "0.85"])
+    for count, most in ((2, "3.0"), (8, "4.5"), (30, "6")):
+        spent = f"{1e3 * statistics.median(seconds[count]):.0f} ms, {memory[count]:.1f} MB"
+        rows.append([f"gradient, {count} parameters", spent, ratio(seconds, count, "cost"), "the run", f"{most}, 10 MB"])
+    return rows
+
+
+def lanes(rounds):
+    """Rows of many plants in one compiled loop, beside a C loop in vector lanes."""
+    case = presets.find("gouta2015/backstepping")
+    halves = case.replace(clock=dataclasses.replace(case.clock, integrator="midpoint"))
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        function = ensemble.c_lanes(folder)
+        if function is None:
+            return rows
+        for words, which, plants in (("RK4", case, 256), ("RK4", case, 4096), ("midpoint", halves, 256)):
+            few = which.replace(clock=dataclasses.replace(which.clock, duration=200.0)) if plants > 256 else which
+            a, b, between, _ = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
+            rival = f"C loop in vector lanes, {b:.1f} ns"
+            rows.append([f"{plants:,} lanes, {words}", f"{a:.1f} ns per step and lane", f"{between:.2f}", rival, "1.5"])
+    return rows
+
+
+def gauss_newton(rounds):
+    """Row of the tuner's pass: gradient and Gauss-Newton matrix of 8 parameters over 16 scenarios, beside the run of the same lanes."""
+    case = presets.find("gouta2015/backstepping")
+    values = parameters(case)[8]
+    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (LANES, 4)) * np.asarray(case.loop.plant.orifice)
+    names, point = tuple(values), tuple(values.values())
+
+    def compiled(one):
+        call = jax.jit(jax.vmap(one), compiler_options=_xla.WIDE).lower(orifice).compile()
+        return lambda: call(orifice)
+
+    at = lambda o: with_values(case.loop, {"plant.orifice": o})
+    calls = {
+        "run": compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST)),
+        "pass": compiled(lambda o: _sensitivities(at(o), case.clock, COST, names, point, None, lanes=True)),
+    }
+    seconds = timed(calls, max(rounds // 3, 3))
+    spent = f"{1e3 * statistics.median(seconds['pass']):.0f} ms"
+    return [
+        ["Gauss-Newton pass, 8 parameters, 16 scenarios", spent, ratio(seconds, "pass", "run"), "the run of the same lanes", "8"]
+    ]
+
+
+def laws(rounds):
+    """Rows of the other papers' laws."""
+    rows = []
+    for name in ("gouta2022/chadpc", "mirakhorli/hybrid", "mirakhorli/sfc", "calofir/backstepping"):
+        case = presets.find(name)
+        key = jax.random.key(0) if noisy(case) else None
+        once, tenfold = case.clock, dataclasses.replace(case.clock, duration=10 * case.clock.duration)
+
+        def run(clock, case=case, key=key):
+            return lambda: loop.evaluate(case.loop, clock, COST, key)
+
+        # a run of microseconds is mostly the call: what ten times the samples take longer tells the sample
+        seconds = timed({"once": run(once), "tenfold": run(tenfold)}, rounds)
+        short, long = (statistics.median(seconds[word]) for word in ("once", "tenfold"))
+        step, whole = 1e9 * (long - short) / (tenfold.samples - once.samples), 1e6 * short
+        words = f"{name}, {once.integrator}, {once.substeps} to a sample"
+        rows.append([words, f"{step:.0f} ns per sample, {whole:.0f} us the run of {once.samples:,}", "", "", "150 ns"])
+    case = presets.find("khalid/laguerre-constrained")
+    case = case.replace(clock=dataclasses.replace(case.clock, duration=600 * case.clock.dt))
+    cost = lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
+    point = {"controller.r_w": np.asarray(case.loop.controller.r_w, dtype=float)}
+    run, slope = jax.jit(cost), jax.jit(jax.jacfwd(cost))
+    seconds = timed({"run": lambda: run(point), "slope": lambda: slope(point)}, rounds)
+    rows.append(
+        [
+            f"khalid/laguerre-constrained, {case.clock.samples} samples",
+            f"{1e3 * statistics.median(seconds['run']):.1f} ms",
+            "",
+            "",
+            "20 ms",
+        ]
+    )
+    rows.append(
+        ["its gradient", f"{1e3 * statistics.median(seconds['slope']):.1f} ms", ratio(seconds, "slope", "run"), "the run", "3"]
+    )
+    return rows
+
+
+COMPILE = """
+import time, jax, jaxtank, numpy as np
+jax.config.update("jax_enable_x64", True)
+from jaxtank import loop, presets
+case = presets.find("gouta2015/backstepping")
+gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
+names = ("rms_error_total",)
+for call in (lambda: loop.evaluate(case.loop, case.clock, names), lambda: loop.sensitivities(case.loop, case.clock, names, gains)):
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    first = time.perf_counter() - began
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    print(first - (time.perf_counter() - began))
+"""
+
+
+def cold():
+    """Rows of what a first use waits for, each in a process of its own: wall time."""
+
+    def wall(*words):
+        times = []
+        for _ in range(3):
+            began = time.perf_counter()
+            subprocess.run([sys.executable, "-m", *words], check=True, capture_output=True)
+            times.append(time.perf_counter() - began)
+        return f"{statistics.median(times):.2f} s"
+
+    program = [sys.executable, "-c", COMPILE]
+    told = [subprocess.run(program, check=True, capture_output=True, text=True).stdout.split() for _ in range(3)]
+    first = [[float(word) for word in words] for words in told]
+    run, slope = (f"{statistics.median(v):.2f} s" for v in zip(*first))
+    return [
+        [
+            "`jaxtank simulate gouta2015/ngpc --json`, cold",
+            wall("jaxtank", "simulate", "gouta2015/ngpc", "--json"),
+            "",
+            "",
+            "3.5 s",
+        ],
+        ["`jaxtank --help`", wall("jaxtank", "--help"), "", "", "0.3 s"],
+        ["first call of a run less the second", run, "", "", "0.5 s"],
+        ["first call of a gradient with Gauss-Newton, less the second", slope, "", "", "1.5 s"],
+    ]
+
+
+def main(words):
+    jax.config.update("jax_enable_x64", True)
+    rounds = next((int(w) for w in words if w.isdigit()), 15)
+    rows = [*one_run(rounds), *lanes(rounds), *gauss_newton(rounds), *laws(rounds), *cold()]
+    print(report.table(rows, HEADS))
+    if "--markdown" in words:
+        table = "\n".join([f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|", *(f"| {' | '.join(row)} |" for row in rows)])
+        text = README.read_text()
+        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
