@@ -3,23 +3,22 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import linalg
-from scipy.optimize import least_squares
+import scipy  # its parts are imported when they are first used
 
 from jaxtank.errors import EquilibriumError, InputError
 from jaxtank.numerics import root
 
 
-def _balance(plant):
+def _balance(plant, xp=jnp):
     """(efflux, pumps): A_i h_i' = efflux @ speeds + pumps @ inputs, of a network without pipes; (n, n) [cm^2] and (n, m) [cm^3/(s V)]."""
     n, m, eye = plant.tanks, plant.pumps, np.eye(plant.tanks)
     out = plant.drain
     for k, (source, _) in enumerate(plant.links):
         out = out + plant.orifice[k] * eye[source]
-    efflux = -jnp.diag(out)
+    efflux = -xp.diag(out)
     for k, (source, sink) in enumerate(plant.links):
         efflux = efflux + plant.orifice[k] * np.outer(eye[sink], eye[source])
-    pumps = jnp.zeros((n, m))
+    pumps = xp.zeros((n, m))
     for j, (first, second) in enumerate(plant.feeds):
         share = 1.0 if second is None else plant.split[j]
         pumps = pumps + share * plant.pump_gain[j] * np.outer(eye[first], np.eye(m)[j])
@@ -37,18 +36,19 @@ def steady_flows(plant, y):
     return _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * jnp.sqrt(jnp.asarray(y)))
 
 
-def _from_known_speeds(plant, known):
-    """`steady_flows` for the efflux speeds (outputs) [cm/s] of the controlled tanks, in which it is linear."""
+def _from_known_speeds(plant, known, xp=jnp):
+    """`steady_flows` for the efflux speeds (outputs) [cm/s] of the controlled tanks, in which it is linear; xp: jax.numpy, or numpy where
+    nothing is to be differentiated, which spares thirty little compilations."""
     if plant.pipes:
         raise InputError("steady_flows is for networks whose orifices discharge freely; with pipes use equilibrium")
     n, m = plant.tanks, plant.pumps
     if m != len(plant.outputs):
         raise InputError(f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}")
-    eye, (efflux, pumps) = np.eye(n), _balance(plant)
+    eye, (efflux, pumps) = np.eye(n), _balance(plant, xp)
     free = [i for i in range(n) if i not in plant.outputs]
-    columns = jnp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
-    solution = jnp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
-    speeds = jnp.zeros(n)
+    columns = xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
+    solution = xp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
+    speeds = xp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]
     return speeds, solution[len(free) :]
@@ -92,7 +92,10 @@ def equilibrium(plant, y):
     if plant.pipes:
         x, u = _balanced(plant, y, f"outputs ({at}) {length}")
     else:
-        speeds, u = (np.asarray(a, dtype=float) for a in steady_flows(plant, y))
+        try:
+            speeds, u = _from_known_speeds(plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np)
+        except np.linalg.LinAlgError:
+            speeds = u = np.array([np.nan])
         if not (np.all(np.isfinite(speeds)) and np.all(np.isfinite(u))):
             raise EquilibriumError(
                 f"outputs ({at}) {length} have no unique steady state: the pumps cannot move the outputs independently"
@@ -145,7 +148,9 @@ def _balanced(plant, y, words):
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    found = least_squares(residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=500)
+    found = scipy.optimize.least_squares(
+        residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=500
+    )
     rough = float(np.max(np.abs(plant.drain))) / float(np.min(plant.area)) * np.sqrt(2.0 * float(plant.gravity) * scale)
     if not np.max(np.abs(found.fun)) < 1e-9 * max(rough, 1e-12):
         raise EquilibriumError(f"{words} have no steady state")
@@ -189,7 +194,7 @@ def transmission_zeros(A, B, C):
         raise InputError(f"transmission_zeros needs as many outputs as inputs: this model has {C.shape[0]} and {m}")
     pencil = np.block([[A, B], [C, np.zeros((m, m))]])
     mass = np.diag([1.0] * n + [0.0] * m)
-    alpha, beta = linalg.eig(pencil, mass, right=False, homogeneous_eigvals=True)
+    alpha, beta = scipy.linalg.eig(pencil, mass, right=False, homogeneous_eigvals=True)
     finite = np.abs(beta) > 1e-10 * np.abs(alpha)
     zeros = alpha[finite] / beta[finite]
     zeros = zeros[np.argsort(-zeros.real)]

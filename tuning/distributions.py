@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+import scipy  # its parts are imported when they are first used
 
 from jaxtank.errors import InputError
 from jaxtank.tree import check_value, describe, get_value, split_index
@@ -74,10 +74,10 @@ class Normal:
 
     def quantile(self, p, nominal):
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
-        tail = ndtr(-self.cut)
+        tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
-        return centre + spread * ndtri(tail + (1.0 - 2.0 * tail) * p)
+        return centre + spread * scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * p)
 
     def check(self, name):
         """Raise InputError unless the width is one."""
@@ -205,9 +205,9 @@ class Draws:
         for name, distribution, nominal, columns in self.parts:
             mine = p[:, columns]
             if isinstance(distribution, Correlated):
-                tail = ndtr(-distribution.cut)
+                tail = scipy.special.ndtr(-distribution.cut)
                 mean = nominal if distribution.mean is None else np.asarray(distribution.mean)
-                drawn = mean + ndtri(tail + (1.0 - 2.0 * tail) * mine) @ distribution.factor().T
+                drawn = mean + scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * mine) @ distribution.factor().T
                 ends = self.ends[name]
                 found.update({one: np.clip(drawn[:, i], *ends[i]) for i, one in enumerate(distribution.names)})
                 continue

@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
+import scipy  # its parts are imported when they are first used
 
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import InputError
@@ -19,7 +19,7 @@ LARGEST_STATE = 60
 
 def sobol(count, dimensions, seed):
     """(count, dimensions) scrambled Sobol points in the unit cube; count should be a power of 2."""
-    return qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(count)
+    return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(count)
 
 
 def spectral_radius(problem, zs, clock):

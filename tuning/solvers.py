@@ -1,8 +1,7 @@
 """Local searches from one start. Each takes a Search, which counts, remembers and shields; each may stop early, none may fail."""
 
 import numpy as np
-import optax
-from scipy.optimize import least_squares, minimize, nnls
+import scipy  # its parts are imported when they are first used
 
 from tuning.objective import EXPLODED, ROOT
 
@@ -94,7 +93,7 @@ def slsqp(search, z, iterations, tolerance=None):
     if search.problem.limits:
         constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
     try:
-        done = minimize(
+        done = scipy.optimize.minimize(
             _Watch(search),
             z,
             jac=True,
@@ -149,7 +148,7 @@ def _epigraph(search, z, iterations, tolerance):
         rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
         return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
 
-    done = minimize(
+    done = scipy.optimize.minimize(
         lambda y: (y[-1], np.eye(len(y))[-1]),
         np.append(z, known(z).lane_costs.max() / search.scale),
         jac=True,
@@ -184,7 +183,7 @@ def trf(search, z, iterations, tolerance=1e-10):
             [root.T * excess**0.5, 0 * z]
         )
 
-    done = least_squares(
+    done = scipy.optimize.least_squares(
         lambda z: model(z)[0],
         np.clip(z, 1e-9, 1 - 1e-9),
         jac=lambda z: model(z)[1],
@@ -252,7 +251,7 @@ def restore(search, z, iterations):
         return np.hstack([rows, np.ones((len(rows), 1))])
 
     worst = max(0.0, float(-search.margins(z)[0].min()))
-    done = minimize(
+    done = scipy.optimize.minimize(
         lambda y: (y[-1], np.eye(len(y))[-1]),
         np.append(z, worst),
         jac=True,
@@ -266,11 +265,15 @@ def restore(search, z, iterations):
 
 def lbfgs(search, z, iterations):
     """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
+    import optax
+
     return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
 
 
 def adam(search, z, iterations):
     """optax's Adam, limits by augmented Lagrangian, projected into the box. Its steps are small: five to an iteration."""
+    import optax
+
     steps = 5 * iterations
     schedule = optax.cosine_decay_schedule(0.05, max(steps // _rounds(search), 1), 0.002)
     return _augmented(search, z, steps, optax.adam(schedule), descend=False)
@@ -279,6 +282,8 @@ def adam(search, z, iterations):
 def minibatches(search, z, iterations, batch, rng):
     """optax's Adam on the mean of `batch` scenarios drawn afresh for every step, limits of those by a quadratic penalty. All scenarios
     are looked at ten times on the way, and they decide what is best."""
+    import optax
+
     steps = 5 * iterations
     optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
     state, every = optimiser.init(z), max(1, steps // 10)
@@ -361,7 +366,7 @@ def _left(search, point):
     residual = g
     if columns:
         matrix = np.array(columns).T
-        found, _ = nnls(matrix, g)
+        found, _ = scipy.optimize.nnls(matrix, g)
         residual = g - matrix @ found
         for owner, value in zip(owners, found):
             if owner is not None:
