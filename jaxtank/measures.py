@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.errors import unknown
-from jaxtank.numerics import at_least, root_of_mean
+from jaxtank.numerics import at_least, magnitude, root_of_mean
 from jaxtank.units import DEFAULT, local
 
 BAND = 0.05
@@ -202,13 +202,13 @@ def _start_travel(run):
 
 def _update_travel(run, state, sample, window):
     previous, total, first = state
-    step = tuple(jnp.abs(v - p) for v, p in zip(sample.u, previous))
+    step = tuple(magnitude(v - p) for v, p in zip(sample.u, previous))
     return sample.u, tuple(s + jnp.where(first, 0.0, d) for s, d in zip(total, step)), jnp.zeros_like(first)
 
 
 ACCUMULATORS = {
     "e2": _sum(lambda run: run.outputs, lambda run, s: tuple(e * e for e in s.e)),
-    "abs_e": _sum(lambda run: run.outputs, lambda run, s: tuple(jnp.abs(e) for e in s.e)),
+    "abs_e": _sum(lambda run: run.outputs, lambda run, s: tuple(magnitude(e) for e in s.e)),
     "u2": _sum(lambda run: run.pumps, lambda run, s: tuple(u * u for u in s.u)),
     "estimate2": _sum(lambda run: run.tanks, lambda run, s: tuple((a - b) * (a - b) for a, b in zip(s.x_hat, s.x))),
     "outside": _sum(lambda run: run.pumps, _outside),
@@ -217,7 +217,9 @@ ACCUMULATORS = {
     "spilled": _sum(lambda run: run.tanks, lambda run, s: s.spilled),
     "max_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a > b, -jnp.inf),
     "min_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf),
-    "max_error": _extreme(lambda run: run.outputs, lambda run, s, w: tuple(jnp.abs(e) for e in s.e), lambda a, b: a > b, -jnp.inf),
+    "max_error": _extreme(
+        lambda run: run.outputs, lambda run, s, w: tuple(magnitude(e) for e in s.e), lambda a, b: a > b, -jnp.inf
+    ),
     "overshoot": _extreme(lambda run: run.outputs, _overshoot, lambda a, b: a > b, -1.0),
     "settling": Accumulator(_start_settling, _update_settling),
     "rise": Accumulator(_start_rise, _update_rise),

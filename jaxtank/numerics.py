@@ -80,6 +80,19 @@ def root_of_mean(x):
     return jnp.where(x == 0.0, 0.0, jnp.sqrt(jnp.where(x == 0.0, 1.0, x)))
 
 
+@jax.custom_jvp
+def magnitude(x):
+    """|x|. Slope 0 at exactly 0: whatever the slopes of `x` to the left and to the right, a and b, those of |x| are -|a| and |b|, and 0
+    lies between. (jnp.abs takes +1: behind a clip at its end, where a pump rests at its limit, that is neither.)"""
+    return jnp.abs(x)
+
+
+@magnitude.defjvp
+def _magnitude_jvp(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    return magnitude(x), jnp.sign(x) * dx
+
+
 def at_least(x, floor):
     """The larger of `x` and `floor`. Slope 1 in `x` at and above the floor, 0 below (jnp.maximum halves it at a tie)."""
     return jnp.where(x >= floor, x, floor)

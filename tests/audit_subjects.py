@@ -91,10 +91,15 @@ def _(rng):
     return 10 ** rng.uniform(-6, 3), numerics.root_of_mean
 
 
-@subject("numerics.at_least clip portion", quick=True, points=40)
+@subject("numerics.at_least clip portion magnitude", quick=True, points=40)
 def _(rng):
     low, high = np.sort(rng.normal(size=2))
-    return (rng.normal(), low, high), lambda p: (numerics.at_least(p[0], p[1]), numerics.clip(*p), numerics.portion(*p))
+    return (rng.normal(), low, high), lambda p: (
+        numerics.at_least(p[0], p[1]),
+        numerics.clip(*p),
+        numerics.portion(*p),
+        numerics.magnitude(p[0]),
+    )
 
 
 @subject("hydraulics.efflux disc", quick=True, points=20)

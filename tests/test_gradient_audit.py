@@ -4,6 +4,8 @@ The default run audits the roots and clips of numerics.py, a network and a senso
 everything, every case of `jaxtank list` too, and prints the count and the worst error.
 """
 
+import dataclasses
+
 import audit_cases
 import audit_subjects
 import jax
@@ -12,8 +14,9 @@ import numpy as np
 import pytest
 from gradient_audit import STEPS, Subject, audit, differences, told
 
-from jaxtank import actuators, numerics, sensors
+from jaxtank import actuators, numerics, presets, sensors
 from jaxtank.controllers.fuzzy import membership
+from jaxtank.loop import evaluate_and_flag
 from jaxtank.plants.network import network
 from jaxtank.records import Clock
 
@@ -105,6 +108,8 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
     ("portion at its low end", lambda x: numerics.portion(x, 2.0, 3.0), 2.0, 0.5),
     ("portion at its high end", lambda x: numerics.portion(x, 2.0, 3.0), 3.0, 0.5),
     ("pieces that meet at a knot", lambda x: 3.0 * numerics.portion(x, 1.0, 2.0) + 5.0 * numerics.portion(x, 2.0, 3.0), 2.0, 4.0),
+    ("magnitude of nothing", numerics.magnitude, 0.0, 0.0),
+    ("travel of a pump at rest at its limit", lambda v: numerics.magnitude(2.0 - numerics.clip(v, 2.0, 3.0)), 2.0, 0.0),
     ("floored root at its floor", lambda h: numerics.floored_root(h, 0.04), 0.04, 2.5),
     ("floored root by its floor", lambda f: numerics.floored_root(0.04, f), 0.04, 0.0),
     ("root of a mean of nothing", lambda e: numerics.root_of_mean(e * e), 0.0, 0.0),
@@ -131,6 +136,21 @@ def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
     slack = 1e-5 * max(1.0, abs(left), abs(right))
     assert min(left, right) - slack <= found[0] <= max(left, right) + slack
     assert slope is None or found[0] == pytest.approx(slope, rel=1e-12)
+
+
+@pytest.mark.parametrize("way", [jax.jacfwd, jax.jacrev])
+def test_empty_tanks_at_their_setpoint_are_a_kink_of_the_travel(way):
+    """gouta2022/enmpc, both tanks and the first setpoint at 0 cm: the first command is 0 V, the limit of pump 1. With more water it
+    stays off, with less it runs: on the one side its travel has slope 0, on the other one as steep as the law."""
+    case = presets.find("gouta2022/enmpc")
+    clock = Clock(dt=0.05, duration=0.2)
+    f = lambda x0: evaluate_and_flag(dataclasses.replace(case.loop, x0=x0), clock, ("input_travel",))[0]["input_travel"]
+    at_rest = jnp.zeros(2)
+    found = np.asarray(way(f)(at_rest))
+    for i, axis in enumerate(np.eye(2)):
+        left, right = one_sided(lambda h, axis=axis: f(at_rest + h * axis), 0.0)
+        assert left[0] < -5.0 and right[0] == 0.0
+        assert np.all(np.minimum(left, right) <= found[:, i]) and np.all(found[:, i] <= np.maximum(left, right))
 
 
 def test_a_staircase_has_the_slope_of_the_line_through_it():

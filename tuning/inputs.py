@@ -11,6 +11,7 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.controllers import OpenLoop
+from jaxtank.numerics import magnitude
 from jaxtank.observers import Direct
 from jaxtank.signals import Table
 from jaxtank.stepping import initial, inputs, run_of, step
@@ -57,7 +58,7 @@ def excess(terms, held, sample):
     """How far each running limit is passed at a sample, negative inside, as a share of its room [-]."""
     found = []
     for j, (measure, i) in enumerate(terms.running):
-        quantity = jnp.abs(sample.e[i]) if measure == "max_error" else sample.x[i]
+        quantity = magnitude(sample.e[i]) if measure == "max_error" else sample.x[i]
         found.append(RUNNING[measure] * (quantity - held.running[j]) / held.room[0][j])
     return found
 

@@ -8,7 +8,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
 from jaxtank.controllers.state_feedback import feedback
 from jaxtank.errors import InputError
-from jaxtank.numerics import clip
+from jaxtank.numerics import clip, magnitude
 from jaxtank.plants.base import Plant
 from jaxtank.tree import component, leaf, static
 
@@ -58,7 +58,7 @@ class FuzzyBlend(Controller):
         law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
         far = [clip(u, self.low[i], self.high[i]) for i, u in enumerate(slide(*law, estimate.x, tick.r, u0, state))]
         near = feedback(self.K, estimate.x, h0, u0)
-        size = [jnp.abs(h - r) for h, r in zip(estimate.x, tick.r)]
+        size = [magnitude(h - r) for h, r in zip(estimate.x, tick.r)]
         share = [membership(size[j], self.b[i], self.w[i]) for i, j in enumerate(PAIRINGS[self.pairing])]
         return tuple(n + m * (f - n) for m, f, n in zip(share, far, near)), state
 
