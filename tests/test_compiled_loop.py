@@ -15,6 +15,7 @@ from jaxtank import _xla, invariants
 from jaxtank.loop import _evaluate, _sensitivities, evaluate_for_reverse
 from jaxtank.materialise import materialised
 from jaxtank.records import Clock
+from tuning import bench
 
 MEASURES = ("rms_error_total", "max_level")
 ONE_FUNCTION = 'xla_cpu_small_call="true"'
@@ -256,3 +257,24 @@ def test_materialised_values_pass_every_transformation():
         jax.jacfwd(looped)(x),
     ):
         assert found == pytest.approx(slope, rel=1e-14)
+
+
+def test_bench_says_why_a_loop_is_slow(gouta):
+    """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the fault."""
+
+    def program(body):
+        return (
+            jax.jit(lambda x: jax.lax.scan(lambda c, _: (body(c), None), x, None, length=50)[0])
+            .lower(jnp.eye(2))
+            .compile()
+            .as_text()
+        )
+
+    plain, solving = program(lambda c: 0.5 * c), program(lambda c: jnp.linalg.solve(c + 3.0 * jnp.eye(2), c))
+    assert bench.reasons(plain, 50, True, np.float64, 0) == []
+    assert "custom-call" in bench.reasons(solving, 50, True, np.float64, 0)[0]
+    assert "JAXTANK_XLA_OPTION" in bench.reasons(solving, 50, False, np.float64, 0)[0]
+    assert "compensated" in bench.reasons(plain, 50, True, np.float32, 0)[0]
+    assert "3 of 3" in bench.reasons(plain, 50, True, np.float64, 3)[0]
+    found = bench.measure_cases({"a": gouta("backstepping", {"clock.duration": 20.0})}, rounds=1)["a"]
+    assert found["one_function"] and found["reasons"] == []

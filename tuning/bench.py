@@ -119,9 +119,7 @@ def measure(rounds=7):
 def _notes(found, function):
     notes = []
     if not found["provenance"]["xla_option"]:
-        notes.append(
-            "the XLA option for fast loops is off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): runs are about 16 times slower"
-        )
+        notes.append(OFF)
     if function is None:
         notes.append("no gcc here, so there is no C loop to compare with")
     if found["provenance"]["backend"] != "cpu":
@@ -170,8 +168,39 @@ def is_one_function(program, samples):
     return False
 
 
+WALLED = ("custom-call", "scatter", "sort", "fft", "partition-id", "outfeed", "infeed")
+"""Operations that keep XLA from compiling a loop to one function (methods 2.1): LAPACK, callbacks, `.at[].set`, sorting."""
+
+OFF = "the XLA options are off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): each operation of the loop is dispatched by itself"
+
+
+def reasons(program, samples, option, dtype, compiled):
+    """Why a run is slower or less exact than it could be, in words; [] if nothing is known.
+
+    program: text of the compiled run; samples: of its loop; option: whether the XLA options are on; dtype: of the levels; compiled: how
+    many programs three further runs compiled."""
+    found = []
+    if not is_one_function(program, samples):
+        named = [word for word in WALLED if f" {word}(" in program]
+        found.append(
+            OFF
+            if not option
+            else f"the time loop is not one function: it holds {', '.join(named) or 'more than XLA takes for a small loop'}"
+        )
+    if dtype == np.float32:
+        found.append(
+            "float32 without compensated sums: levels are about 5e-3 cm wrong at dt = 0.01 s, and a scalar run is no faster for it"
+        )
+    if compiled:
+        found.append(
+            f"traced anew at every call: {compiled} of 3 further runs compiled a program (a static field changes between calls)"
+        )
+    return found
+
+
 def measure_cases(cases, rounds=3):
-    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s"}} of {name: Case}: a run with two measures, median of `rounds`."""
+    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s", "reasons"}} of {name: Case}: a run with two measures, median
+    of `rounds`."""
     found = {}
     for name, case in cases.items():
         key = jax.random.key(0) if noisy(case) else None
@@ -179,14 +208,24 @@ def measure_cases(cases, rounds=3):
         began = time.perf_counter()
         text_of_program = program.compile().as_text()
         first = time.perf_counter() - began
-        seconds, _ = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
+        seconds, results = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
         median = statistics.median(seconds[name])
+        before = lp._evaluate._cache_size()
+        for _ in range(3):
+            lp.evaluate(case.loop, case.clock, MEASURES, key)
         found[name] = {
             "ns_per_step": 1e9 * median / case.clock.samples,
             "ms": 1e3 * median,
             "samples": case.clock.samples,
             "one_function": is_one_function(text_of_program, case.clock.samples),
             "first_call_s": first,
+            "reasons": reasons(
+                text_of_program,
+                case.clock.samples,
+                provenance(case, None)["xla_option"],
+                results[name]["rms_error_total"].dtype,
+                lp._evaluate._cache_size() - before,
+            ),
         }
     return found
 
@@ -204,4 +243,5 @@ def text_of_cases(found):
         ]
         for name, r in found.items()
     ]
-    return report.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"])
+    why = [f"{name}: {reason}" for name, r in found.items() for reason in r["reasons"]]
+    return "\n".join([report.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why])

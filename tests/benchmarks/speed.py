@@ -165,9 +165,9 @@ def laws(rounds):
         # a run of microseconds is mostly the call: what ten times the samples take longer tells the sample
         seconds = timed({"once": run(once), "tenfold": run(tenfold)}, rounds)
         short, long = (statistics.median(seconds[word]) for word in ("once", "tenfold"))
-        step, whole = 1e9 * (long - short) / (tenfold.samples - once.samples), 1e6 * short
-        words = f"{name}, {once.integrator}, {once.substeps} to a sample"
-        rows.append([words, f"{step:.0f} ns per sample, {whole:.0f} us the run of {once.samples:,}", "", "", "150 ns"])
+        step = 1e9 * (long - short) / ((tenfold.samples - once.samples) * once.substeps)
+        words = f"{name}, {once.integrator}" + (f", {once.substeps} steps to a sample" if once.substeps > 1 else "")
+        rows.append([words, f"{step:.0f} ns per step ({1e3 * short:.1f} ms the run of {once.samples:,} samples)", "", "", "150 ns"])
     case = presets.find("khalid/laguerre-constrained")
     case = case.replace(clock=dataclasses.replace(case.clock, duration=600 * case.clock.dt))
     cost = lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
