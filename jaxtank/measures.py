@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from jaxtank.compensated import nothing, plus, totals
 from jaxtank.errors import unknown
 from jaxtank.numerics import at_least, magnitude, root_of_mean
 from jaxtank.units import DEFAULT, local
@@ -58,13 +59,17 @@ def _filled(run, count, value):
     return (run.zero + value,) * count
 
 
+def _sums(run, count):
+    return (nothing(run.zero),) * count
+
+
 def _sum(size, term):
     """Accumulator of sums over the run: `term(run, sample)` gives one number per output, tank or pump."""
 
     def update(run, state, sample, window):
-        return tuple(s + v for s, v in zip(state, term(run, sample)))
+        return tuple(plus(s, v) for s, v in zip(state, term(run, sample)))
 
-    return Accumulator(lambda run: _filled(run, size(run), 0.0), update)
+    return Accumulator(lambda run: _sums(run, size(run)), update)
 
 
 def _extreme(size, pick, better, worst):
@@ -174,11 +179,11 @@ def _past(sample, window):
 
 
 def _update_past(run, state, sample, window):
-    return tuple(s + v * v for s, v in zip(state, _past(sample, window)))
+    return tuple(plus(s, v * v) for s, v in zip(state, _past(sample, window)))
 
 
 def _update_deviation(run, state, sample, rest):
-    return tuple(s + d * d for s, d in zip(state, _deviation(run, sample, rest)))
+    return tuple(plus(s, d * d) for s, d in zip(state, _deviation(run, sample, rest)))
 
 
 def _over_rim(run, sample):
@@ -193,17 +198,17 @@ def _changes(state, sample):
 
 
 def _update_changes(run, state, sample, window):
-    return sample.u, tuple(s + d * d for s, d in zip(state[1], _changes(state, sample))), jnp.zeros_like(state[2])
+    return sample.u, tuple(plus(s, d * d) for s, d in zip(state[1], _changes(state, sample))), jnp.zeros_like(state[2])
 
 
 def _start_travel(run):
-    return _filled(run, run.pumps, 0.0), _filled(run, run.pumps, 0.0), run.zero == 0.0
+    return _filled(run, run.pumps, 0.0), _sums(run, run.pumps), run.zero == 0.0
 
 
 def _update_travel(run, state, sample, window):
     previous, total, first = state
     step = tuple(magnitude(v - p) for v, p in zip(sample.u, previous))
-    return sample.u, tuple(s + jnp.where(first, 0.0, d) for s, d in zip(total, step)), jnp.zeros_like(first)
+    return sample.u, tuple(plus(s, jnp.where(first, 0.0, d)) for s, d in zip(total, step)), jnp.zeros_like(first)
 
 
 ACCUMULATORS = {
@@ -224,8 +229,8 @@ ACCUMULATORS = {
     "settling": Accumulator(_start_settling, _update_settling),
     "rise": Accumulator(_start_rise, _update_rise),
     "recovery": Accumulator(lambda run: tuple((run.zero, run.zero, run.zero) for _ in range(run.outputs)), _update_recovery),
-    "past2": Accumulator(lambda run: _filled(run, run.outputs, 0.0), _update_past),
-    "deviation2": Accumulator(lambda run: _filled(run, run.pumps, 0.0), _update_deviation),
+    "past2": Accumulator(lambda run: _sums(run, run.outputs), _update_past),
+    "deviation2": Accumulator(lambda run: _sums(run, run.pumps), _update_deviation),
     "travel": Accumulator(_start_travel, _update_travel),
     "changes2": Accumulator(_start_travel, _update_changes),
 }
@@ -481,4 +486,5 @@ def residual_weights(run, squares):
 
 def read(run, states, names):
     """{measure: value} at the end of a run."""
+    states = totals(states)
     return {name: MEASURES[name].read(run, states) for name in names}

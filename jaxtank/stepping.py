@@ -11,13 +11,14 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.actuators import PumpBank
 from jaxtank.analysis import steady_along
+from jaxtank.compensated import added
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.materialise import materialised
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
-from jaxtank.plants.integration import integrate
+from jaxtank.plants.integration import change, integrate
 from jaxtank.records import Sample, Tick
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Signal
@@ -52,6 +53,7 @@ class State(NamedTuple):
     observer: Any
     controller: Any
     actuator: Any
+    excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
 
 
 class Inputs(NamedTuple):
@@ -121,6 +123,7 @@ def initial(loop, clock):
         observer=typed(loop.observer.init(x0)),
         controller=typed(loop.controller.init(x0, u0)),
         actuator=typed(loop.actuator.init(clock)),
+        excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
     )
 
 
@@ -137,7 +140,7 @@ def step(loop, clock, state, now):
     controller = loop.controller.track(controller, tick, command, applied)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, spilled = _advance(plant, clock, t, state.x, materialised(loop.actuator.driving(u)), now.d)
+    x, excess, spilled = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
         t=t,
@@ -152,17 +155,22 @@ def step(loop, clock, state, now):
         u=u,
         spilled=spilled,
     )
-    return State(state.k + 1, x, observer, controller, actuator), sample
+    return State(state.k + 1, x, observer, controller, actuator, excess), sample
 
 
-def _advance(plant, clock, t, x, u, d):
-    """Levels after dt with u and d held, and the volume lost over each rim on the way [cm^3]."""
+def _advance(plant, clock, t, x, excess, u, d):
+    """Levels after dt with u and d held, what rounding has added to them too much, and the volume lost over each rim on the way [cm^3]."""
     h = clock.dt / clock.substeps
     spilled = None
     for j in range(clock.substeps):
-        x, lost = plant.spill(integrate(plant, clock.integrator, t + j * h, x, u, d, h))
+        if excess:
+            changes = change(plant, clock.integrator, t + j * h, x, u, d, h)
+            x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
+        else:
+            x = integrate(plant, clock.integrator, t + j * h, x, u, d, h)
+        x, lost = plant.spill(x)
         spilled = lost if spilled is None else tuple(a + b for a, b in zip(spilled, lost))
-    return x, spilled
+    return x, excess, spilled
 
 
 def run_of(loop, clock):
@@ -181,7 +189,7 @@ def run_of(loop, clock):
 
 
 def zero_of(loop):
-    """0.0 of the type in which the run is done: what x0 becomes inside jax. float32 is named, for it would be wrong here."""
+    """0.0 of the type in which the run is done: what x0 becomes inside jax. float32 is named, and what it costs."""
     dtype = jnp.result_type(loop.x0, jnp.float32 if jnp.result_type(loop.x0) == jnp.float32 else float)
     if dtype == jnp.float32:
         _warn_float32()
@@ -191,8 +199,9 @@ def zero_of(loop):
 @functools.cache
 def _warn_float32():
     warnings.warn(
-        "this run is in float32: at dt = 0.01 s a level is then wrong by about 5e-3 cm, because a step changes it by less than float32 "
-        "resolves. Call jax.config.update('jax_enable_x64', True) first for float64.",
+        "this run is in float32. Levels and running sums keep what rounding takes from them, so levels are right to about 1e-5 cm (2e-3 cm "
+        "under gouta2022's laws, which amplify rounding; 0.1 to 3 % of input_travel is rounding). Call "
+        "jax.config.update('jax_enable_x64', True) first for float64, which one run is no slower in.",
         stacklevel=6,
     )
 

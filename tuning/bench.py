@@ -188,9 +188,7 @@ def reasons(program, samples, option, dtype, compiled):
             else f"the time loop is not one function: it holds {', '.join(named) or 'more than XLA takes for a small loop'}"
         )
     if dtype == np.float32:
-        found.append(
-            "float32 without compensated sums: levels are about 5e-3 cm wrong at dt = 0.01 s, and a scalar run is no faster for it"
-        )
+        found.append("float32: less exact, and one run is no faster for it; many lanes are (half the time)")
     if compiled:
         found.append(
             f"traced anew at every call: {compiled} of 3 further runs compiled a program (a static field changes between calls)"

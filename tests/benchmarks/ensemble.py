@@ -48,41 +48,48 @@ def draw(case, samples, **options):
     return tuning.ensemble(case, samples=samples, measures=NAMES, fan=False, **options)
 
 
-def c_lanes(folder):
+SINGLE = ("-DSINGLE", "-fsingle-precision-constant")  # the same source in float32, its sums not compensated
+
+
+def c_lanes(folder, single=False):
     """The C loop of floor_lanes.c, None where there is no gcc."""
     if shutil.which("gcc") is None:
         return None
     library = Path(folder) / "lanes.so"
-    subprocess.run(["gcc", *FLAGS, f"-DLANES={BLOCK}", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True)
+    subprocess.run(
+        ["gcc", *FLAGS, *(SINGLE if single else ()), f"-DLANES={BLOCK}", "-o", str(library), str(SOURCE), "-lm"],
+        check=True,
+        capture_output=True,
+    )
     function = ctypes.CDLL(str(library)).four_tanks
     function.restype = None
     return function
 
 
-def c_run(function, case, samples):
+def c_run(function, case, samples, single=False):
     """A call of the C loop on the plants that `draw` draws: () -> (total rms error (samples,), highest levels (samples, 4)) [cm]."""
     plant, law, clock = case.loop.plant, case.loop.controller, case.clock
     space = Draws(case.loop, spread_of(case))
     v = space.values(probabilities("random", space.dimensions, samples, 0))
     rows = np.concatenate([v["plant.drain"][:, :2].T, v["plant.orifice"].T, v["plant.pump_gain"].T])
-    rows = np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge").copy()
+    real, c_real = (np.float32, ctypes.c_float) if single else (np.float64, ctypes.c_double)
+    rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge"), dtype=real)
     model = law.model
     area, drain, orifice, gain = (np.array(x, dtype=float) for x in (model.area, model.drain, model.orifice, model.pump_gain))
     w = float(2.0 * model.gravity) ** 0.5
     out = np.array([drain[0], orifice[0], orifice[2], drain[1], orifice[1], orifice[3]]) * w / area[[0, 0, 0, 1, 1, 1]]
     upper = [orifice[:2].sum() * w / area[2], gain[0] / area[2], orifice[2:].sum() * w / area[3], gain[1] / area[3]]
-    nominal, own = np.concatenate([out, upper]), np.array(plant.area, dtype=float)
-    r, x0 = np.array(case.loop.reference.sample(clock)[0]).copy(), np.array(case.loop.x0, dtype=float)
-    found = np.zeros((rows.shape[1], 5))
+    nominal, own = np.concatenate([out, upper]).astype(real), np.array(plant.area, dtype=real)
+    r, x0 = np.array(case.loop.reference.sample(clock)[0], dtype=real), np.array(case.loop.x0, dtype=real)
+    found = np.zeros((rows.shape[1], 5), dtype=real)
 
     def at(array):
-        return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+        return array.ctypes.data_as(ctypes.POINTER(c_real))
 
-    real = [
-        ctypes.c_double(float(x))
-        for x in (plant.gravity, plant.knee, clock.dt, law.k, law.k1, law.level_floor, case.loop.actuator.high[0])
+    scalars = [
+        c_real(float(x)) for x in (plant.gravity, plant.knee, clock.dt, law.k, law.k1, law.level_floor, case.loop.actuator.high[0])
     ]
-    gravity, knee, dt, *rest = real
+    gravity, knee, dt, *rest = scalars
 
     def run():
         function(
@@ -94,9 +101,9 @@ def c_run(function, case, samples):
     return run
 
 
-def beside_lanes(function, case, samples, rounds):
+def beside_lanes(function, case, samples, rounds, single=False):
     """(ns per step and plant of ours, of the C loop, ratio, largest difference [cm]): medians of core time, the two in turn."""
-    ours, theirs = (lambda: draw(case, samples)), c_run(function, case, samples)
+    ours, theirs = (lambda: draw(case, samples)), c_run(function, case, samples, single)
     seen, (rms, top), times = ours(), theirs(), {ours: [], theirs: []}
     apart = max(abs(rms - seen.measures["rms_error_total"]).max(), abs(top - seen.measures["max_level"]).max())
     for _ in range(rounds):

@@ -6,6 +6,11 @@
 
 #include <math.h>
 
+#ifdef SINGLE /* the same in float32, its sums not compensated */
+#define double float
+#define sqrt sqrtf
+#endif
+
 #ifndef LANES
 #define LANES 16
 #endif

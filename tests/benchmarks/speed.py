@@ -122,10 +122,27 @@ def lanes(rounds):
             return rows
         for words, which, plants in (("RK4", case, 256), ("RK4", case, 4096), ("midpoint", halves, 256)):
             few = which.replace(clock=dataclasses.replace(which.clock, duration=200.0)) if plants > 256 else which
-            a, b, between, _ = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
+            a, b, between, apart = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
+            assert apart < 1e-10, f"{words}: jaxtank and the C loop are {apart:.1e} cm apart"
             rival = f"C loop in vector lanes, {b:.1f} ns"
             rows.append([f"{plants:,} lanes, {words}", f"{a:.1f} ns per step and lane", f"{between:.2f}", rival, "1.5"])
+    program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(max(rounds // 4, 3))]
+    told = subprocess.run(program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.split()
+    a, b, between = map(float, told)
+    rival = f"C loop in vector lanes, float32 not compensated, {b:.1f} ns"
+    rows.append(["256 lanes, RK4, float32 with compensated sums", f"{a:.1f} ns per step and lane", f"{between:.2f}", rival, "2.0"])
     return rows
+
+
+SINGLE = """
+import sys, tempfile
+sys.path.insert(0, ".")
+import ensemble
+from jaxtank import presets
+with tempfile.TemporaryDirectory() as folder:
+    function, case = ensemble.c_lanes(folder, single=True), presets.find("gouta2015/backstepping")
+    print(*ensemble.beside_lanes(function, case, 256, int(sys.argv[1]), single=True)[:3])
+"""
 
 
 def gauss_newton(rounds):
