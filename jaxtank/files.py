@@ -1,6 +1,7 @@
 """Files are written whole or not at all."""
 
 import contextlib
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -10,22 +11,45 @@ from jaxtank.errors import InputError
 LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 
 
+ASIDE = ".jaxtank"
+"""How the names of files end that are not yet whole."""
+
+
 def write_atomic(path, data):
     """Write `data` (str or bytes) to `path` by way of a temporary file in the same folder; a link is not followed."""
     path = Path(path)
-    data = data.encode() if isinstance(data, str) else data
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    write_together(path.parent, {path.name: data})
+
+
+def write_together(folder, files):
+    """Write {name: str or bytes} to `folder`: all of them are whole on the disk before the first takes its place, so that a disk that is
+    full leaves what was there as it was."""
+    folder, aside = Path(folder), []
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
+        for name, data in files.items():
+            if (folder / name).is_dir():
+                raise IsADirectoryError(errno.EISDIR, f"{name} is a folder there")
+            handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{name}.", suffix=ASIDE)
+            aside.append((temporary, folder / name))
+            with os.fdopen(handle, "wb") as file:
+                file.write(data.encode() if isinstance(data, str) else data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(temporary, 0o666 & ~_umask())
+        for temporary, path in aside:
+            os.replace(temporary, path)
     except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(name)
+        for temporary, _ in aside:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(temporary)
         raise
+
+
+def sweep(folder):
+    """Remove the unfinished files that a killed run left in a folder."""
+    for path in Path(folder).glob(f".*{ASIDE}"):
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def _umask():

@@ -42,7 +42,7 @@ ABOVE = [
     {"manual_parts"},
     {"manual", "sensitivity_report", "ensemble_report", "identify_report"},
     {"bench", "compare"},
-    {"arguments", "interrupts", "completion"},
+    {"arguments", "interrupts", "completion", "holds"},
     {"options"},
     {"identify_command", "tune_command", "batch_commands"},
     {"parser"},

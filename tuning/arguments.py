@@ -1,5 +1,7 @@
 """What the words of a command line mean: numbers, ranges, NAME=VALUE, the case they describe."""
 
+import os
+
 from jaxtank.errors import InputError
 
 
@@ -81,13 +83,22 @@ def seed(args):
     return whole("--seed", args.seed, 0, 2**31 - 1)
 
 
-def check_out(args):
-    if args.out is not None and not args.out.strip():
-        raise InputError("--out '': must name a folder")
-    if args.out is not None:
+def folder_of(args):
+    """The folder that a command writes to, None where it writes to none. Raises InputError where it cannot; nothing is made yet."""
+    out, resume = getattr(args, "out", None), getattr(args, "resume", None)
+    for option, folder in (("--out", out), ("--resume", resume)):
+        if folder is not None and not folder.strip():
+            raise InputError(f"{option} '': must name a folder")
+    if resume and out and resume != out:
+        raise InputError("--resume and --out name different folders: a run is continued in its own")
+    if args.command == "merge" and not out:
+        return args.case if os.path.isdir(args.case) else None
+    folder = resume or out
+    if folder is not None:
         from jaxtank.files import check_folder
 
-        check_folder(args.out)
+        check_folder(folder)
+    return folder
 
 
 def span(text):

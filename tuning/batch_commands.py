@@ -4,7 +4,7 @@ import os
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import check_out, open_case, whole
+from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
 from tuning.options import devices_of, distributions_of, limits_of, tell_written
 
@@ -15,10 +15,7 @@ def uncertainty(args):
         shard = _shard(args.shard)
         if not args.out and not args.resume:
             raise InputError(f"--shard {args.shard!r}: needs --out DIR, where the shares meet")
-    if args.resume and args.out and args.resume != args.out:
-        raise InputError("--resume and --out name different folders: a run is continued in its own")
     args.out = args.resume or args.out
-    check_out(args)
     devices = devices_of(args)
     progress = None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
     found = _ensemble(args, devices=devices, shard=shard, folder=args.out, resume=args.resume is not None, progress=progress)
@@ -32,7 +29,6 @@ def uncertainty(args):
 def merge(args):
     """Of a folder alone, by what its manifest says; of a case with the options of its shards and --out DIR."""
     if args.out:
-        check_out(args)
         return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
     if not os.path.isdir(args.case):
         raise InputError(f"merge {args.case!r}: is no folder; give the one that the shards were written to (their --out DIR)")
@@ -72,8 +68,10 @@ def _told(found, args):
     """Write, print and end with an Ensemble."""
     from tuning import report
 
-    written = found.save(args.out, args.line) if args.out else []
-    print(report.dumps(found.to_json()) if args.json else repr(found))
+    try:
+        written = found.save(args.out, args.line) if args.out else []
+    finally:  # a disk that is full costs the files, not the answer
+        print(report.dumps(found.to_json()) if args.json else repr(found))
     tell_written(written, args)
     return 0
 
@@ -92,7 +90,6 @@ def _shard(text):
 
 
 def sensitivity(args):
-    check_out(args)
     devices = devices_of(args)
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
@@ -120,7 +117,9 @@ def sensitivity(args):
     )
     if terminal and not args.quiet:
         print(file=sys.stderr)
-    written = result.save(args.out, args.line) if args.out else []
-    print(report.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
+    try:
+        written = result.save(args.out, args.line) if args.out else []
+    finally:
+        print(report.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
     tell_written(written, args)
     return 0

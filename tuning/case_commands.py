@@ -3,7 +3,7 @@
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import check_out, open_case, whole
+from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
 from tuning.options import tell_written
 
@@ -18,7 +18,6 @@ def list_cases(args):
 
 
 def show(args):
-    check_out(args)
     case = open_case(args)
     from tuning import manual, report
 
@@ -49,7 +48,6 @@ def init(args):
 
 
 def export_law(args):
-    check_out(args)
     case = open_case(args)
     from pathlib import Path
 
@@ -68,7 +66,6 @@ def export_law(args):
 
 
 def simulate(args):
-    check_out(args)
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
     seed, case = seed_of(args), open_case(args)
@@ -105,7 +102,6 @@ def simulate(args):
 
 
 def compare(args):
-    check_out(args)
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -10,6 +10,8 @@ import sys
 
 from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
 from tuning import batch_commands, case_commands, identify_command, tune_command
+from tuning.arguments import folder_of
+from tuning.holds import hold
 from tuning.parser import parser
 
 COMMANDS = {
@@ -48,7 +50,10 @@ def main(argv=None):
         if args.command is None:
             raise InputError("no command: try jaxtank --help")
         args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
-        return COMMANDS[args.command](args)
+        with hold(folder_of(args), shared=getattr(args, "shard", None) is not None):
+            code = COMMANDS[args.command](args)
+        sys.stdout.flush()
+        return code
     except (InputError, NonFiniteError) as error:
         print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
         return 5 if isinstance(error, DataError) else 2
@@ -58,10 +63,11 @@ def main(argv=None):
             os._exit(130)  # an interrupt inside jax leaves threads that cannot be wound up safely
         return 130
     except BrokenPipeError:  # the reader of our output has gone; nothing more to say
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()
         return 0
     except OSError as error:
-        print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
+        print(f"jaxtank: {error.filename or 'output'}: {error.strerror or _one_line(error)}", file=sys.stderr)
+        _drop_output()
         return 2
     except Exception as error:
         if os.environ.get("JAXTANK_TRACEBACK"):
@@ -71,6 +77,14 @@ def main(argv=None):
             file=sys.stderr,
         )
         return 1
+
+
+def _drop_output():
+    """Let go of what stdout cannot take (a reader that has left, a full disk), so that the end of the program does not try again."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _one_line(error):

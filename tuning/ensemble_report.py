@@ -190,9 +190,8 @@ def save(ensemble, folder, command=None):
     check_folder(folder)
     folder = Path(folder)
     files = {"result.json": report.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
-    written = report.write_files(folder, files)
     drawn = figures(ensemble)
-    written += report.write_files(folder, {"report.html": page_of(ensemble, drawn, command)} | report.pngs(drawn))
+    written = report.write_files(folder, files | {"report.html": page_of(ensemble, drawn, command)} | report.pngs(drawn))
     if (folder / parts.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):
             if parts.NAME.fullmatch(path.name):

@@ -45,7 +45,7 @@ def curvature(problem, search, point):
     the objective, run}.
     """
     z, count = point.z, len(point.z)
-    if count < 2 or count > LARGEST_CURVATURE:
+    if count < 2 or count > LARGEST_CURVATURE or point.cost == 0.0:  # nothing is a share of an objective of 0
         return None
     columns = []
     for i in range(count):

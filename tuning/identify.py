@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2, qmc
 
+import jaxtank
 from jaxtank import rig as rigs
 from jaxtank.errors import DataError, InputError
 from jaxtank.plants.base import Plant
@@ -19,6 +20,8 @@ from tuning import logs as lg
 from tuning import playback as pb
 from tuning.bounds import bounds
 from tuning.coordinates import coordinates, nominal, usual
+from tuning.memo import Log, Memo
+from tuning.parts import digest
 
 ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
 UNSEEN = (
@@ -397,6 +400,8 @@ def identify(
     profile=False,
     iterations=100,
     gap=1.5,
+    folder=None,
+    resume=False,
     progress=None,
 ):
     """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
@@ -410,7 +415,8 @@ def identify(
     each log (below 1), or number of samples, at its end on which a fit to the rest is judged before all is fitted; noise: standard
     deviation of each channel in its unit, from the record where None; loss: "linear", "soft_l1" or "huber" (beyond 3 standard deviations);
     substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
-    gap: longest step between samples, in median steps; progress: called with the Fit of each search that has ended; if it raises
+    gap: longest step between samples, in median steps; folder: where a log of the searches is kept, with which resume=True goes on after a
+    kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
     KeyboardInterrupt, the best of them is gone on with.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
@@ -433,10 +439,13 @@ def identify(
     kept = [_kept(one, hold_back) for one in logs]
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
     partial = Estimation(case, [one.part(0, n) for one, n in zip(logs, kept)], **options)
+    memo = Memo()
+    if folder is not None:
+        memo = Log(folder, _problem(case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}), resume)
     fits, interrupted = [], False
     try:
         for z in partial.begin(starts, seed):
-            fits.append(partial.solve(z, loss, iterations, tolerance=1e-8))
+            fits.append(_search(memo, partial, z, loss, iterations))
             if progress is not None:
                 progress(fits[-1])
     except KeyboardInterrupt:
@@ -490,6 +499,39 @@ def identify(
         wall_s=time.perf_counter() - began,
         seed=seed,
     )
+
+
+def _search(memo, estimation, z, loss, iterations):
+    """The Fit of a first search from z. One that a memo knows is where it ended, without its residual and jacobian."""
+    made = []
+
+    def compute():
+        made.append(estimation.solve(z, loss, iterations, tolerance=1e-8))
+        return made[0].p, made[0].own, made[0].cost, float(made[0].evaluations), float(made[0].status)
+
+    p, own, cost, evaluations, status = memo.recall("search", [z], compute)
+    if made:
+        return made[0]
+    none = np.zeros((0, estimation.size))
+    return Fit(
+        p=p, own=own, cost=cost, residual=none[:, 0], jacobian=none, evaluations=int(evaluations), status=int(status), loss=loss
+    )
+
+
+def _problem(case, logs, partial, options):
+    """What two runs must share for one to go on where the other ended: {what: text}."""
+    return {
+        "command": "identify",
+        "case": digest([np.asarray(leaf) for leaf in jax.tree.leaves(case.loop)]),
+        "logs": digest([np.asarray(v) for one in logs for v in (one.t, one.u, one.y)]),
+        "free": repr([tuple(b) for b in partial.bounds]),
+        "held back": repr([one.samples for one in partial.logs]),
+        "noise": repr(partial.noise.tolist()),
+        "substeps": repr(partial.substeps),
+        **{n: repr(options[n]) for n in ("start", "loss", "iterations", "gap")},
+        "jaxtank": jaxtank.__version__,
+        "jax": jax.__version__,
+    }
 
 
 def stopped(loop, parameters):

@@ -33,6 +33,7 @@ def add(commands, parents):
     )
     one.add_argument("--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,")
     one.add_argument("--gap", default="1.5", metavar="X", help="longest step between samples, in median steps (default 1.5)")
+    one.add_argument("--resume", metavar="DIR", help="go on where a killed run with --out DIR ended, to the same answer")
     one.add_argument("--start", default="free", metavar="HOW", help="first levels: free (default), measured, or case")
     one.add_argument("--starts", default="8", metavar="N", help="searches (default 8)")
     one.add_argument("--iterations", default="100", metavar="N", help="evaluations of each search (default 100)")
@@ -54,7 +55,7 @@ def add(commands, parents):
 
 def run(args):
     """Run the command; returns the exit code."""
-    arguments.check_out(args)
+    args.out = args.resume or args.out
     seed, case = arguments.seed(args), arguments.open_case(args)
     free = dict(arguments.pair("--free", text, arguments.span) for text in args.free) or None
     if args.plan:
@@ -64,6 +65,7 @@ def run(args):
     from tuning import report
     from tuning.identify import identify
     from tuning.log_file import read_log
+    from tuning.memo import discard
 
     columns = dict(case.log) | dict(arguments.pair("--column", text, _column) for text in args.column)
     logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
@@ -94,10 +96,16 @@ def run(args):
         profile=args.profile,
         iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
         gap=gap,
+        folder=args.out,
+        resume=args.resume is not None,
         progress=Interrupts().check,  # between two searches
     )
-    written = found.save(args.out, args.line) if args.out else []
-    print(report.dumps(found.to_json()) if args.json else repr(found))
+    try:
+        written = found.save(args.out, args.line) if args.out else []
+    finally:  # a disk that is full costs the files, not the answer; and the log is kept
+        print(report.dumps(found.to_json()) if args.json else repr(found))
+    if args.out and found.status != "interrupted":
+        discard(args.out)  # the result is whole: there is nothing left to go on with
     if written and not args.quiet:
         print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):

@@ -288,9 +288,11 @@ def save(found, folder, command=None):
     drawn = figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
     files["report.html"] = page_of(found, drawn, command)
     files |= report.pngs(drawn)
-    for path in _left_over(Path(folder), files):
+    stale = _left_over(Path(folder), files)
+    written = report.write_files(Path(folder), files)
+    for path in stale:
         path.unlink()
-    return report.write_files(Path(folder), files)
+    return written
 
 
 def _left_over(folder, files):

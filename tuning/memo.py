@@ -45,12 +45,13 @@ class Log(Memo):
         super().__init__()
         self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 1, "problem": problem}, sort_keys=True)
         whole = self._read(head) if resume else b""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with open(self.path, "r+b" if whole else "wb") as file:
-            if whole:
-                file.truncate(len(whole))
-            else:
-                file.write(head.encode() + b"\n")
+        with self._told():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "r+b" if whole else "wb") as file:
+                if whole:
+                    file.truncate(len(whole))
+                else:
+                    file.write(head.encode() + b"\n")
         self.resumed = len(self.found)
 
     def _read(self, head):
@@ -86,9 +87,17 @@ class Log(Memo):
 
     def keep(self, kind, key, result):
         text = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]})
-        with open(self.path, "ab") as file:
+        with self._told(), open(self.path, "ab") as file:
             file.write(text.encode() + b"\n")
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
+
+    @contextlib.contextmanager
+    def _told(self):
+        """A log that cannot be written is an InputError: what it holds so far is good to go on from."""
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"{str(self.path)!r} cannot be written ({error.strerror}): make room, then --resume") from None
 
     def memo(self):
         """A Memo of what the log holds, for what is asked later and need not be kept."""

@@ -45,9 +45,8 @@ class Store:
                 raise InputError(f"{str(folder)!r} holds finished batches of this ensemble: --resume goes on with them")
         elif resume and not path.exists():
             raise InputError(f"--resume {str(folder)!r}: there is no ensemble to go on with")
-        self.folder.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            write_atomic(path, json.dumps(self.manifest, indent=1) + "\n")
+            self._write(path, json.dumps(self.manifest, indent=1) + "\n")
 
     def path(self, k):
         """The file of batch k."""
@@ -61,7 +60,14 @@ class Store:
         """Write batch k, {name: array}."""
         out = io.BytesIO()
         np.savez(out, **batch, seal=np.bytes_(self._seal(k, batch)))
-        write_atomic(self.path(k), out.getvalue())
+        self._write(self.path(k), out.getvalue())
+
+    def _write(self, path, data):
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_atomic(path, data)
+        except OSError as error:
+            raise InputError(f"{str(path)!r} cannot be written ({error.strerror}): make room, then --resume") from None
 
     def get(self, k):
         """Batch k as {name: array}. Raises InputError for a file that is not one of ours, or not what was written as batch k of this

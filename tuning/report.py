@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.errors import InputError
-from jaxtank.files import check_folder, write_atomic
+from jaxtank.files import check_folder, write_together
 from jaxtank.neighbours import columns
 from jaxtank.units import DEFAULT
 from tuning.objective import LOWER
@@ -567,9 +568,8 @@ def save(result, folder, command=None):
         "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
         "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
-    written = write_files(folder, files)  # the numbers first: pictures take seconds
     drawn = figures(result, runs)
-    return written + write_files(folder, {"report.html": page_of(result, drawn, command)} | pngs(drawn))
+    return write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
 
 
 def save_run(case, run, payload, folder, gif=False):
@@ -578,27 +578,24 @@ def save_run(case, run, payload, folder, gif=False):
 
     check_folder(folder)
     picture = plotting.responses(case.loop, {case.name: run}, case.title)
-    written = write_files(
-        Path(folder),
-        {
-            "result.json": dumps(payload) + "\n",
-            "trajectory.csv": trajectory_csv(run, case.loop.units),
-            "responses.png": _png(picture),
-        },
-    )
+    files = {
+        "result.json": dumps(payload) + "\n",
+        "trajectory.csv": trajectory_csv(run, case.loop.units),
+        "responses.png": _png(picture),
+    }
     if gif:
         from jaxtank.animation import animate
 
-        written.append(animate(case.loop, run, Path(folder) / "run.gif"))
-    return written
+        with tempfile.TemporaryDirectory() as aside:
+            files["run.gif"] = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
+    return write_files(Path(folder), files)
 
 
 def write_files(folder, files):
-    """Write {name: text or bytes} to `folder`, made if need be; returns the paths."""
+    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; returns the paths."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, data in files.items():
-            write_atomic(folder / name, data)
+        write_together(folder, files)
     except OSError as error:
         raise InputError(f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder that can") from None
     return [folder / name for name in files]

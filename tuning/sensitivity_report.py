@@ -248,5 +248,5 @@ def save(result, folder, command=None):
     """
     check_folder(folder)
     files = {"result.json": report.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
-    written, drawn = report.write_files(Path(folder), files), figures(result)
-    return written + report.write_files(Path(folder), {"report.html": page_of(result, drawn, command)} | report.pngs(drawn))
+    drawn = figures(result)
+    return report.write_files(Path(folder), files | {"report.html": page_of(result, drawn, command)} | report.pngs(drawn))

@@ -4,7 +4,7 @@ import functools
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import check_out, number, open_case, pair, span, whole
+from tuning.arguments import number, open_case, pair, span, whole
 from tuning.arguments import seed as seed_of
 from tuning.interrupts import Interrupts, put_back
 from tuning.options import choices_of, distributions_of, limits_of, once, scenarios_of, tell_written, tradeoff_of
@@ -19,7 +19,6 @@ def tune(args):
 
 
 def _tune(args):
-    check_out(args)
     seed, case = seed_of(args), open_case(args)
     from jaxtank.rig import check_objective
     from tuning import report, search
@@ -29,10 +28,6 @@ def _tune(args):
     if objective:
         objective = check_objective(objective)
     limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
-    if args.resume and args.out and args.resume != args.out:
-        raise InputError("--resume and --out name different folders: a run is continued in its own")
-    if args.resume is not None and not args.resume.strip():
-        raise InputError("--resume '': must name a folder")
     folder = args.resume or args.out
     choices, varied = choices_of(args), distributions_of(args, case)
     only = (args.samples, args.fresh, args.back_off)
@@ -83,13 +78,15 @@ def _tune(args):
         from tuning.bound import bound
 
         result = result.replace(bound=bound(result.tuned, objective, limits))
-    written = result.save(folder, args.line) if folder else []
     args.out = folder
+    try:
+        written = result.save(folder, args.line) if folder else []
+    finally:  # a disk that is full costs the files, not the answer; and the log is kept
+        print(report.dumps(report.json_of(result)) if args.json else report.text(result))
     if folder and result.status != "interrupted":
         from tuning.memo import discard
 
         discard(folder)  # the result is whole: there is nothing left to go on with
-    print(report.dumps(report.json_of(result)) if args.json else report.text(result))
     tell_written(written, args)
     if not args.out and not args.json and not args.quiet:
         print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)

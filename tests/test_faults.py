@@ -1,0 +1,292 @@
+"""Kills, full disks, folders that cannot be written to, Ctrl-C, two runs in one folder: one line, the promised exit code, nothing lost."""
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from jaxtank import files
+from jaxtank.errors import InputError
+from tuning import cli, holds, memo, parts
+
+HERE = Path(__file__).parent
+SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
+SIMULATE = ["simulate", *SHORT, "--quiet"]
+SEARCH = ["tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0", "--iterations", "3", "--quiet"]
+SPREAD = ["uncertainty", *SHORT, "--samples", "20", "--quiet"]
+JAXTANK = [sys.executable, "-m", "tuning.cli"]
+WRITERS = {
+    "simulate": SIMULATE,
+    "uncertainty": SPREAD,
+    "tune": SEARCH,
+    "sensitivity": ["sensitivity", *SHORT, "--quiet"],
+    "export": ["export", "cascaded/pi"],
+    "show": ["show", "cascaded/pi"],
+    "identify": ["identify", "cascaded/pi", "--data", "log.csv", "--quiet"],
+    "compare": ["compare", "cascaded"],
+}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def say(words, capsys):
+    """(exit code, stdout, lines of stderr) of a command."""
+    code = cli.main([str(w) for w in words])
+    said = capsys.readouterr()
+    return code, said.out, said.err.splitlines()
+
+
+@contextlib.contextmanager
+def small_disk(size):
+    """No file may grow past `size` bytes: what is written past it fails, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def frozen(tmp_path):
+    """A folder with an old result in it that nobody may write to, root included."""
+    folder = tmp_path / "frozen"
+    folder.mkdir()
+    (folder / "result.json").write_text("old")
+    if os.geteuid():
+        folder.chmod(0o500)
+        yield folder
+        folder.chmod(0o700)
+        return
+    bind = subprocess.run(["mount", "--bind", folder, folder], capture_output=True)
+    if bind.returncode:
+        pytest.skip("root, to whom permissions say nothing, may not mount read-only here")
+    subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+# Files together.
+
+
+def test_files_are_replaced_together_or_not_at_all(tmp_path):
+    (tmp_path / "a").write_text("old a")
+    (tmp_path / "b").write_text("old b")
+    with small_disk(1000), pytest.raises(OSError, match="too large"):
+        files.write_together(tmp_path, {"a": "new a", "b": "x" * 2000})
+    (tmp_path / "c").mkdir()
+    with pytest.raises(IsADirectoryError):
+        files.write_together(tmp_path, {"a": "new a", "c": "new c"})
+    assert {p.name for p in tmp_path.iterdir()} == {"a", "b", "c"}
+    assert ((tmp_path / "a").read_text(), (tmp_path / "b").read_text()) == ("old a", "old b")
+    files.write_together(tmp_path, {"a": "new a", "b": b"new b"})
+    assert ((tmp_path / "a").read_text(), (tmp_path / "b").read_text()) == ("new a", "new b")
+
+
+def test_a_log_and_batches_on_a_full_disk(tmp_path):
+    """/dev/full takes nothing."""
+    (tmp_path / memo.NAME).symlink_to("/dev/full")
+    with pytest.raises(InputError, match=r"evaluations\.jsonl.*No space left.*--resume"):
+        memo.Log(tmp_path, {"p": 1})
+    with small_disk(100), pytest.raises(InputError, match=r"manifest\.json.*too large.*--resume"):
+        parts.Store(tmp_path / "new", {"measures": ["x" * 200]})
+    assert not list((tmp_path / "new").iterdir())
+
+
+def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
+    log = memo.Log(tmp_path, {"p": 1})
+    with small_disk(2000), pytest.raises(InputError, match="make room, then --resume"):
+        for i in range(100):
+            log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
+    again, made = memo.Log(tmp_path, {"p": 1}, resume=True), []
+    assert [again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3)) for i in range(20)] == [
+        (float(i), 1 / 3) for i in range(20)
+    ]
+    assert made[0] > 5 and made == list(range(made[0], 20))
+
+
+# The command on a full disk, and where nothing can be written.
+
+
+def old_result(folder, words, capsys):
+    """What a first run wrote; its log, if it needs one, is log.csv."""
+    if words[0] == "identify":
+        row = "".join(f"{k},{3 + k % 5},{4 + 0.01 * k},{4 - 0.01 * k}\n" for k in range(60))
+        Path("log.csv").write_text("t_s,pump_V,upper_V,lower_tank_V\n" + row)
+        folder.mkdir()
+        (folder / "result.json").write_text("old" * 5000)
+    else:
+        assert say([*words, "--out", folder], capsys)[0] in (0, 3)
+    return contents(folder)
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow) for n in WRITERS]
+)
+def test_a_full_disk_leaves_the_old_result_whole(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words, folder = WRITERS[name], tmp_path / "out"
+    before = old_result(folder, words, capsys)
+    room = 0.5 * max(map(len, before.values()))  # enough for a log, or a batch, not for the largest file of the result
+    seed = ["--seed", "1"] if name in ("simulate", "tune", "uncertainty") else []
+    with small_disk(int(room)):
+        code, out, err = say([*words, *seed, "--out", folder], capsys)
+    last = [line for line in err if line.startswith("jaxtank: ")]
+    assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
+    assert "Traceback" not in "".join(err)
+    assert {n: data for n, data in contents(folder).items() if n in before} == before
+    left = contents(folder).keys() - before.keys()
+    assert all(n == memo.NAME or n == parts.MANIFEST or parts.NAME.fullmatch(n) for n in left), left
+    if name in ("tune", "uncertainty", "sensitivity", "identify"):
+        assert out.strip()  # the answer is told all the same
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen, capsys):
+    for folder in (frozen, frozen / "in" / "it", frozen / "result.json" / "under"):
+        code, out, err = say([*WRITERS[name], "--out", folder], capsys)
+        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), err
+    assert contents(frozen) == {"result.json": b"old"}
+
+
+def test_output_that_cannot_be_written_is_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*JAXTANK, "completion", "bash"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "jaxtank: output: No space left on device\n")
+
+
+# Two runs in one folder.
+
+HOLDER = """
+import sys, time
+from tuning.holds import hold
+with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextlib.contextmanager
+def another(folder, kind="alone"):
+    """A process that holds a folder."""
+    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, capsys):
+    folder = tmp_path / "out"
+    with another(folder) as process:
+        began = time.monotonic()
+        code, out, err = say([*SIMULATE, "--out", folder], capsys)
+        assert code == 2 and out == "" and len(err) == 1
+        assert f"process {process.pid}" in err[0] and "give another folder" in err[0]
+        assert time.monotonic() - began < 20 and [p.name for p in folder.iterdir()] == [holds.NAME]
+        (folder / f".result.json.k3x{files.ASIDE}").write_text("half")
+        (folder / ".mine").write_text("whole")
+    with holds.hold(folder):  # its process was killed
+        assert {p.name for p in folder.iterdir()} == {holds.NAME, ".mine"}
+        assert int((folder / holds.NAME).read_text()) == os.getpid()
+    assert [p.name for p in folder.iterdir()] == [".mine"]
+
+
+def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
+    with another(tmp_path, "shared"):
+        with holds.hold(tmp_path, shared=True):
+            (tmp_path / f".part{files.ASIDE}").write_text("of the other")
+        assert (tmp_path / holds.NAME).exists() and (tmp_path / f".part{files.ASIDE}").exists()
+        with pytest.raises(InputError, match="another run"), holds.hold(tmp_path):
+            pass
+
+
+def test_a_folder_made_for_nothing_is_removed(tmp_path):
+    with pytest.raises(KeyError), holds.hold(tmp_path / "a" / "b"):
+        raise KeyError
+    assert not list(tmp_path.iterdir())
+    with holds.hold(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "b" / "result.json").write_text("{}")
+    assert [p.name for p in (tmp_path / "a" / "b").iterdir()] == ["result.json"]
+    with holds.hold(None):
+        pass
+
+
+@pytest.mark.slow
+def test_two_at_once(tmp_path):
+    """Both may be right one after the other; neither is wrong."""
+    command = [*JAXTANK, *SPREAD, "--samples", "3000", "--out", str(tmp_path / "out")]
+    alone = [*JAXTANK, *SPREAD, "--samples", "3000", "--out", str(tmp_path / "alone")]
+    subprocess.run(alone, check=True, capture_output=True)
+    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [(*p.communicate(), p.returncode) for p in both]
+    assert sorted(code for *_, code in said) in ([0, 2], [0, 0])
+    assert all(err == "" if code == 0 else "another run" in err and err.count("\n") == 1 for _, err, code in said)
+    mine, theirs = contents(tmp_path / "out"), contents(tmp_path / "alone")
+    assert mine.keys() == theirs.keys() and mine["draws.csv"] == theirs["draws.csv"]
+
+
+# Ctrl-C.
+
+
+def interrupted(words, folder, lines):
+    """(exit code, stderr) of a command that gets SIGINT once its log has so many lines; 0: as soon as the folder is there."""
+    process = subprocess.Popen([*JAXTANK, *words, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    log, until = folder / memo.NAME, time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < until:
+        if (lines == 0 and folder.exists()) or (log.exists() and log.read_bytes().count(b"\n") >= lines > 0):
+            break
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    return process.communicate(timeout=120)[1], process.returncode
+
+
+LONG = ["tune", "cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400", "--screening", "64", "--validation", "0"]
+
+
+@pytest.mark.parametrize("lines", [6, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 11, 25))])
+def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
+    said, code = interrupted([*LONG, "--starts", "40", "--quiet"], tmp_path / "out", lines)
+    assert code == 130 and "interrupted" in said and "Traceback" not in said, said
+    found = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert found["status"] == "interrupted" and "best point so far" in found["message"]
+    evaluated = (tmp_path / "out" / memo.NAME).read_bytes().count(b"\n") - 1
+    assert 0 < evaluated < 200 and found["evaluations"]["simulations"] > 0
+    assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / holds.NAME).exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_before_anything_was_found(tmp_path):
+    said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", 0)
+    assert code == 130 and "interrupted" in said and "Traceback" not in said, said
+    left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
+    assert holds.NAME not in left
+
+
+# Kills.
+
+
+def drill(*words):
+    done = subprocess.run([sys.executable, str(HERE / "fault_drill.py"), *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+def test_two_kills():
+    assert "2 kills" in drill("2", "uncertainty")
+
+
+@pytest.mark.slow
+def test_fifty_kills():
+    print(drill("50"))

@@ -1,0 +1,90 @@
+"""One run writes to a folder at a time: a lock that dies with its process, and says whose it is."""
+
+import contextlib
+import os
+import time
+from pathlib import Path
+
+from jaxtank.errors import InputError
+from jaxtank.files import check_folder, sweep
+
+try:
+    import fcntl
+except ImportError:  # no such locks on this system: two runs in one folder are then the user's own care
+    fcntl = None
+
+NAME = ".jaxtank.lock"
+PATIENCE = 0.2
+"""How long a lock may be in the way before it is a refusal [s]: one that lets go removes its file in less."""
+
+
+@contextlib.contextmanager
+def hold(folder, shared=False):
+    """Hold `folder`, made if need be, against other runs; shared=True: against all but those that share it.
+
+    The lock is the system's own (flock on a file with the process id in it): it ends with its process however that ends, so that what a
+    kill left behind is taken over, unfinished files (`jaxtank.files.sweep`) included. A folder that was made for this and got nothing is
+    removed again. folder None: nothing is held. Raises InputError where another run holds it.
+    """
+    if folder is None or fcntl is None:
+        yield
+        return
+    check_folder(folder)
+    folder = Path(folder)
+    made = [p for p in (folder, *folder.parents) if not p.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = _locked(folder, shared)
+        try:
+            if not shared:
+                sweep(folder)
+            yield
+        finally:
+            _let_go(folder / NAME, file)
+    finally:
+        for path in made:  # the innermost first
+            with contextlib.suppress(OSError):  # not empty
+                path.rmdir()
+
+
+def _locked(folder, shared):
+    """The open lock file of a folder, None where there are no locks."""
+    path, kind, until = folder / NAME, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(file, kind | fcntl.LOCK_NB)
+        except BlockingIOError:
+            owner = os.pread(file, 20, 0).decode("ascii", "replace").strip()
+            os.close(file)
+            if time.monotonic() > until:
+                raise InputError(
+                    f"{str(folder)!r}: another run{f' (process {owner})' if owner.isdigit() else ''} writes there: wait for it, or give "
+                    "another folder"
+                ) from None
+            time.sleep(0.02)
+            continue
+        except OSError:  # a file system without locks
+            os.close(file)
+            path.unlink(missing_ok=True)
+            return None
+        with contextlib.suppress(OSError):
+            if os.fstat(file).st_ino == os.stat(path).st_ino:  # else: removed by its last owner before we had it
+                with contextlib.suppress(OSError):  # a full disk: the lock holds without a name on it
+                    os.ftruncate(file, 0)
+                    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+                return file
+        os.close(file)
+
+
+def _let_go(path, file):
+    """Remove the lock file, unless others share it, and close it."""
+    if file is None:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.unlink(path)
+    except OSError:
+        pass
+    finally:
+        os.close(file)
