@@ -8,7 +8,7 @@ import tuning
 
 LAYERS = [
     {"errors", "_xla", "files", "units"},
-    {"tree", "numerics", "invariants", "dependence", "materialise"},
+    {"tree", "numerics", "invariants", "dependence", "materialise", "compensated"},
     {"records", "signals"},
     {"plants", "sensors", "actuators"},
     {"analysis", "linear", "qp"},
