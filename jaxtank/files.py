@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import os
+import stat
 import tempfile
 from pathlib import Path
 
@@ -70,16 +71,23 @@ def check_folder(path):
         raise InputError(f"--out {str(path)!r}: no permission to write to {str(parent)!r}")
 
 
+def refusal(path, largest):
+    """Why a file is not to be read, in words, or None: it is a folder, a device or a pipe, which may never end, or has more than `largest`
+    bytes. Raises OSError where there is none."""
+    found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        return "is not a file"
+    return f"has {found.st_size} bytes: at most {largest} are read" if found.st_size > largest else None
+
+
 def read_text(path, kind):
     """The text of a file of at most 4 MiB; InputError if it is missing, too large, or not UTF-8."""
     path = Path(path)
     if not path.exists():
         raise InputError(f"{kind} {str(path)!r} does not exist")
-    if not path.is_file():
-        raise InputError(f"{kind} {str(path)!r} is not a file")
-    if path.stat().st_size > LARGEST_TEXT:
-        raise InputError(f"{kind} {str(path)!r} has {path.stat().st_size} bytes: at most {LARGEST_TEXT} are read")
     try:
+        if why := refusal(path, LARGEST_TEXT):
+            raise InputError(f"{kind} {str(path)!r} {why}")
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{kind} {str(path)!r} is not UTF-8 text (byte {error.start})") from None

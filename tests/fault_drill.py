@@ -2,7 +2,7 @@
 
 Each trial starts one of the commands with --out, sends SIGKILL at a seeded moment, half of them anywhere in the time that an undisturbed run
 takes, half just after some number of evaluations has been kept, and goes on with --resume (or once more, where nothing had been kept yet).
-Now and then what goes on is killed as well. The folder must then hold the files of an undisturbed run, byte by byte but for the wall
+What goes on may be killed as well, up to four times. The folder must then hold the files of an undisturbed run, byte by byte but for the wall
 time and the command line that the report tells, and nothing else.
 
 Processes are forked from one that has imported everything and started no jax: a kill tells more there than in two seconds of imports.
@@ -86,21 +86,21 @@ def kept(folder):
 
 
 def kill(child, folder, seconds, count):
-    """SIGKILL after `seconds`, or, where count is given, that long after `count` has been kept. False where the run had ended before."""
+    """SIGKILL after `seconds`, or, where count is given, that long after `count` has been kept. The exit code of a run that had ended before,
+    else None."""
     until = time.monotonic() + PATIENCE
-    if count is not None:
-        while kept(folder) < count and os.waitpid(child, os.WNOHANG) == (0, 0):
-            if time.monotonic() > until:
-                raise TimeoutError(f"{folder}: {kept(folder)} of {count} kept")
-            time.sleep(0.001)
-    try:
-        if ended(child, seconds) is not None:
-            return False
-    except ChildProcessError:  # it ended while it was watched
-        return False
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
+    while count is not None and kept(folder) < count:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > until:
+            raise TimeoutError(f"{folder}: {kept(folder)} of {count} kept")
+        time.sleep(0.001)
+    code = ended(child, seconds)
+    if code is None:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    return code
 
 
 def contents(folder):
@@ -140,16 +140,16 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
             folder, again, first = Path("run"), False, told["kills"]
             told["trials"] += 1
             shutil.rmtree(folder, ignore_errors=True)
-            for attempt in range(6):
+            for attempt in range(12):
                 option = "--resume" if again else "--out"
                 child = start(cli, [*COMMANDS[name], option, str(folder)])
-                if attempt < 3 and (attempt == 0 or rng.random() < 0.25) and told["kills"] < count:
+                if attempt < 4 and (attempt == 0 or rng.random() < 0.5) and told["kills"] < count:
                     few = rng.randint(1, max(1, whole[name][1])) if rng.random() < 0.5 else None
-                    if kill(child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few):
+                    code = kill(child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few)
+                    if code is None:
                         told["kills"] += 1
                         again = True
                         continue
-                    code = None
                 else:
                     code = ended(child)
                 if again and code == 2 and AFRESH.search(Path("said.txt").read_text()):
@@ -157,7 +157,7 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                     told["afresh"] += 1
                     continue
                 break
-            if code not in (None, whole[name][0]):
+            if code != whole[name][0]:
                 told["wrong"].append(f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}")
             elif contents(folder) != whole[name][3]:
                 mine, theirs = contents(folder), whole[name][3]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import DataError, InputError, nearest
+from jaxtank.files import refusal
 from tuning.logs import FLOWS, LENGTHS, VOLTS, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
@@ -85,11 +86,12 @@ class _Column:
 def _text(path):
     if not path.exists():
         raise DataError(f"log {str(path)!r} does not exist")
-    if not path.is_file():
-        raise DataError(f"log {str(path)!r} is not a file")
-    if path.stat().st_size > LARGEST:
-        raise DataError(f"log {str(path)!r} has {path.stat().st_size} bytes: at most {LARGEST} are read")
-    data = path.read_bytes()
+    try:
+        if why := refusal(path, LARGEST):
+            raise DataError(f"log {str(path)!r} {why}")
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"log {str(path)!r} cannot be read: {error.strerror}") from None
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import InputError
+from jaxtank.files import refusal
 
 NAME = "evaluations.jsonl"
 LARGEST = 1 << 30
@@ -56,8 +57,8 @@ class Log(Memo):
 
     def _read(self, head):
         try:
-            if self.path.stat().st_size > LARGEST:
-                raise InputError(f"{NAME}: larger than {LARGEST >> 20} MiB, not a log of this program")
+            if why := refusal(self.path, LARGEST):
+                raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} {why}, so it is no log of this program")
             data = self.path.read_bytes()
         except FileNotFoundError:
             done = (self.path.parent / "result.json").exists()

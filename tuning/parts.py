@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.files import check_folder, write_atomic
+from jaxtank.files import check_folder, refusal, write_atomic
 
 MANIFEST = "manifest.json"
 LARGEST = 1 << 28
@@ -96,6 +96,8 @@ class Store:
 def read_part(path, names):
     """{name: array} of a batch file; nothing is unpickled, and nothing larger than it should be is unpacked."""
     try:
+        if why := refusal(path, LARGEST):
+            raise ValueError(why)
         with zipfile.ZipFile(path) as archive:
             if sum(info.file_size for info in archive.infolist()) > LARGEST:
                 raise InputError(f"{path.name}: unpacks to more than {LARGEST >> 20} MiB, not a batch of this program")
@@ -111,9 +113,11 @@ def read_manifest(folder):
     """The manifest of a folder. Raises InputError where there is none, or it is no manifest."""
     path = Path(folder) / MANIFEST
     try:
-        if path.stat().st_size > 1 << 20:
-            raise InputError(f"{str(path)!r} is too large to be a manifest")
+        if why := refusal(path, 1 << 20):
+            raise InputError(f"{str(path)!r} {why}, so it is no manifest")
         found = json.loads(path.read_text(encoding="utf-8"))
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
     except ValueError:

@@ -1,0 +1,85 @@
+"""The same numbers whatever runs them: another process, two devices, the XLA option off; and where float32 is refused, with the reason.
+
+Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices, processes and shards of an ensemble).
+"""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxtank import _xla
+
+RUNS = """
+import json, sys
+import jaxtank, jax
+import numpy as np
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+from jaxtank import presets, rig
+case = rig.set_values(presets.find("gouta2022/chadpc"), {"clock.duration": 20.0, "sensor.noise": 0.02, "actuator.delay": 0.2})
+names, device = ["rms_error_total", "input_travel", "max_level"], jax.devices()[-1]
+def run(value, noise):
+    return jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": value}), case.clock, names, jax.random.key(noise))
+at = jax.device_put(1.3, device)
+found = {"one": run(at, 5), "slope": jax.jacfwd(lambda v: run(v, 5))(at)}
+found["lanes"] = jax.vmap(run)(jax.device_put(np.array([0.9, 1.3, 2.0]), device), np.array([4, 5, 6], dtype=np.uint32))
+places = {d.id for v in jax.tree.leaves(found) for d in v.devices()}
+print(json.dumps([{f"{k} {n}": [x.hex() for x in np.ravel(v).tolist()] for k, t in found.items() for n, v in t.items()}, sorted(places)]))
+"""
+
+
+def told(devices, option):
+    """({quantity: (n,)}, where it was) of a fresh process."""
+    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)} | {_xla.SWITCH: option}
+    done = subprocess.run([sys.executable, "-c", RUNS, str(devices)], capture_output=True, text=True, check=True, env=env)
+    found, places = json.loads(done.stdout)
+    return {name: np.array([float.fromhex(v) for v in values]) for name, values in found.items()}, places
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return told(1, "1")[0]
+
+
+def test_another_process_and_the_second_of_two_devices_give_the_same_bits(plain):
+    again, places = told(2, "1")
+    assert places == [1]
+    for name, values in plain.items():
+        np.testing.assert_array_equal(again[name], values, name)
+
+
+def test_the_option_off_gives_the_same_noisy_runs_lanes_and_slopes(plain):
+    """To 1e-12 (methods 2.1: the last bits of a step; what adds up over 2,000 of them). A slope is a sum of terms of either sign."""
+    off, _ = told(1, "0")
+    for name, values in plain.items():
+        np.testing.assert_allclose(off[name], values, rtol=1e-10 if "slope" in name else 1e-12, err_msg=name)
+
+
+def test_a_lane_is_the_run_alone(plain):
+    for name in ("rms_error_total", "input_travel", "max_level"):
+        alone, lanes = plain[f"one {name}"], plain[f"lanes {name}"]
+        np.testing.assert_allclose(lanes.reshape(3, -1)[1], alone, rtol=1e-12, err_msg=name)
+        assert np.all(np.ptp(lanes.reshape(3, -1), axis=0) > 0)
+
+
+FLOAT32 = """
+import jaxtank, tuning
+from jaxtank import presets
+case = presets.find("cascaded/pi")
+for run in (lambda: tuning.tune(case), lambda: tuning.identify(case, None), lambda: tuning.tune_robust(case)):
+    try:
+        run()
+        print("ran")
+    except jaxtank.InputError as error:
+        print(error)
+"""
+
+
+def test_float32_is_refused_where_it_would_be_wrong():
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", FLOAT32], capture_output=True, text=True, check=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == 3 and all("float64" in line and "jax_enable_x64" in line for line in lines), lines

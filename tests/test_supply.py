@@ -1,0 +1,224 @@
+"""What is shipped, and what it never does: pickles, evaluates text, talks to a network, or reads a file of any size."""
+
+import ast
+import importlib.util
+import os
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import jaxtank
+import tuning
+from jaxtank import files, presets
+from jaxtank.errors import DataError, InputError
+from tuning import log_file, memo, parts
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {p.__name__: Path(p.__file__).parent for p in (jaxtank, tuning)}
+
+# Modules that one would need to unpickle, evaluate, talk to others or start programs.
+SUSPECT = {
+    "pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib",
+    "code", "codeop", "runpy", "imp",
+    "socket", "socketserver", "ssl", "urllib", "http", "ftplib", "smtplib", "telnetlib", "xmlrpc", "requests", "httpx", "aiohttp", "asyncio",
+    "websockets", "webbrowser", "sentry_sdk", "posthog", "analytics",
+    "subprocess", "ctypes", "cffi", "multiprocessing", "pty",
+}  # fmt: skip
+IMPORTED = {
+    ("tuning.bench", "subprocess"): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
+    ("tuning.bench", "ctypes"): "and calls it",
+}
+
+# Calls that run text, and those that open a file to read it.
+CALLS = {"eval", "exec", "__import__", "import_module", "system", "popen", "execv", "execve", "spawnv", "startfile", "breakpoint"}
+READS = {
+    "open",
+    "read_text",
+    "read_bytes",
+    "load",
+    "fromfile",
+    "loadtxt",
+    "genfromtxt",
+    "memmap",
+    "ZipFile",
+    "TarFile",
+    "imread",
+    "CDLL",
+}
+MADE = {
+    ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
+}
+READ = {
+    ("jaxtank.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
+    ("jaxtank.rig.reading", "load", "read_text"): "that of jaxtank.files",
+    ("jaxtank.animation", "animate", "read_bytes"): "the picture that it has just drawn",
+    ("tuning.report", "save_run", "read_bytes"): "the picture that it has just drawn",
+    ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
+    ("tuning.completion", "words", "read_text"): "names.txt of the package",
+    ("tuning.log_file", "_text", "read_bytes"): "after `refusal`",
+    ("tuning.memo", "_read", "read_bytes"): "after `refusal`",
+    ("tuning.memo", "__init__", "open"): "to write",
+    ("tuning.memo", "keep", "open"): "to write",
+    ("tuning.parts", "read_part", "ZipFile"): "after `refusal`; unpacked sizes are added up first",
+    ("tuning.parts", "read_part", "load"): "after that; allow_pickle=False",
+    ("tuning.parts", "read_manifest", "read_text"): "after `refusal`",
+    ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
+    ("tuning.holds", "_locked", "open"): "its own lock, of which 20 bytes are read",
+}
+
+
+def sources():
+    """(module, syntax tree) of every file of the packages."""
+    for package, root in PACKAGES.items():
+        for path in sorted(root.rglob("*.py")):
+            name = ".".join([package, *path.relative_to(root).with_suffix("").parts]).removesuffix(".__init__")
+            yield name, ast.parse(path.read_text())
+
+
+def called(tree):
+    """(function it stands in, name) of every call; a name is the last word: `np.load` is load."""
+    inside = {}
+    for function in ast.walk(tree):
+        if isinstance(function, ast.FunctionDef):
+            inside |= {id(node): function.name for node in ast.walk(function)}  # the innermost last
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            f = node.func
+            name = f.id if isinstance(f, ast.Name) else f.attr if isinstance(f, ast.Attribute) else ""
+            yield inside.get(id(node), ""), name, ast.unparse(f), node
+
+
+def test_nothing_is_imported_that_unpickles_talks_or_starts_programs():
+    found = set()
+    for module, tree in sources():
+        for node in ast.walk(tree):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            found |= {(module, n.split(".")[0]) for n in names if n.split(".")[0] in SUSPECT}
+    assert found == set(IMPORTED)
+
+
+def test_no_text_is_run():
+    found = {(m, where, name) for m, tree in sources() for where, name, _, _ in called(tree) if name in CALLS}
+    assert found == set(MADE)
+    for module, tree in sources():
+        for _, name, _, node in called(tree):
+            assert not any(
+                k.arg == "allow_pickle" and not (isinstance(k.value, ast.Constant) and k.value.value is False)
+                for k in node.keywords
+            )
+            assert name not in ("to_pickle", "read_pickle") and not any(k.arg == "shell" for k in node.keywords), module
+
+
+def test_every_reading_of_a_file_is_known_and_why_it_is_safe():
+    ours = ("presets.", "jaxtank.presets", "rig.", "rigs.")  # load: of a case by its name, of a rig by read_text
+    found = {
+        (m, where, name)
+        for m, tree in sources()
+        for where, name, whole, _ in called(tree)
+        if name in READS
+        and not whole.startswith(ours)
+        and not (m in ("jaxtank.presets", "jaxtank.rig.reading") and whole == "load")
+    }
+    assert found == set(READ)
+    assert all(READ.values()) and all(MADE.values()) and all(IMPORTED.values())
+
+
+def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
+    """A device, a pipe, a folder, a huge file where a log, a batch, a manifest or a rig file should be."""
+    (tmp_path / "huge").touch()
+    os.truncate(tmp_path / "huge", 1 << 32)  # takes no room
+    os.mkfifo(tmp_path / "pipe")
+    loop = presets.find("cascaded/pi").loop
+    for i, odd in enumerate((Path("/dev/zero"), tmp_path / "pipe", tmp_path, tmp_path / "huge")):
+        folder = tmp_path / f"run{i}"
+        folder.mkdir()
+        for name in (memo.NAME, parts.MANIFEST, "part-000000.npz", "rig.toml", "log.csv"):
+            (folder / name).symlink_to(odd)
+        says = "is not a file|at most"
+        with pytest.raises(InputError, match=says):
+            memo.Log(folder, {"p": 1}, resume=True)
+        with pytest.raises(InputError, match=says):
+            parts.read_manifest(folder)
+        with pytest.raises(InputError, match=says):
+            parts.read_part(folder / "part-000000.npz", {"x"})
+        with pytest.raises(InputError, match=says):
+            files.read_text(folder / "rig.toml", "rig file")
+        with pytest.raises(DataError, match=says):
+            log_file.read_log(folder / "log.csv", loop)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """(wheel, sdist) of the repository."""
+    if importlib.util.find_spec("hatchling") is None or not (ROOT / "pyproject.toml").exists():
+        pytest.skip("hatchling, or the repository, is not here")
+    folder = tmp_path_factory.mktemp("dist")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(folder)], cwd=ROOT, check=True, capture_output=True)
+    (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    return wheel, sdist
+
+
+def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
+    with zipfile.ZipFile(built[0]) as archive:
+        names = set(archive.namelist())
+        info = {n.split(".dist-info/")[1] for n in names if ".dist-info/" in n}
+        license_there = any("LICENSE" in n for n in info)
+        entry = next(archive.read(n).decode() for n in names if n.endswith("entry_points.txt"))
+    packed = {n for n in names if ".dist-info/" not in n}
+    there = {
+        f"{package}/{path.relative_to(root)}"
+        for package, root in PACKAGES.items()
+        for path in root.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert packed == there and {"tuning/floor.c", "tuning/names.txt"} <= packed
+    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "txt"}
+    assert license_there and "METADATA" in info and "jaxtank = tuning.cli:main" in entry
+
+
+def test_the_sdist_holds_what_builds_and_tests_it(built):
+    with tarfile.open(built[1]) as archive:
+        names = {m.name.split("/", 1)[1] for m in archive.getmembers()}
+        assert all(m.isreg() and not m.name.startswith(("/", "..")) for m in archive.getmembers())
+    assert {
+        "pyproject.toml",
+        "README.md",
+        "CHANGELOG.md",
+        "LICENSE",
+        "jaxtank/__init__.py",
+        "tuning/floor.c",
+        "tests/conftest.py",
+    } <= names
+    assert {"tests/rigs/watertank.toml", "tests/slow.txt", "tests/versions.sh", "notebooks/run.py"} <= names
+    assert not any("__pycache__" in n or n.endswith((".pyc", ".so", ".log")) for n in names)
+
+
+@pytest.mark.slow
+def test_it_installs_into_an_empty_environment_and_runs(built, tmp_path):
+    """From wheel and from sdist, away from the repository; needs the dependencies from pip."""
+    for package, words in zip(
+        built, (["tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "1", "--out", "tuned"], ["list"])
+    ):
+        home = tmp_path / package.suffix[1:]
+        venv.create(home, with_pip=True)
+        clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+        subprocess.run([home / "bin" / "pip", "install", "--quiet", package], check=True, capture_output=True, env=clean)
+        done = subprocess.run([home / "bin" / "jaxtank", *words], cwd=home, capture_output=True, text=True, env=clean)
+        assert done.returncode == 0 and "backstepping" in done.stdout, done.stderr
+        where = subprocess.run(
+            [home / "bin" / "python", "-c", "import tuning; print(tuning.__file__)"],
+            cwd=home,
+            capture_output=True,
+            text=True,
+            env=clean,
+        )
+        assert where.stdout.startswith(str(home))
+    assert {"result.json", "rig.toml", "report.html", "responses.png"} <= {p.name for p in (tmp_path / "whl" / "tuned").iterdir()}
