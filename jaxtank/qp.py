@@ -103,7 +103,7 @@ def interior_point(H, f, G, l, u, iterations):
         reach = _reach(p, step, BACK)
         new = jax.tree.map(lambda a, b: a + reach * b, p, step)
         worst = jnp.maximum(jnp.max(jnp.abs(dual)), jnp.maximum(jnp.max(jnp.abs(up)), jnp.max(jnp.abs(low))))
-        # every product, not their mean: one of 30 that is left behind at 7e-11 bends the slopes by 1e-4. Further steps would only stir the
+        # every product, not their mean: a row that is left behind at 7e-11 bends the slopes by 1e-4. Further steps would only stir the
         # last digits
         left = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll))
         done = (left < LEFT * MU_MIN) & (worst < RESIDUAL)

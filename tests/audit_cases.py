@@ -12,12 +12,15 @@ from jax.flatten_util import ravel_pytree
 
 from jaxtank import loop as lp
 from jaxtank import presets, rig
+from jaxtank.derivatives import _sensitivities
 from jaxtank.signals import Ramps
+from jaxtank.tree import parameters, with_values
 
 MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")
-SAMPLES = 60
+SAMPLES = 64
+"""A square: reverse mode then has no rest to compile."""
 POINTS = 8
-STARTS = ("near", "far", "dry", "empty", "equal", "full", "over", "far")
+STARTS = ("near", "far", "dry", "empty", "equal", "full", "over", "zero")
 ROUGH = {}
 """{case: (tolerance, why)} where differences, or the run, are good to less."""
 
@@ -30,7 +33,8 @@ def start(kind, rng, loop):
         "near": np.clip(x0 * rng.uniform(0.8, 1.2, x0.size), 0.05 * rim, 0.9 * rim),
         "far": rim * rng.uniform(0.1, 0.9, x0.size),
         "dry": rim * rng.uniform(0.1, 0.9, x0.size),
-        "empty": plant.knee * rng.uniform(0.1, 1.5, x0.size),  # not at 0, where a law may have a kink
+        "empty": plant.knee * rng.uniform(0.1, 1.5, x0.size),
+        "zero": 0.0,  # a kink of many: pumps rest exactly at their limit, tanks exactly at their bottom
         "equal": rim * rng.uniform(0.2, 0.8),
         "full": rim * rng.uniform(0.97, 1.0, x0.size),
         "over": rim * rng.uniform(1.01, 1.05, x0.size),
@@ -43,7 +47,7 @@ def start(kind, rng, loop):
 def short(name):
     """The case with a run of SAMPLES: changes of the setpoint come at once, for there is no time to wait for them."""
     case = presets.find(name)
-    dt = max(case.clock.dt, 0.05)  # 60 samples of 0.01 s are too short for the levels to move
+    dt = max(case.clock.dt, 0.05)  # 64 samples of 0.01 s are too short for the levels to move
     changes = {"clock.dt": dt, "clock.duration": (SAMPLES - 1) * dt}
     reference = case.loop.reference
     if isinstance(reference, Ramps):
@@ -76,7 +80,7 @@ def subject(names, seed=0):
         found = found[0] if isinstance(found, tuple) else found
         return jnp.concatenate([jnp.ravel(found[m]) for m in MEASURES])
 
-    tolerance, why = ROUGH.get(names[0], (1e-5, "runs of 60 samples amplify rounding"))
+    tolerance, why = ROUGH.get(names[0], (1e-5, "runs of 64 samples amplify rounding"))
     return Subject(
         label(names),
         functools.partial(value, lp.evaluate_and_flag),
@@ -104,4 +108,41 @@ def groups():
     return list(found.values())
 
 
-SUBJECTS = {label(names): functools.partial(subject, names) for names in groups()}
+def carried(name, lanes):
+    """The derivatives that the tuner carries along with a run (`loop.sensitivities`), which are not those of jax.jvp; `lanes`: as it
+    makes them for several runs side by side."""
+    case, rng = short(name), np.random.default_rng(0)
+    loop, clock = case.loop, case.clock
+    own = {n: v for n, v in parameters(loop).items() if n.startswith("controller.") and not n.startswith("controller.model.")}
+    values = own | {n: parameters(loop)[n] for n in ("plant.drain", "x0")}
+    points = [
+        {n: np.asarray(v, dtype=float) * (1.0 + 0.02 * rng.standard_normal(np.shape(v))) for n, v in values.items()}
+        | {"x0": start(kind, rng, loop)}
+        for kind in STARTS
+    ]
+    order = tuple(values)
+    unravel = ravel_pytree([points[0][n] for n in order])[1]
+    flat = lambda found: jnp.concatenate([jnp.ravel(found[m]) for m in MEASURES])
+    at = lambda theta: with_values(loop, dict(zip(order, unravel(theta))))
+
+    def forwards(theta):
+        slopes = _sensitivities(loop, clock, MEASURES, order, unravel(theta), None, lanes=lanes)[1]
+        return jnp.concatenate([slopes[m].reshape(-1, theta.size) for m in MEASURES])
+
+    return Subject(
+        f"sensitivities {name}{', lanes' if lanes else ''}",
+        lambda theta: flat(lp.evaluate_and_flag(at(theta), clock, MEASURES)[0]),
+        np.array([ravel_pytree([p[n] for n in order])[0] for p in points]),
+        np.array([scales_of([np.maximum(p[n], 0.01) if n == "x0" else p[n] for n in order]) for p in points]),
+        tolerance=1e-5,
+        why="runs of 64 samples amplify rounding",
+        backwards=lambda theta: flat(lp.evaluate_for_reverse(at(theta), clock, MEASURES)),
+        forwards=forwards,
+    )
+
+
+SUBJECTS = {label(names): functools.partial(subject, names) for names in groups()} | {
+    f"sensitivities {name}{', lanes' if lanes else ''}": functools.partial(carried, name, lanes)
+    for name in ("gouta2015/ngpc", "gouta2022/chadpc", "calofir/backstepping", "mirakhorli/hybrid", "khalid/gpc")
+    for lanes in (False, True)
+}

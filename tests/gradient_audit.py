@@ -5,13 +5,14 @@
     python tests/gradient_audit.py law qp     subjects whose name has one of these words
     python tests/gradient_audit.py --record   also keeps each subject's row in gradient_audit.json, and count and worst error in survived.json;
                                               with words the rows of the others stay, so that it can be done in pieces
+    python tests/gradient_audit.py --record --missing     those without a row
 
 How a difference is judged. Every direction is scaled by the parameter itself, so steps and slopes are relative. Central differences are
 taken at eight steps, each a quarter of the last, and extrapolated pairwise (Richardson: fourth order). The step is chosen by the differences
 alone, where three in a row agree best, never by the derivative that is judged. The error is relative to the component's own slope, but not to
 less than 1e-3 of the largest slope of that component over the points, nor 1e-6 of its value: below, differences of float64 say nothing.
 
-Kinks. Sixty samples of a loop have hundreds of clips, absolute values and extremes; now and then one lies within the steps, and a central
+Kinks. The samples of a run have hundreds of clips, absolute values and extremes; now and then one lies within the steps, and a central
 difference is then the mean of two slopes. A derivative that misses the central difference is therefore compared with the slopes of the left
 and of the right, of smaller steps and each by itself (third order). Where these two agree with each other there is no kink, and a miss is a
 miss. Where they do not, the derivative must be one of them ("kinks" in the table: its error is the distance from the nearer) or lie between
@@ -30,7 +31,9 @@ import numpy as np
 STEPS = 0.01 * 0.25 ** np.arange(8)
 NEAR = 0.01 * 0.25 ** np.arange(2, 12)  # of one-sided differences: down to 2e-9
 TOLERANCE = 1e-6
+FLOOR = 1e-3  # share of a component's largest slope below which an error is relative to that share
 BOTH_WAYS = 1e-9  # forward against reverse
+IN_HASTE = {"xla_backend_optimization_level": 0}  # reverse mode is compared, not timed: half of the audit was its compilation
 
 
 class Subject(NamedTuple):
@@ -42,8 +45,10 @@ class Subject(NamedTuple):
     scales: np.ndarray  # (K, P) what counts as a change of 1 of each parameter
     directions: int | None = None  # random directions per point; None: every axis
     tolerance: float = TOLERANCE
-    why: str = ""  # of another tolerance
+    why: str = ""  # of another tolerance or floor
+    floor: float = FLOOR
     backwards: Callable | None = None  # the same function for reverse mode, where that is another program
+    forwards: Callable | None = None  # (P,) -> (outputs, P): its forward derivatives, where a program of its own makes them
 
 
 class Row(NamedTuple):
@@ -74,8 +79,11 @@ def audit(subject, seed=0):
         moves = subject.scales[:, None, :] * np.eye(size)
     else:
         moves = subject.scales[:, None, :] * rng.choice([-1.0, 1.0], (count, subject.directions, size))
-    forward = jax.jit(jax.vmap(lambda x, v: jax.vmap(lambda w: jax.jvp(f, (x,), (w,))[1])(v)))(subject.points, moves)
-    jacobian = jax.jit(jax.vmap(jax.jacrev(subject.backwards or f)))(subject.points)
+    if subject.forwards is None:
+        forward = jax.jit(jax.vmap(lambda x, v: jax.vmap(lambda w: jax.jvp(f, (x,), (w,))[1])(v)))(subject.points, moves)
+    else:
+        forward = np.einsum("kop,kdp->kdo", np.asarray(jax.jit(jax.vmap(subject.forwards))(subject.points)), moves)
+    jacobian = jax.jit(jax.vmap(jax.jacrev(subject.backwards or f)), compiler_options=IN_HASTE)(subject.points)
     forward, reverse = np.asarray(forward), np.einsum("kop,kdp->kdo", np.asarray(jacobian), moves)
     signs = np.array([1.0, -1.0])
     at = subject.points[:, None, None, None, :] + moves[:, :, None, None, :] * STEPS[:, None, None] * signs[:, None]
@@ -83,7 +91,7 @@ def audit(subject, seed=0):
     values = np.asarray(run(at.reshape(-1, size))).reshape(*at.shape[:4], -1)
     found, step = differences(values)
     size_of = np.abs(values).max(axis=(0, 1, 2, 3))
-    least = np.maximum(1e-3 * np.abs(forward).max(axis=(0, 1)), 1e-6 * size_of) + 1e-300
+    least = np.maximum(subject.floor * np.abs(forward).max(axis=(0, 1)), 1e-6 * size_of) + 1e-300
     scale = np.maximum(np.maximum(np.abs(forward), np.abs(found)), least)
     error, ways = np.abs(forward - found) / scale, np.abs(forward - reverse) / scale
     finite = bool(np.isfinite(forward).all() and np.isfinite(reverse).all() and np.isfinite(values).all())
@@ -170,12 +178,17 @@ def summed(rows):
     )
 
 
+def recorded():
+    """{subject: its row} of gradient_audit.json."""
+    file = Path(__file__).parent / "gradient_audit.json"
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
 def record(rows, known):
     """Keep `rows` beside those kept before of subjects that are still `known`; the sum of all goes to survived.json."""
     from jaxtank.files import write_atomic
 
-    here = Path(__file__).parent
-    kept = json.loads((here / "gradient_audit.json").read_text()) if (here / "gradient_audit.json").exists() else {}
+    here, kept = Path(__file__).parent, recorded()
     kept = {n: kept[n] for n in known if n in kept} | {r.name: list(r[1:]) for r in rows}
     write_atomic(
         here / "gradient_audit.json", "{\n" + ",\n".join(f" {json.dumps(n)}: {json.dumps(r)}" for n, r in kept.items()) + "\n}\n"
@@ -196,6 +209,8 @@ def main(words):
 
     known = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
     chosen = {n: make for n, make in known.items() if n in audit_subjects.QUICK or "--quick" not in words}
+    if "--missing" in words:
+        chosen = {n: make for n, make in chosen.items() if n not in recorded()}
     wanted = [w for w in words if not w.startswith("-")]
     rows = []
     for name, make in chosen.items():
