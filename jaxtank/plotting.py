@@ -137,8 +137,10 @@ def responses(loop, trajectories, title="", limits=None):
                 draw(ax)
             for ax in line[len(row) :]:
                 ax.set_visible(False)
-        for ax in axes[-1]:
-            ax.set_xlabel("time [s]")
+        for column in axes.T:
+            last = [ax for ax in column if ax.get_visible()][-1]
+            last.set_xlabel("time [s]")
+            last.tick_params(labelbottom=True)
         handles = {}
         for ax in axes.flat:
             for handle, label in zip(*ax.get_legend_handles_labels()):
@@ -384,7 +386,7 @@ def violations(rows, samples):
         ends = np.array([r["interval95"] for r in rows])
         ax.barh(y, p, color="#56B4E9", height=0.6)
         ax.errorbar(p, y, xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]), fmt="none", ecolor="black", capsize=3)
-        ax.set_yticks(y, [f"{r['name']} ({r['limit']:g})" for r in rows])
+        ax.set_yticks(y, [f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")") for r in rows])
         ax.invert_yaxis()
         ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
         ax.set_xlabel(f"probability of breaking the limit [-], {samples} draws")

@@ -559,3 +559,14 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
     process.wait()
     found = json.loads(subprocess.run([*command, "--resume", str(folder)], capture_output=True, check=True).stdout)
     assert {k: v for k, v in found.items() if k != "wall_s"} == {k: v for k, v in alone.items() if k != "wall_s"}
+
+
+def test_distributions_are_told_in_words():
+    from tuning import Correlated, Normal, Uniform
+    from tuning.ensemble_report import _words
+
+    pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
+    assert _words(Uniform(relative=0.1)) == "+-10 % (even)"
+    assert _words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (even, all entries together)"
+    assert _words(Normal(relative=0.05)) == "5 % sd (normal, cut at 3 sd)"
+    assert _words(pair) == "2 of them together, with a covariance"

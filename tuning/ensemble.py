@@ -122,6 +122,7 @@ class Ensemble:
                 {
                     "name": limit.label,
                     "limit": limit.value,
+                    "unit": ms.unit(limit.measure, self.case.loop.units),
                     "count": broken,
                     "probability": broken / self.samples,
                     "interval95": clopper_pearson(broken, self.samples),

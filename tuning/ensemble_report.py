@@ -9,6 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.files import check_folder
 from tuning import page, parts, report, search
+from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
@@ -83,7 +84,7 @@ def parts_of(ensemble):
         rows = [
             [
                 v["name"],
-                report.number(v["limit"]),
+                f"{report.number(v['limit'])} {v['unit']}",
                 v["count"],
                 f"{v['probability']:.4g}",
                 "{:.4g} : {:.4g}".format(*v["interval95"]),
@@ -104,8 +105,27 @@ def parts_of(ensemble):
 
 
 def _words(distribution):
-    fields = {n: v for n, v in dataclasses.asdict(distribution).items() if v is not None and v is not False}
-    return f"{type(distribution).__name__}({', '.join(f'{n}={v}' for n, v in fields.items())})"
+    """A distribution in words, in the units of its parameter."""
+    d = distribution
+    if isinstance(d, Correlated):
+        return f"{len(d.names)} of them together, with a covariance" + ("" if d.mean is None else " and means of their own")
+    if isinstance(d, Discrete):
+        return (
+            "one of "
+            + ", ".join(f"{v:g}" for v in d.values)
+            + ("" if d.weights is None else f" (weights {', '.join(f'{w:g}' for w in d.weights)})")
+        )
+    kind = {Uniform: "even", LogUniform: "even in the logarithm", Normal: f"normal, cut at {getattr(d, 'cut', 0):g} sd"}[type(d)]
+    if getattr(d, "relative", None) is not None:
+        extent = f"{100 * d.relative:g} %" + (" sd" if isinstance(d, Normal) else "")
+        extent = extent if isinstance(d, Normal) else f"+-{extent}"
+    elif getattr(d, "factor", None) is not None:
+        extent = f"within a factor {d.factor:g}"
+    elif isinstance(d, Normal):
+        extent = (f"{d.mean:g} " if d.mean is not None else "") + f"sd {d.sd:g}"
+    else:
+        extent = f"{d.low:g} to {d.high:g}"
+    return f"{extent} ({kind}{', all entries together' if d.tied else ''})"
 
 
 def draws_csv(ensemble):
@@ -151,9 +171,12 @@ def page_of(ensemble, drawn, command=None):
         worst = max(broken, key=lambda v: v["probability"])
         low, high = worst["interval95"]
         facts.insert(1, ("the limit most often broken", f"{100 * worst['probability']:.3g} %"))
+        which = f"{worst['name']} ({report.number(worst['limit'])} {worst['unit']})"
         said.append(
-            f"{worst['name']} ({report.number(worst['limit'])}) is the limit most often broken: in {worst['count']} of {ensemble.samples} draws, "
+            f"{which} is the limit most often broken: in {worst['count']} of {ensemble.samples} draws, "
             f"a probability between {low:.3g} and {high:.3g} with 95 % confidence"
+            if worst["count"]
+            else f"a limit that none of {ensemble.samples} draws breaks is broken with a probability of at most {high:.3g}, with 95 % confidence"
         )
     found = ensemble.summary().get("rms_error_total")
     if found is not None and found["p50"] is not None:

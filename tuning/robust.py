@@ -119,7 +119,7 @@ def tune_robust(
     words = (
         f"on {fresh} fresh plants a limit was broken {broken} times (95 % interval {interval[0]:.2g} to {interval[1]:.2g}); the scenario "
         f"theory bounds the probability by {certificate.bound:.2g} (N {samples}, support {support}, confidence 1 - 1e-6"
-        + (")" if risk == "worst" else f"; an indication: plants at no limit move the {risk} too, and count for nothing in it)")
+        + (")" if risk == "worst" else f", an indication: plants at no limit move the {risk} too, and count for nothing in it)")
     )
     if back_off:
         words += f"; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
