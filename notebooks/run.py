@@ -1,13 +1,15 @@
 """Execute the notebooks of this folder, top to bottom.
 
-    python notebooks/run.py            in full, and keep the outputs in the files
-    python notebooks/run.py --fast     with JAXTANK_NOTEBOOK_FAST=1 (coarse steps, few starts), outputs thrown away
-    python notebooks/run.py 05 08      those alone, by the beginnings of their names
+python notebooks/run.py            in full, and keep the outputs in the files
+python notebooks/run.py --fast     with JAXTANK_NOTEBOOK_FAST=1 (coarse steps, few starts), outputs thrown away
+python notebooks/run.py 05 08      those alone, by the beginnings of their names
 """
 
 import os
+import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -21,6 +23,10 @@ def main():
     if not paths:
         sys.exit(f"no notebook here begins with {' or '.join(wanted)}")
     os.environ["JAXTANK_NOTEBOOK_FAST"] = "1" if fast else "0"
+    if fast and len(paths) > 1:  # two at once, each in a process of its own
+        alone = lambda path: subprocess.run([sys.executable, __file__, "--fast", path.name]).returncode
+        with ThreadPoolExecutor(2) as pool:
+            sys.exit(max(pool.map(alone, paths)))
     for path in paths:
         began = time.perf_counter()
         notebook = nbformat.read(path, as_version=4)
