@@ -140,7 +140,7 @@ def small_point(rng):
     return small_network(rng), x, rng.uniform(0, 10, 2), rng.uniform(-5, 50, 3)
 
 
-@subject("plants.derivative net_inflow", quick=True, points=30)
+@subject("plants.derivative net_inflow", points=30)
 def _(rng):
     return small_point(rng), lambda p: (
         p[0].derivative(0.0, tuple(p[1]), tuple(p[2]), tuple(p[3])),
@@ -460,12 +460,18 @@ LAWS = {
     "mirakhorli": ("sfc", "smc", "hybrid", "lqi", "smc-printed"),
     "khalid": ("gpc", "gpc-nc2-constrained", "laguerre-mimo", "laguerre-mimo-constrained"),
 }
+ROUGH = {
+    "gpc-nc2-constrained": {"tolerance": 1e-4, "why": "the interior point stops at a complementarity of 1e-12"},
+    "laguerre-mimo-constrained": {
+        "tolerance": 1e-4,
+        "floor": 1.0,
+        "why": "where many of its rows bind, the 15 iterations leave 4e-7 V, which differences feel and the slope of the implicit function "
+        "does not: -1e-4 against -2e-8 V at point 10, direction 23; with 30 iterations both are 0 to 1e-10",
+    },
+}
 for _paper, _names in LAWS.items():
     for _name in _names:
-        rough = (
-            {"tolerance": 1e-4, "why": "the interior point stops at a complementarity of 1e-12"} if "constrained" in _name else {}
-        )
-        of_law(f"{_paper}/{_name}", **rough)
+        of_law(f"{_paper}/{_name}", **ROUGH.get(_name, {}))
 
 
 def with_a_schedule(case):

@@ -10,9 +10,11 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from jaxtank import files
+import tuning
+from jaxtank import files, presets
 from jaxtank.errors import InputError
 from tuning import cli, holds, memo, parts
 
@@ -272,6 +274,31 @@ def test_ctrl_c_before_anything_was_found(tmp_path):
     assert code == 130 and "interrupted" in said and "Traceback" not in said, said
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
     assert holds.NAME not in left
+
+
+def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
+    """Two of three searches are in the log: the third alone is run, and the answer has the same bits; another problem's log is refused."""
+    case, k = presets.find("cascaded/pi"), np.arange(80.0)
+    wave = 3 + np.sin(k / 9)
+    log = tuning.log(t=4 * k, u=wave[:, None], y=np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1))
+    free = {"plant.pump_gain[0]": (0.02, 0.1), "plant.drain[1]": (0.02, 0.08)}
+    options = {"start": "case", "starts": 3, "hold_back": 0, "noise": 0.05, "substeps": 2}
+    seen = []
+
+    def stop(fit):
+        seen.append(fit)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    whole = tuning.identify(case, log, free, **options)
+    assert tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status == "interrupted"
+    assert (tmp_path / memo.NAME).read_bytes().count(b"\n") == 3
+    again = tuning.identify(case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options)
+    assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]  # what is recalled has no slopes
+    told = [{k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)]
+    assert json.dumps(told[0]) == json.dumps(told[1])
+    with pytest.raises(InputError, match="of another problem; what differs: noise"):
+        tuning.identify(case, log, free, folder=tmp_path, resume=True, **{**options, "noise": 0.06})
 
 
 # Kills.

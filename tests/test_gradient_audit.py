@@ -1,7 +1,8 @@
 """The audit of gradients (gradient_audit.py) as tests, and the points on a kink, where no central difference is a derivative.
 
 The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow -s tests/test_gradient_audit.py` audits
-everything, every case of `jaxtank list` too, and prints the count and the worst error.
+everything, every case of `jaxtank list` too, and prints the count and the worst error; that takes half an hour of a processor, so in pieces:
+-k law, -k case, -k sensitivities, ... (2 GB at a time).
 """
 
 import dataclasses
@@ -36,6 +37,8 @@ ALL = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
 def test_forward_and_reverse_are_the_differences(name, rows):
     subject = ALL[name]()
     rows.append(audit(subject))
+    if name not in audit_subjects.QUICK:
+        jax.clear_caches()  # a program of its own for each: together they would take tens of gigabytes
     assert rows[-1].good, told(rows[-1:])
 
 
