@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -153,6 +154,71 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
             files.read_text(folder / "rig.toml", "rig file")
         with pytest.raises(DataError, match=says):
             log_file.read_log(folder / "log.csv", loop)
+
+
+def header(shape):
+    """The beginning of an .npy file that claims to hold an array of this shape."""
+    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+ARRAY = header("(2,)") + bytes(16)
+HOSTILE = {
+    "a bomb": {"x.npy": ARRAY + bytes(1 << 29)},
+    "a name that climbs": {"../../x.npy": ARRAY},
+    "a name of a folder": {"/x.npy": ARRAY},
+    "a batch twice": {"x.npy": ARRAY, "y.npy": ARRAY},
+    "an array of 745 GiB": {"x.npy": header("(100000000000,)") + bytes(16)},
+    "a header that is a program": {"x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"},
+    "an object, pickled": {"x.npy": ARRAY.replace(b"<f8", b"|O ")},
+    "nothing": {},
+}
+
+
+@pytest.mark.parametrize("held", HOSTILE.values(), ids=HOSTILE)
+def test_a_batch_is_not_trusted(held, tmp_path):
+    path = tmp_path / "part-000000.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in held.items():
+            archive.writestr(name, data)
+    with pytest.raises(InputError, match=r"part-000000\.npz: is not a batch of this program"):
+        parts.read_part(path, {"x"})
+    assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (tmp_path.parent / "x.npy").exists()
+
+
+def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
+    path = tmp_path / "part-000000.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x.npy", ARRAY + bytes(1 << 20))
+    whole = path.read_bytes()
+    at = whole.rfind(b"PK\x01\x02")  # its entry in the directory
+    for where, value in ((at + 24, b"\x0a\0\0\0"), (at + 8, b"\x01\0"), (at + 10, b"\x63\0"), (60, b"\xff" * 40), (0, b"\0" * 4)):
+        path.write_bytes(whole[:where] + value + whole[where + len(value) :])
+        with pytest.raises(InputError, match="not a batch of this program"):
+            parts.read_part(path, {"x"})
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="not a batch of this program"):
+        parts.read_part(path, {"x"})
+
+
+def test_json_without_end_is_refused(tmp_path):
+    head = json.dumps({"jaxtank": 1, "problem": {"p": 1}}) + "\n"
+    deep = "[" * 200_000 + "\n"
+    (tmp_path / parts.MANIFEST).write_text(deep)
+    with pytest.raises(InputError, match="is not a manifest"):
+        parts.read_manifest(tmp_path)
+    entry = '{"kind": "x", "key": "k", "result": ['
+    for text, words in (
+        (deep, "not a log"),
+        (head + deep, "line 2"),
+        (head + entry + '{"all": [' * 900 + "]}" * 900 + "]}\n", "line 2"),  # JSON that is read, and is too deep to be a result
+        (head + entry + '{"shape": [1000000000, 1000000000], "hex": ["0x1p0"]}]}\n', "line 2"),
+        (head + entry + '{"shape": [1], "hex": ["__import__"]}]}\n', "line 2"),
+    ):
+        (tmp_path / memo.NAME).write_text(text)
+        with pytest.raises(InputError, match=words):
+            memo.Log(tmp_path, {"p": 1}, resume=True)
+        assert (tmp_path / memo.NAME).read_text() == text
 
 
 @pytest.fixture(scope="module")

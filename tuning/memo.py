@@ -15,6 +15,9 @@ NAME = "evaluations.jsonl"
 LARGEST = 1 << 30
 """Largest log that is read [bytes]."""
 
+BROKEN = (ValueError, KeyError, TypeError, RecursionError)
+"""What reading a line of JSON raises that is not one of ours; the last where it is nested without end."""
+
 
 class Memo:
     """Results by what was asked. A search asks in an order that its results alone decide, so one that is started again and finds its
@@ -71,7 +74,7 @@ class Log(Memo):
             return b""
         try:
             mine, theirs = json.loads(head)["problem"], json.loads(lines[0])["problem"]
-        except (ValueError, KeyError, TypeError):
+        except BROKEN:
             raise InputError(f"--resume: {NAME} is not a log of this program") from None
         if mine != theirs:
             other = [k for k in mine if not isinstance(theirs, dict) or mine[k] != theirs.get(k)]
@@ -82,7 +85,7 @@ class Log(Memo):
             try:
                 entry = json.loads(line)
                 self.found[entry["key"]] = tuple(_read(v) for v in entry["result"])
-            except (ValueError, KeyError, TypeError):
+            except BROKEN:
                 raise InputError(f"--resume: line {i + 2} of {NAME} is not one of its entries") from None
         return b"".join(lines)
 

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +102,11 @@ def read_part(path, names):
         with zipfile.ZipFile(path) as archive:
             if sum(info.file_size for info in archive.infolist()) > LARGEST:
                 raise InputError(f"{path.name}: unpacks to more than {LARGEST >> 20} MiB, not a batch of this program")
-            if {Path(n).stem for n in archive.namelist()} != names:
+            if sorted(archive.namelist()) != sorted(f"{n}.npy" for n in names):
                 raise InputError(f"{path.name}: does not hold the measures of the manifest")
         with np.load(path, allow_pickle=False) as table:
             return {name: table[name] for name in names}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise InputError(f"{path.name}: is not a batch of this program ({' '.join(str(error).split())[:80]})") from None
 
 
@@ -120,7 +121,7 @@ def read_manifest(folder):
         raise
     except OSError as error:
         raise InputError(f"{str(path)!r} cannot be read ({error.strerror})") from None
-    except ValueError:
+    except (ValueError, RecursionError):  # the latter where it is nested without end
         raise InputError(f"{str(path)!r} is not a manifest") from None
     if not isinstance(found, dict):
         raise InputError(f"{str(path)!r} is not a manifest")
