@@ -148,9 +148,15 @@ def _balanced(plant, y, words):
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    found = scipy.optimize.least_squares(
-        residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=500
-    )
+    try:
+        with np.errstate(
+            all="ignore"
+        ):  # an area of 1e-300, say, overflows on the way: the answer below is all that need be said of it
+            found = scipy.optimize.least_squares(
+                residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=500
+            )
+    except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
+        raise EquilibriumError(f"{words} have no steady state") from None
     rough = float(np.max(np.abs(plant.drain))) / float(np.min(plant.area)) * np.sqrt(2.0 * float(plant.gravity) * scale)
     if not np.max(np.abs(found.fun)) < 1e-9 * max(rough, 1e-12):
         raise EquilibriumError(f"{words} have no steady state")

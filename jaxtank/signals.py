@@ -248,7 +248,7 @@ def pours(tanks, entries):
         if not (time >= 0 and duration > 0 and 0 <= tank < tanks):
             raise InputError(
                 f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0 s, a duration above 0 s and a tank "
-                f"from 0 to {tanks - 1}"
+                f"from 0 to {tanks - 1}, counted from 0"
             )
     return Pours(
         volume=number([volume for *_, volume in entries]),

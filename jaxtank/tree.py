@@ -138,6 +138,7 @@ def check_leaves(tree, names=None):
 def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
     array, low, high = np.asarray(value), meta["low"], meta["high"]
+    array = number(value) if array.dtype == object else array  # whole numbers of 2^64 and more are no numbers to numpy
     good = np.isfinite(array)
     if low is not None:
         good = good & ((array > low) if meta["strict"] else (array >= low))

@@ -171,7 +171,8 @@ BAD = {  # text of a file: words its message must have
     HEAD + "[valeus]": ["valeus", "nearest: values"],
     HEAD + "values = 3": ["values = 3", "table"],
     values('"controller.kk" = 1'): ["controller.kk", "nearest: controller.k"],
-    values("controller.k = 1"): ["'controller'"],  # without its quotation marks TOML reads a table
+    values("controller.kk = 1"): ["controller.kk", "nearest: controller.k"],  # without its quotation marks TOML reads a table
+    values('controller.k = 1\n"controller.k" = 2'): ["[values] controller.k is given twice"],
     values('"plant.area[9]" = 1'): ["plant.area[9]", "(4,)"],
     values('"plant.area[x]" = 1'): ["plant.area[x]"],
     values('"clock.dtt" = 1'): ["clock.dtt", "nearest: clock.dt"],
@@ -184,6 +185,7 @@ BAD = {  # text of a file: words its message must have
     values('"controller.k" = 0'): ["controller.k = 0 1/s", "above 0"],
     values('"controller.k" = -1'): ["controller.k = -1 1/s", "above 0"],
     values(f'"controller.k" = {BIG}'): ["controller.k"],
+    HEAD + '[log]\nh1 = "level"\nh2 = ["level", "cm"]': ["log h2 = 'level'", "h1 already"],
     values('"controller.k" = [1.0]'): ["controller.k", "(1,)"],
     values('"plant.area" = [1, 2, 3]'): ["plant.area", "(3,)", "(4,)"],
     values('"plant.area" = [[1, 2], [3]]'): ["plant.area"],
@@ -228,6 +230,8 @@ BAD = {  # text of a file: words its message must have
     reference("changes = [[nan, 1, 5.0]]"): ["nan"],
     reference("changes = [[inf, 1, 5.0]]"): ["inf"],
     reference(f"changes = [[20.0, 1, {BIG}]]"): ["reference"],
+    reference("changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]"): ["[20.0, 2, 5.0] after [30.0, 1, 5.0]", "order of time"],
+    reference("changes = [[30.0, 1, 5.0], [30.0, 1, 6.0]]"): ["two changes of output 1 at 30 s"],
     reference("ramp = -1"): ["reference.ramp = -1 s"],
     reference("ramp = nan"): ["reference.ramp = nan"],
     reference('ramp = "x"'): ["reference.ramp = 'x'"],
@@ -235,6 +239,7 @@ BAD = {  # text of a file: words its message must have
     limits("max_levl = 3"): ["max_levl", "nearest: max_level"],
     limits("max_level = nan"): ["max_level", "nan"],
     limits("max_level = inf"): ["max_level", "inf"],
+    limits("max_level = -1.0"): ["limit max_level = -1.0 cm", "at least 0 cm"],
     limits("max_level = true"): ["max_level"],
     limits('max_level = "high"'): ["max_level", "high"],
     limits('rms_error = "rim"'): ["rms_error", "rim"],
@@ -365,3 +370,49 @@ def test_scenarios_and_spreads_that_cannot_be_used(text, words, tmp_path):
     path.write_text(HEAD + text + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=re.escape(words)):
         rig.load(path)
+
+
+LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
+
+
+@pytest.mark.parametrize("big", [2**63, 2**64, LARGE])
+@pytest.mark.parametrize(
+    "line",
+    [
+        '[values]\n"plant.area" = [BIG, 20, 20, 20]',
+        "[limits]\nmax_level = BIG",
+        "[objective]\nrms_error = BIG",
+        '[free]\n"controller.k" = [0.1, BIG]',
+        '[[scenario]]\nweight = BIG\nvalues = { "sensor.noise" = BIG }',
+        "[[pour]]\ntime = 1\nduration = BIG\ntank = 1\nvolume = BIG",
+        "[disturbance]\ninflow = [0, 0, 0, BIG]",
+        '[[fault]]\nof = "drain[0]"\nstart = 1\nend = BIG\nextra = BIG',
+    ],
+)
+def test_a_large_whole_number_is_the_float_next_to_it(line, big):
+    whole, real = (rig.loads(HEAD + line.replace("BIG", text)) for text in (str(big), repr(float(big))))
+    assert_same(whole, real)
+    assert [s.weight for s in whole.scenarios] == [s.weight for s in real.scenarios]
+
+
+def test_a_large_setpoint_is_told_as_the_float_next_to_it():
+    """No steady state has it: the answer is that, whole number or not."""
+    for form in ("initial = [BIG, 3.0]", "changes = [[20.0, 1, BIG]]"):
+        told = []
+        for text in (str(LARGE), repr(float(LARGE))):
+            with pytest.raises(EquilibriumError) as caught:
+                rig.loads(reference(form.replace("BIG", text)))
+            told.append(str(caught.value))
+        assert told[0] == told[1]
+
+
+def test_names_without_quotation_marks_are_dotted_names(gouta):
+    text = HEAD + "[values]\nclock.dt = 0.5\n[values.controller]\nk = 0.5\n[values.plant]\n'area[1]' = 20.0\n"
+    text += "[free]\ncontroller.k = [0.1, 9.0]\n[uncertain.plant]\ndrain = 0.1\n[[scenario]]\nvalues.sensor.noise = 0.1\n"
+    case = rig.loads(text)
+    assert_same(
+        case.replace(free={}),
+        gouta("backstepping", {"clock.dt": 0.5, "controller.k": 0.5, "plant.area[1]": 20.0}).replace(free={}),
+    )
+    assert set(case.free) == {"controller.k"} and case.uncertain == {"plant.drain": 0.1}
+    assert dict(case.scenarios[0].values) == {"sensor.noise": 0.1}

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+import warnings
 
 import jax
 import numpy as np
@@ -197,7 +198,31 @@ TANK += '[law]\nkind = "pid"\nKc = 1.0\nTi = 9.0\n'
     ("text", "words"),
     [
         (HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 9\nvolume = 1.0\n", r"pour 1: tank = 9: .* from 1 to 4"),
-        (HEAD + "[[pour]]\ntime = 1.0\nduration = 0.0\ntank = 1\nvolume = 1.0\n", "duration above 0"),
+        (
+            HEAD + "[[pour]]\ntime = 1.0\nduration = 0.0\ntank = 1\nvolume = 1.0\n",
+            "pour 1 into tank 1: duration = 0 s: must be above 0 s",
+        ),
+        (
+            HEAD + "[[pour]]\ntime = -1.0\nduration = 1.0\ntank = 1\nvolume = 1.0\n",
+            "pour 1 into tank 1: time = -1 s: must be at least",
+        ),
+        (
+            TANK.replace("[[tank]]", '[[tank]]\nname = "left"')
+            + '[[pour]]\ntime = 1.0\nduration = 0.0\ntank = "left"\nvolume = 1.0\n',
+            "pour 1 into tank 'left': duration = 0 s",
+        ),
+        (TANK.replace("high = 12.0", "high = 0.0"), "pump 1: high = 0 V: must be above its low, 0 V"),
+        (TANK.replace("high = 12.0", "low = 13.0\nhigh = 12.0"), "pump 1: high = 12 V: must be above its low, 13 V"),
+        (
+            TANK.replace("high = 12.0", "high = 12.0\nlag = 2.0"),
+            r"pump 1: lag is not a key of \[\[pump\]\]: it is \"actuator.lag\" in \[values\]",
+        ),
+        (TANK.replace("rim = 30.0", "rim = 30.0\nbits = 12"), r'tank 1: bits .*"sensor.bits" in \[values\]'),
+        (TANK.replace("to = 1", "to = 1\nsplit = 0.5"), "pump 1: split is the share of the first of two tanks"),
+        (
+            TANK.replace("[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]").replace("to = 1", "to = [1, 2]"),
+            "pump 1: split is the share",
+        ),
         (HEAD + "[[pour]]\ntime = 1.0\nvolum = 1.0\n", r"unknown key of \[\[pour\]\] 'volum'; nearest: volume"),
         (HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 1\n", "pour 1: volume is missing"),
         (
@@ -251,3 +276,74 @@ def test_init_of_the_command(tmp_path, capsys):
     assert said("--tanks") == (0, rig.complete(case, tankwise=True))
     assert cli.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
     assert parameters(case.loop)
+
+
+def test_what_a_preset_says_in_more_tables_does_not_come_back():
+    """A short file without [uncertain], or with one pour of two, would have the preset's."""
+    from jaxtank.signals import pours
+
+    case = presets.find("gouta2015/ngpc").replace(uncertain={})
+    assert rig.loads(rig.short(case)).uncertain == {}
+    assert rig.complete(rig.loads(rig.short(case))) == rig.complete(case)
+    case = presets.find("gouta2022/chadpc")
+    own = case.loop.disturbance
+    first = [(t, d, i, v) for (t, d, i), v in zip(own.events, np.asarray(own.volume).tolist())][:1]
+    assert len(own.events) > 1
+    case = case.replace(loop=case.loop.__class__(**{**vars(case.loop), "disturbance": pours(own.width, first)}))
+    assert rig.loads(rig.short(case)).loop.disturbance.events == own.events[:1]
+
+
+def test_names_of_tanks_and_pumps_are_kept():
+    text = TANK.replace("[[tank]]", '[[tank]]\nname = "left"').replace("[[pump]]", '[[pump]]\nname = "P-101"')
+    case = rig.loads(text)
+    assert case.names == {"tank": ("left",), "pump": ("P-101",)}
+    case = rig.set_values(case, {"plant.area": 21.0})
+    for written in (rig.dump(case), rig.complete(case), rig.short(case)):
+        table = tomllib.loads(written)
+        assert table["tank"][0]["name"] == "left" and table["pump"][0]["name"] == "P-101"
+        assert rig.loads(written).names == case.names
+    assert '#name = "tank 1"' in rig.complete(rig.loads(TANK)) and rig.loads(rig.dump(rig.loads(TANK))).names == {}
+    # the tanks of a preset's rig, called by names: the preset cannot say them
+    four = rig.complete(presets.find("gouta2015/ngpc"), tankwise=True).replace('#name = "tank 3"', 'name = "upper left"')
+    assert rig.loads(rig.dump(rig.loads(four))).names == {"tank": ("", "", "upper left", "")}
+
+
+def test_numpy_says_nothing_beside_a_refusal():
+    text = TANK.replace("area = 20.0", "area = 1e-300").replace("[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]")
+    with warnings.catch_warnings(), pytest.raises(InputError, match="no steady state"):
+        warnings.simplefilter("error")
+        rig.loads(text + "[[pipe]]\nbetween = [1, 2]\narea = 0.5\n")
+
+
+def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
+    about = "limit on overflow_volume"
+    assert about in rig.complete(presets.find("cascaded/pi")).replace("\n# ", " ")
+    assert about not in rig.complete(presets.find("gouta2015/ngpc")).replace("\n# ", " ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            "[reference]\nchanges = [[100.0, 1, 4.0], [700.0, 1, 5.0]]\n",
+            "1 of 2 changes of the reference come after the end of the run at 600 s",
+        ),
+        ("[[pour]]\ntime = 600.0\nduration = 1.0\ntank = 1\nvolume = 1.0\n", "1 of 1 pours come after the end"),
+        ("[reference]\nchanges = [[100.0, 1, 4.0], [150.0, 1, 5.0]]\nramp = 60.0\n", "output 1 at 150 s begins before"),
+        ("[reference]\nchanges = [[100.0, 1, 31.0]]\n", "asked for 31 cm, above the rim of tank 1 at 30 cm: rims are limits"),
+        ("[plant]\noverflow = true\n[reference]\ninitial = [31.0]\n", "a level cannot get there"),
+        ('[values]\nx0 = 31.0\n"actuator.initial" = 3.0\n', "tank 1 starts at 31 cm, above its rim at 30 cm"),
+        ('[values]\n"actuator.initial" = 13.0\n', "pump 1 runs at 13 V before t = 0, outside its limits of 0 and 12 V"),
+    ],
+)
+def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_path, capsys):
+    text = TANK.replace("drain = 1.0", "drain = 0.2").replace("gain = 5.0", "gain = 50.0")
+    (tmp_path / "rig.toml").write_text(text + change, encoding="utf-8")
+    (sentence,) = rig.doubts(rig.load(tmp_path / "rig.toml"))
+    assert words in sentence
+    assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert capsys.readouterr().err.splitlines() == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+
+
+def test_no_preset_is_doubted():
+    assert [n for n in presets.names() if rig.doubts(presets.find(n))] == []

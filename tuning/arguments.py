@@ -1,18 +1,22 @@
 """What the words of a command line mean: numbers, ranges, NAME=VALUE, the case they describe."""
 
 import os
+import sys
 
 from jaxtank.errors import InputError
 
 
 def open_case(args):
-    """The checked case of the command line, in float64."""
+    """The checked case of the command line, in float64; what of a rig file can hardly be meant is told on stderr."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig
 
     case = rig.open_case(args.case)
+    if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
+        for sentence in rig.doubts(case):
+            print(f"jaxtank: {args.case}: note: {sentence}", file=sys.stderr)
     values = dict(pair("--set", text, parse_value) for text in args.values)
     if args.dt is not None:
         values["clock.dt"] = number("--dt", args.dt)
@@ -53,12 +57,14 @@ def parse_value(text):
 
 
 def plain_number(text):
-    """An int where it is written as one, else a float; underscores are not numbers."""
+    """An int where it is written as one and a float can hold it, else a float; underscores are not numbers."""
     if "_" in text:
         raise ValueError(text)
     try:
-        return int(text)
-    except ValueError:
+        value = int(text)
+        float(value)
+        return value
+    except (ValueError, OverflowError):
         return float(text)
 
 

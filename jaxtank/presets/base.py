@@ -64,7 +64,7 @@ class Case:
     `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange roles, where the law has such;
     uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on; covariance: (names (n,), covariance (n, n) in
     their units) of parameters that were identified together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its
-    header}, where a log of this rig names them otherwise.
+    header}, where a log of this rig names them otherwise; names: {"tank" or "pump": a name of each, "" for none}, where a rig gives them.
     """
 
     name: str
@@ -80,6 +80,7 @@ class Case:
     uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
     covariance: tuple | None = None
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    names: Mapping[str, tuple] = dataclasses.field(default_factory=dict)
 
     def replace(self, **changes):
         """A copy with the named fields changed."""

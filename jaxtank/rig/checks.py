@@ -13,8 +13,8 @@ from jaxtank.measures import check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free, Scenario
 from jaxtank.records import CLOCK_UNITS
-from jaxtank.rig.values import set_values
-from jaxtank.rig.words import is_numeric
+from jaxtank.rig.values import by_dotted_name, set_values
+from jaxtank.rig.words import is_finite, is_numeric
 from jaxtank.signals import Ramps
 from jaxtank.tree import _short, check_value, describe, get_value, split_index
 
@@ -61,11 +61,12 @@ def check_limits(loop, limits):
         count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
         if isinstance(value, str) and value == "rim" and measure == "max_level":
             continue
-        good = is_numeric(value) and np.shape(value) in ((), (count,))
-        if not good or not np.all(np.isfinite(np.asarray(value, dtype=float))):
+        if not (is_finite(value) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise InputError(f"limit {measure} = {_short(value)}: must be a finite number [{unit}]{many}{rim}")
+        if measure == "max_level" and np.min(value) < 0:
+            raise InputError(f"limit {measure} = {_short(value)} {unit}: must be at least 0 {unit}, no level is below empty")
     return dict(limits)
 
 
@@ -73,7 +74,7 @@ def check_objective(objective):
     """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one of them above."""
     check_names(objective)
     for measure, weight in objective.items():
-        if not (is_numeric(weight) and np.ndim(weight) == 0 and np.isfinite(weight) and weight >= 0):
+        if not (is_finite(weight) and np.ndim(weight) == 0 and weight >= 0):
             raise InputError(f"objective {measure} = {_short(weight)}: must be a finite weight at or above 0")
     if not any(objective.values()):
         raise InputError("the objective has no measure with a weight above 0")
@@ -126,9 +127,10 @@ def scenario(case, entry, index):
         raise InputError(f"scenario {index + 1}: name must be a text, and values a table")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
         raise InputError(f"scenario {name!r}: seed = {_short(seed)} must be a whole number from 0 to {2**31 - 1}")
-    if not is_numeric(weight) or np.ndim(weight) or not (np.isfinite(weight) and weight > 0):
+    if not (is_finite(weight) and np.ndim(weight) == 0 and weight > 0):
         raise InputError(f"scenario {name!r}: weight = {_short(weight)} must be a finite number above 0")
     try:
+        values = by_dotted_name(values, "scenario.values")
         set_values(case, values)
     except InputError as error:
         raise type(error)(f"scenario {name!r}: {error}") from None

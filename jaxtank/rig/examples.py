@@ -30,6 +30,8 @@ def absent(loop, name, meta):
 def of_measure(case, name):
     """What a measure is, as metadata."""
     rim = '; "rim": that of each tank' if name == "max_level" else ""
+    if rim and case.loop.plant.overflow:  # where rims are physics no level passes one (tuning.objective)
+        rim += ", which beside overflow = true is a limit on overflow_volume: nothing may be lost"
     return {"unit": measure_unit(name, case.loop.units), "doc": f"{MEASURES[name].doc}{_each(name)}{rim}"}
 
 

@@ -11,11 +11,14 @@ from jaxtank.tree import is_component, walk
 
 
 def origin_of(case):
-    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as its own), or (None, ()).
+    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as its own), or (None, ()): of a rig whose
+    tanks have names too, which only a file that describes it tank by tank can say.
 
     Of several, the one with the same law and observer, then of the same name, then with the most static fields in common: its title is
     the one that the file will show. What a file can say in a table of its own (reference, disturbances, faults) may differ.
     """
+    if case.names:
+        return None, ()
     loop = scheduling.unscheduled(case.loop)
     mine, statics, best, found = structures(loop), _statics(loop), None, (None, ())
     for paper in presets.PAPERS:

@@ -56,8 +56,8 @@ def _building(case, origin, same):
     if origin is None:
         top = Section("", [name, Key("units", list(units), {**BARE, "doc": "[length, pump input]"})])
         found = [
-            Section(t, keys_of([(k, tanks.METAS[kind][k], v) for k, v in own.items()], units))
-            for t, kind, own in tanks.entries_of(loop)
+            Section(t, [*_named(kind, own), *keys_of([(k, tanks.METAS[kind][k], v) for k, v in own.items() if k != "name"], units)])
+            for t, kind, own in tanks.entries_of(loop, case.names)
         ]
     else:
         top = Section("", [Key("case", origin.name, {**BARE, "doc": "the preset that this file starts from"}), name])
@@ -79,6 +79,14 @@ def _building(case, origin, same):
         Key(k, [], {**BARE, "doc": "none"}) for k, f in dropped if getattr(loop, f) is None and getattr(start, f, None) is not None
     ]
     return [top._replace(keys=[*top.keys, *none]), *found]
+
+
+def _named(kind, own):
+    """The key of a tank's or a pump's name; a suggestion where it has none."""
+    if "name" not in own:
+        return []
+    name, number = own["name"]
+    return [Key("name", name or f"{kind} {number}", tanks.METAS[kind]["name"], bool(name))]
 
 
 def _reference(loop, start):

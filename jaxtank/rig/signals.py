@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.errors import InputError, unknown
 from jaxtank.plants.faults import Faults, faults
-from jaxtank.rig.words import is_numeric, plain, static_value
+from jaxtank.rig.words import is_finite, plain, static_value
 from jaxtank.signals import Constant, Pours, Ramps, Sine, Sum, pours, ramps
 from jaxtank.tree import _short, check_value, number
 
@@ -47,16 +47,24 @@ def ramps_of(where, table, old, words):
     """The Ramps of the keys of RAMP_KEYS in `table`, called `where` in errors; words: what a channel and its value are called."""
     channels = np.size(old.initial)
     initial = table.get("initial", np.asarray(old.initial).tolist())
-    if not (is_numeric(initial) and np.shape(initial) == (channels,) and np.all(np.isfinite(initial))):
+    if not (is_finite(initial) and np.shape(initial) == (channels,)):
         raise InputError(f"{where}.initial = {_short(initial)}: must be a list of {channels} finite {words[1]}s")
     changes = table.get("changes", changes_of(old))
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
         raise InputError(f"{where}.changes = {_short(changes)}: must be a list of {form}")
     for change in changes:
-        good = isinstance(change, list) and len(change) == 3 and all(np.ndim(v) == 0 and is_numeric(v) for v in change)
-        if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels and np.all(np.isfinite(change))):
+        good = isinstance(change, list) and len(change) == 3 and all(np.ndim(v) == 0 and is_finite(v) for v in change)
+        if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels):
             raise InputError(f"{where}.changes has {_short(change)}: must be {form}, finite numbers")
+    for before, after in zip(changes, changes[1:]):
+        if after[0] < before[0]:
+            raise InputError(f"{where}.changes has {_short(after)} after {_short(before)}: must be in order of time")
+    taken = set()
+    for time, channel, _ in changes:
+        if (time, channel) in taken:
+            raise InputError(f"{where}.changes has two changes of {words[0]} {channel} at {time:g} s: must be one")
+        taken.add((time, channel))
     ramp = plain(f"{where}.ramp", table.get("ramp", old.ramp))
     check_value(f"{where}.ramp", ramp, meta_of(Ramps, "ramp"))
     band = plain(f"{where}.band", table.get("band", old.band))
@@ -111,7 +119,7 @@ def disturbance_of(table, loop, tank):
         if table.get("pour"):
             raise InputError("[disturbance] inflow and [[pour]]: give one of them")
         inflow = more["inflow"]
-        if not (is_numeric(inflow) and np.shape(inflow) == (plant.tanks,) and np.all(np.isfinite(inflow))):
+        if not (is_finite(inflow) and np.shape(inflow) == (plant.tanks,)):
             raise InputError(f"disturbance.inflow = {_short(inflow)}: must be a list of {plant.tanks} finite flows, one per tank")
         old = Constant(level=number(inflow))
     if "pour" in table:
@@ -119,6 +127,9 @@ def disturbance_of(table, loop, tank):
             raise InputError("[[pour]]: this rig has a steady inflow already, and a rig file can have one of the two")
         entries = [_entry("pour", i, e, POUR, ("tank",)) for i, e in enumerate(table["pour"])]
         events = [(e["time"], e["duration"], tank(e["tank"], f"pour {i + 1}: tank"), e["volume"]) for i, e in enumerate(entries)]
+        for i, e in enumerate(entries):
+            for key, meta, _ in pour_keys(None, None, None, None)[:2]:
+                check_value(f"pour {i + 1} into tank {_short(e['tank'])}: {key}", e[key], {"high": None, **meta})
         if entries or isinstance(old, Pours):
             old = pours(plant.tanks, [(float(a), float(b), c, float(d)) for a, b, c, d in events]) if entries else None
     if "window" in more:

@@ -1,5 +1,7 @@
 """A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]], [plant]; no Python."""
 
+import dataclasses
+
 import numpy as np
 
 from jaxtank.actuators import PumpBank
@@ -74,6 +76,8 @@ METAS = {
         **{k: meta_of(TankNetwork, k) for k in ("gravity", "overflow", "bottom", "knee")},
     },
 }
+# parts of the loop whose other fields one looks for in a table
+ELSEWHERE = {"pump": ("actuator", PumpBank), "tank": ("sensor", LevelSensor)}
 
 
 def tank_index(value, where, named, count):
@@ -117,6 +121,13 @@ def build(table):
             raise InputError(f"{where} = {_short(value)}: must be two different tanks")
         return (*found, None) if len(found) == 1 else tuple(found)
 
+    for i, (p, written) in enumerate(zip(pumps, table["pump"])):
+        if not p["high"] > p["low"]:
+            raise InputError(f"pump {i + 1}: high = {p['high']:g} {drive}: must be above its low, {p['low']:g} {drive}")
+        if ("split" in written) != (isinstance(p["to"], list) and len(p["to"]) > 1):
+            raise InputError(
+                f"pump {i + 1}: split is the share of the first of two tanks: give it where to = [first, second], and only there"
+            )
     feeds = [pair(p["to"], f"pump {i + 1}: to", short=True) for i, p in enumerate(pumps)]
     outputs = more["outputs"] if more["outputs"] is not None else [first + 1 for first, _ in feeds]
     if not isinstance(outputs, list) or not outputs:
@@ -156,7 +167,7 @@ def build(table):
             low=number([p["low"] for p in pumps]),
             high=number([p["high"] for p in pumps]),
             stop=number(np.zeros(len(pumps))),
-            pulse=number([p["high"] for p in pumps]),
+            pulse=number([p["high"] if p["high"] > 0 else 1.0 for p in pumps]),  # of use only above 0, beside a dead zone
             initial=initial,
         ),
         reference=ramps(start, [], ramp=0.0),
@@ -171,6 +182,7 @@ def build(table):
         limits={"max_level": "rim"},
         free={},
         objective={"rms_error_total": 1.0},
+        names={kind: found for kind, own in (("tank", tanks), ("pump", pumps)) if any(found := tuple(e["name"] for e in own))},
     )
 
 
@@ -202,6 +214,11 @@ def _entry(kind, index, entry, fields, units):
         raise InputError(f"{where}: must be a table")
     for key, value in entry.items():
         if key not in fields:
+            part, cls = ELSEWHERE.get(kind, ("", None))
+            if cls is not None and key in {f.name for f in dataclasses.fields(cls)}:
+                raise InputError(
+                    f'{where}: {key} is not a key of [[{kind}]]: it is "{part}.{key}" in [values], for all of them at once'
+                )
             raise unknown(f"key of [[{kind}]]" if index is not None else f"key of [{kind}]", key, fields)
         if key == "name" and not isinstance(value, str):
             raise InputError(f"{where}: name = {_short(value)}: must be a text")
@@ -219,8 +236,9 @@ def _entry(kind, index, entry, fields, units):
     return {**fields, **entry}
 
 
-def entries_of(loop):
-    """[(title, kind, {key: value})] that describe the rig of a loop tank by tank. A steady inflow is the tanks' own."""
+def entries_of(loop, names):
+    """[(title, kind, {key: value})] that describe the rig of a loop tank by tank. A steady inflow is the tanks' own. names: those of a
+    Case; "name" is (name, number from 1)."""
     plant, bank, found = loop.plant, loop.actuator, []
     steady = np.asarray(loop.disturbance.level) if isinstance(loop.disturbance, Constant) else np.zeros(plant.tanks)
     columns = {
@@ -232,7 +250,8 @@ def entries_of(loop):
         "noise": loop.sensor.noise,
     }
     for i in range(plant.tanks):
-        found.append(("[[tank]]", "tank", {k: float(np.asarray(v)[i]) for k, v in columns.items()}))
+        own = {"name": (names["tank"][i] if "tank" in names else "", i + 1)}
+        found.append(("[[tank]]", "tank", own | {k: float(np.asarray(v)[i]) for k, v in columns.items()}))
     for (a, b), area in zip(plant.links, np.asarray(plant.orifice).tolist()):
         found.append(("[[orifice]]", "orifice", {"from": a + 1, "to": b + 1, "area": area}))
     for (a, b), area in zip(plant.pipes, np.asarray(plant.pipe).tolist()):
@@ -240,7 +259,8 @@ def entries_of(loop):
     for (a, b), caught in zip(plant.spills, np.asarray(plant.caught).tolist()):
         found.append(("[[spill]]", "spill", {"from": a + 1, "to": b + 1, "caught": caught}))
     for j, (first, second) in enumerate(plant.feeds):
-        own = {"gain": float(plant.pump_gain[j]), "to": first + 1 if second is None else [first + 1, second + 1]}
+        own = {"name": (names["pump"][j] if "pump" in names else "", j + 1)}
+        own |= {"gain": float(plant.pump_gain[j]), "to": first + 1 if second is None else [first + 1, second + 1]}
         own |= {} if second is None else {"split": float(plant.split[j])}
         found.append(("[[pump]]", "pump", own | {k: float(np.asarray(getattr(bank, k))[j]) for k in ("low", "high", "initial")}))
     more = {"outputs": [i + 1 for i in plant.outputs], "gravity": float(plant.gravity)}

@@ -9,6 +9,20 @@ from jaxtank.rig.words import is_numeric, plain, static_value, unit
 from jaxtank.tree import _short, check_value, describe, get_value, with_values
 
 
+def by_dotted_name(table, where):
+    """{dotted name: value} of a table in which names may be written without quotation marks: `clock.dt = 0.5` and [values.controller]
+    are tables in tables to TOML. InputError, naming the table `where`, for a name that is given both ways."""
+    found = {}
+    for key, value in table.items():
+        nested = isinstance(value, dict) and value and "." not in key  # a name that is quoted is whole: its value is no table
+        inner = {f"{key}.{k}": v for k, v in by_dotted_name(value, where).items()} if nested else {key: value}
+        for name in inner:
+            if name in found:
+                raise InputError(f"[{where}] {name} is given twice")
+        found |= inner
+    return found
+
+
 def set_values(case, values):
     """A copy of `case` with leaves, static fields and clock fields set by dotted name.
 

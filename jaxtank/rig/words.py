@@ -37,6 +37,12 @@ def is_numeric(value):
         return False
 
 
+def is_finite(value):
+    """True for what `is_numeric` is true for, if every number is finite. A whole number is taken as the float next to it: numpy's own
+    answer to one of 2^64 and more is a TypeError."""
+    return is_numeric(value) and bool(np.all(np.isfinite(np.asarray(value, dtype=float))))
+
+
 def plain(name, value):
     """`value` as a float; InputError, naming it `name`, unless it is a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):

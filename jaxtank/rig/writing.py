@@ -38,10 +38,11 @@ def short(case):
     origin, _ = origin_of(case)
     if origin is None:
         return complete(case)
-    plain = {line for s in sections(presets.find(origin.name)) for line in lines_of(s)}
+    theirs, mine = sections(presets.find(origin.name)), sections(case)
+    plain, same = {line for s in theirs for line in lines_of(s)}, _same_tables(mine, theirs)
     found, wanted = [], {toml(n).split("[")[0].strip('"') for n in case.free} | {"clock.dt", "clock.duration", "sensor.noise"}
     inside = False
-    for s in sections(case):
+    for s in mine:
         inside = s.title == "[values]" or (inside and not s.title)
         if inside:
             own = [k for k in s.keys if not set(lines_of(s._replace(title="", keys=[k]))) <= plain]
@@ -49,9 +50,19 @@ def short(case):
             keys = [*(k for k in own if k.on), *(k._replace(on=False) for k in more)]
             if keys or s.title:
                 found.append(_commented(s._replace(keys=keys, prose=())))
-        elif s.on and (not s.title or s.title in SHORT or not set(lines_of(s)) <= plain):
+        elif s.on and (not s.title or s.title in SHORT or s.title not in same):
             found.append(_commented(s._replace(prose=(), keys=[k for k in s.keys if k.on])))
     return _text([[f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"], *found])
+
+
+def _same_tables(mine, theirs):
+    """Titles of the tables that two files have alike, those of a list in the same number: an empty [uncertain] is not a preset's."""
+    tables = [{}, {}]
+    for found, sections_ in zip(tables, (mine, theirs)):
+        for s in sections_:
+            if s.on:
+                found.setdefault(s.title, []).append(lines_of(s))
+    return {title for title, lines in tables[0].items() if tables[1].get(title) == lines}
 
 
 def _text(blocks):

@@ -1,0 +1,49 @@
+"""What a rig file may say, though it is seldom meant: told in a line each, and not refused, for a run cut short or a pump that was
+weakened by `--set` says the same on purpose."""
+
+import numpy as np
+
+from jaxtank.rig.signals import steps
+from jaxtank.signals import Pours
+
+
+def doubts(case):
+    """Sentences on what of a case can hardly be meant: changes and pours after the end of the run, changes that overlap, levels and
+    setpoints above the rim, pumps that start outside their limits."""
+    loop, (length, drive) = case.loop, case.loop.units
+    found, end, rim = [], case.clock.duration, np.asarray(loop.plant.rim)
+    reference, bank = steps(loop.reference), loop.actuator
+    events = [] if reference is None else list(reference.changes)
+    _late(found, "changes of the reference", [t for t, _ in events], end)
+    if isinstance(loop.disturbance, Pours):
+        _late(found, "pours", [t for t, *_ in loop.disturbance.events], end)
+    last = {}
+    for t, i in events:
+        if t < last.get(i, -np.inf):
+            found.append(
+                f"reference: the change of output {i + 1} at {t:g} s begins before the one before it is over (ramp {reference.ramp:g} s): "
+                "it starts from where that one has got to"
+            )
+        last[i] = t + reference.ramp
+    lost = "what is above it is lost at once" if loop.plant.overflow else "rims are limits here and not physics"
+    for i, level in enumerate(np.asarray(loop.x0)):
+        if level > rim[i]:
+            found.append(f"tank {i + 1} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
+    never = "a level cannot get there" if loop.plant.overflow else lost
+    for i, tank in enumerate(loop.plant.outputs if reference is not None else ()):
+        asked = [reference.initial[i], *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i)]
+        if max(asked) > rim[tank]:
+            found.append(
+                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of tank {tank + 1} at "
+                f"{rim[tank]:g} {length}: {never}"
+            )
+    for j, (low, volts, high) in enumerate(zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))):
+        if not low <= volts <= high:
+            found.append(f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of {low:g} and {high:g} {drive}")
+    return found
+
+
+def _late(found, what, times, end):
+    late = [t for t in times if t >= end]
+    if late:
+        found.append(f"{len(late)} of {len(times)} {what} come after the end of the run at {end:g} s")
