@@ -168,12 +168,13 @@ def told(rows):
     return "\n".join(lines)
 
 
-def summed(rows):
-    """What was found, in a line."""
+def summed(rows, of=None):
+    """What was found, in a line. of: how many subjects there are."""
     worst, failed = max(rows, key=lambda r: r.worst), [r.name for r in rows if not r.good]
+    audited = f"{len(rows)} of {of}" if of else len(rows)
     return (
-        f"{sum(r.slopes for r in rows)} slopes of {len(rows)} subjects: worst against differences {worst.worst:.1e} ({worst.name}), forward "
-        f"against reverse {max(r.ways for r in rows):.1e}; {sum(r.kinks for r in rows)} slopes beside a kink, "
+        f"{sum(r.slopes for r in rows)} slopes of {audited} subjects: worst against differences {worst.worst:.1e} ({worst.name}), "
+        f"forward against reverse {max(r.ways for r in rows):.1e}; {sum(r.kinks for r in rows)} slopes beside a kink, "
         f"{sum(r.between for r in rows)} on one; {f'{len(failed)} fail: ' + ', '.join(failed) if failed else 'none fails'}"
     )
 
@@ -195,7 +196,7 @@ def record(rows, known):
     )
     survived = json.loads((here / "survived.json").read_text()) if (here / "survived.json").exists() else {}
     found = [Row(n, *r) for n, r in kept.items()]
-    survived["gradient audit"] = {"count": sum(r.points for r in found), "outcome": summed(found)}
+    survived["gradient audit"] = {"count": sum(r.points for r in found), "outcome": summed(found, len(known))}
     write_atomic(here / "survived.json", json.dumps(survived, indent=1) + "\n")
     return found
 
