@@ -92,11 +92,13 @@ def equilibrium(plant, y):
     if plant.pipes:
         x, u = _balanced(plant, y, f"outputs ({at}) {length}")
     else:
-        try:
-            speeds, u = _from_known_speeds(plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np)
-        except np.linalg.LinAlgError:
-            speeds = u = np.array([np.nan])
-        if not (np.all(np.isfinite(speeds)) and np.all(np.isfinite(u))):
+        with np.errstate(all="ignore"):  # what overflows is told below
+            try:
+                speeds, u = _from_known_speeds(plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np)
+            except np.linalg.LinAlgError:
+                speeds = u = np.array([np.nan])
+            x = np.maximum(speeds, 0.0) ** 2 / (2.0 * float(plant.gravity))
+        if not all(np.all(np.isfinite(v)) for v in (speeds, u, x)):
             raise EquilibriumError(
                 f"outputs ({at}) {length} have no unique steady state: the pumps cannot move the outputs independently"
             )
@@ -107,7 +109,6 @@ def equilibrium(plant, y):
                     f"outputs ({at}) {length} have no steady state: tank {i + 1} would have to pour {-v:.3g} {length}/s backwards "
                     "(below empty)"
                 )
-        x = np.maximum(speeds, 0.0) ** 2 / (2.0 * float(plant.gravity))
     for j, volts in enumerate(u):
         if volts < -1e-9 * max(1.0, float(np.max(np.abs(u)))):
             raise EquilibriumError(
@@ -149,9 +150,8 @@ def _balanced(plant, y, words):
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
     try:
-        with np.errstate(
-            all="ignore"
-        ):  # an area of 1e-300, say, overflows on the way: the answer below is all that need be said of it
+        # an area of 1e-300, say, overflows on the way: the answer below is all that need be said of it
+        with np.errstate(all="ignore"):
             found = scipy.optimize.least_squares(
                 residual, start, jac=jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale="jac", max_nfev=500
             )

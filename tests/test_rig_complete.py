@@ -313,6 +313,9 @@ def test_numpy_says_nothing_beside_a_refusal():
     with warnings.catch_warnings(), pytest.raises(InputError, match="no steady state"):
         warnings.simplefilter("error")
         rig.loads(text + "[[pipe]]\nbetween = [1, 2]\narea = 0.5\n")
+    with warnings.catch_warnings(), pytest.raises(InputError, match="no unique steady state"):
+        warnings.simplefilter("error")
+        rig.loads(TANK + "[reference]\ninitial = [1e308]\n")
 
 
 def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
