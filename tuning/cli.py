@@ -12,6 +12,7 @@ from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
 from tuning import batch_commands, case_commands, identify_command, tune_command
 from tuning.arguments import folder_of
 from tuning.holds import hold
+from tuning.interrupts import listen
 from tuning.parser import parser
 
 COMMANDS = {
@@ -33,6 +34,8 @@ COMMANDS = {
 
 def main(argv=None):
     """Run the command; returns the exit code."""
+    if argv is None:  # a program of its own
+        listen()
     try:
         top = parser()
         args, rest = top.parse_known_args(argv)

@@ -5,12 +5,25 @@ import os
 import signal
 import threading
 
+heard = []
+"""Holds something once Ctrl-C has come before anything ran."""
+
+
+def listen():
+    """Remember a Ctrl-C, beside raising KeyboardInterrupt: one that comes while modules are imported may be lost in them."""
+
+    def early(*_):
+        heard.append(True)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, early)
+
 
 class Interrupts:
     """Takes SIGINT from now on: `check` raises KeyboardInterrupt once it has come, a second one ends the program at once."""
 
     def __init__(self):
-        self.stop = False
+        self.stop = bool(heard)
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, self.interrupt)
 
