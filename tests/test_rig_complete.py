@@ -332,7 +332,10 @@ def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
             "1 of 2 changes of the reference come after the end of the run at 600 s",
         ),
         ("[[pour]]\ntime = 600.0\nduration = 1.0\ntank = 1\nvolume = 1.0\n", "1 of 1 pours come after the end"),
-        ("[reference]\nchanges = [[100.0, 1, 4.0], [150.0, 1, 5.0]]\nramp = 60.0\n", "output 1 at 150 s begins before"),
+        (
+            "[reference]\nchanges = [[100.0, 1, 4.0], [150.0, 1, 5.0]]\nramp = 60.0\n",
+            "1 of 2 changes begin before the one before is over (ramp 60 s), the first of output 1 at 150 s",
+        ),
         ("[reference]\nchanges = [[100.0, 1, 31.0]]\n", "asked for 31 cm, above the rim of tank 1 at 30 cm: rims are limits"),
         ("[plant]\noverflow = true\n[reference]\ninitial = [31.0]\n", "a level cannot get there"),
         ('[values]\nx0 = 31.0\n"actuator.initial" = 3.0\n', "tank 1 starts at 31 cm, above its rim at 30 cm"),
@@ -346,6 +349,16 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
     assert words in sentence
     assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
     assert capsys.readouterr().err.splitlines() == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+
+
+def test_a_doubt_calls_a_tank_by_its_name():
+    named = (
+        TANK.replace("[[tank]]", '[[tank]]\nname = "left"')
+        .replace("level = 3.0", "level = 31.0")
+        .replace("gain = 5.0", "gain = 90.0")
+    )
+    told = rig.doubts(rig.loads(named))
+    assert told[0].startswith("tank 1 ('left') starts at 31 cm") and "above the rim of tank 1 ('left')" in told[1]
 
 
 def test_no_preset_is_doubted():

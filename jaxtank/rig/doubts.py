@@ -17,30 +17,36 @@ def doubts(case):
     _late(found, "changes of the reference", [t for t, _ in events], end)
     if isinstance(loop.disturbance, Pours):
         _late(found, "pours", [t for t, *_ in loop.disturbance.events], end)
-    last = {}
+    over, early = {}, []
     for t, i in events:
-        if t < last.get(i, -np.inf):
-            found.append(
-                f"reference: the change of output {i + 1} at {t:g} s begins before the one before it is over (ramp {reference.ramp:g} s): "
-                "it starts from where that one has got to"
-            )
-        last[i] = t + reference.ramp
+        early += [(i, t)] if t < over.get(i, 0.0) - 1e-7 * case.clock.dt else []
+        over[i] = t + reference.ramp
+    if early:
+        found.append(
+            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {reference.ramp:g} s), the first "
+            f"of output {early[0][0] + 1} at {early[0][1]:g} s: each starts from where that one has got to"
+        )
     lost = "what is above it is lost at once" if loop.plant.overflow else "rims are limits here and not physics"
     for i, level in enumerate(np.asarray(loop.x0)):
         if level > rim[i]:
-            found.append(f"tank {i + 1} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
+            found.append(f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
     never = "a level cannot get there" if loop.plant.overflow else lost
     for i, tank in enumerate(loop.plant.outputs if reference is not None else ()):
         asked = [reference.initial[i], *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i)]
         if max(asked) > rim[tank]:
             found.append(
-                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of tank {tank + 1} at "
+                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of {_tank(case, tank)} at "
                 f"{rim[tank]:g} {length}: {never}"
             )
     for j, (low, volts, high) in enumerate(zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))):
         if not low <= volts <= high:
             found.append(f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of {low:g} and {high:g} {drive}")
     return found
+
+
+def _tank(case, i):
+    name = case.names.get("tank", {i: ""})[i]
+    return f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}"
 
 
 def _late(found, what, times, end):
