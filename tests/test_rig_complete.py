@@ -308,6 +308,24 @@ def test_names_of_tanks_and_pumps_are_kept():
     assert rig.loads(rig.dump(rig.loads(four))).names == {"tank": ("", "", "upper left", "")}
 
 
+@pytest.mark.parametrize("line", ["area = 20.0", "rim = 30.0", "drain = 1.0", "level = 3.0", "gain = 5.0", "high = 12.0"])
+def test_a_large_whole_number_of_a_tank_is_the_float_next_to_it(line):
+    key, big, told = line.split(" = ")[0], 10**20, []
+    for value in (str(big), repr(float(big))):
+        try:
+            told.append(rig.dump(rig.loads(TANK.replace(line, f"{key} = {value}"))))
+        except InputError as error:
+            told.append(str(error))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("option", ["--dt", "--set", "--free"])
+def test_a_whole_number_that_no_float_holds_is_refused_in_one_line(option, capsys):
+    said = {"--dt": "", "--set": "controller.k=", "--free": "controller.k=0.1:"}[option] + "9" * 400
+    assert cli.main(["tune" if option == "--free" else "show", "gouta2015/backstepping", option, said]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_numpy_says_nothing_beside_a_refusal():
     text = TANK.replace("area = 20.0", "area = 1e-300").replace("[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]")
     with warnings.catch_warnings(), pytest.raises(InputError, match="no steady state"):
