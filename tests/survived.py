@@ -27,7 +27,10 @@ DRILLS = {
     "gradient audit": ("points at which derivatives are compared with differences", "`python tests/gradient_audit.py`"),
     "properties": ("random rigs, over all properties", "`pytest -m slow tests/test_properties.py`"),
     "kills": ("SIGKILLs of tune, uncertainty and identify", "`python tests/fault_drill.py 50`"),
-    "other faults": ("full disks, read-only folders, Ctrl-C, two runs in one folder", "`pytest tests/test_faults.py`"),
+    "other faults": (
+        "full disks, read-only folders, Ctrl-C, two runs in one folder",
+        "`pytest -m 'slow or not slow' tests/test_faults.py`",
+    ),
     "long and large": ("runs of up to 10^7 samples, ensembles of up to 10^6 draws", "`pytest -m slow tests/test_long_runs.py`"),
     "versions, oldest": ("tests with the oldest versions", "`tests/versions.sh oldest`"),
     "versions, newest": ("tests with the newest versions", "`tests/versions.sh newest`"),
