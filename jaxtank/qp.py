@@ -58,7 +58,7 @@ def _slope(iterations, primals, tangents):
     order of 1 (`_normal` would lose H in the shadow of binding rows)."""
     H, f, G, l, u = primals
     H, f = _scaled(H, f)
-    x, su, sl, lu, ll = jax.lax.stop_gradient(interior_point(H, f, G, l, u, iterations))
+    x, su, sl, lu, ll = interior_point(H, f, G, l, u, iterations)
     up, low = lu / su, ll / sl
     both = up + low
     row = jnp.sqrt(jnp.minimum(both, 1.0))

@@ -282,7 +282,7 @@ def ramps(initial, changes, ramp=60.0, shape="linear", band=0.05):
 
 def _index(time, clock):
     """First sample at or after `time`; half a part in a million of a sample is forgiven, so that 20 s is sample 2000 at 0.01 s."""
-    return max(0, math.ceil(time / clock.dt - 5e-7))
+    return max(0, math.ceil(min(time / clock.dt, 2.0**53) - 5e-7))
 
 
 def _flat(level):

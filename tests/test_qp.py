@@ -152,3 +152,16 @@ def test_no_row_is_left_behind():
     points = jax.jit(jax.vmap(lambda *p: qp.interior_point(*p, 40)))(*programmes)
     products = np.concatenate([points.su * points.lu, points.sl * points.ll], axis=1)
     assert products.max() < 4.0 * qp.MU_MIN
+
+
+@pytest.mark.parametrize("t", [0.2, 3.0])  # inside, and with both rows at their limits
+def test_second_derivatives_against_differences_of_the_first(t):
+    H, G, b = jnp.array([[2.0, 0.3], [0.3, 1.0]]), jnp.eye(2), 0.5 * jnp.ones(2)
+
+    def f(t):
+        x = qp.solve(H, jnp.array([t, 0.1 * t]), G, -b, b)
+        return jnp.sum(x**2) + x[0] * t
+
+    slope = float(jax.grad(f)(t + 1e-4) - jax.grad(f)(t - 1e-4)) / 2e-4
+    assert float(jax.hessian(f)(t)) == pytest.approx(slope, rel=1e-7)
+    assert float(jax.jacfwd(jax.jacfwd(f))(t)) == pytest.approx(slope, rel=1e-7)

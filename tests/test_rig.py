@@ -416,3 +416,24 @@ def test_names_without_quotation_marks_are_dotted_names(gouta):
     )
     assert set(case.free) == {"controller.k"} and case.uncertain == {"plant.drain": 0.1}
     assert dict(case.scenarios[0].values) == {"sensor.noise": 0.1}
+
+
+@pytest.mark.parametrize(
+    "lines, words",
+    [
+        ('"clock.duration" = 1e308', "samples"),
+        ('"clock.dt" = 5e-324', "samples"),
+    ],
+)
+def test_a_run_longer_than_any_whole_number_is_refused(lines, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(f'case = "gouta2015/ngpc"\n[values]\n{lines}\n')
+
+
+def test_a_byte_order_mark_is_read_over():
+    assert rig.loads('\ufeffcase = "gouta2015/ngpc"\n').name == "gouta2015/ngpc"
+
+
+def test_more_tanks_than_a_loop_can_hold_are_refused_at_once():
+    with pytest.raises(InputError, match="at most 100"):
+        rig.loads("[[tank]]\narea = 1.0\nrim = 1.0\n" * 101 + "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1.0\n")

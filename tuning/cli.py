@@ -69,7 +69,7 @@ def main(argv=None):
         _drop_output()
         return 0
     except OSError as error:
-        print(f"jaxtank: {error.filename or 'output'}: {error.strerror or _one_line(error)}", file=sys.stderr)
+        print(f"jaxtank: {_one_line(error.filename or 'output')}: {error.strerror or _one_line(error)}", file=sys.stderr)
         _drop_output()
         return 2
     except Exception as error:

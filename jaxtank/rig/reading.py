@@ -56,7 +56,7 @@ def load(path):
 def loads(text, words="rig file"):
     """The Case of the text of a rig file, called `words` in errors."""
     try:
-        table = tomllib.loads(text)
+        table = tomllib.loads(text.removeprefix("\ufeff"))  # a byte-order mark, as some editors write
     except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
         raise InputError(f"{words} is not TOML: {' '.join(str(error).split())}") from None
     except RecursionError:

@@ -91,6 +91,10 @@ def tank_index(value, where, named, count):
     return value - 1
 
 
+MOST = 100
+"""Tanks that a rig file may have."""
+
+
 def names_in(table):
     """{name: index} of the [[tank]] tables that have a name."""
     return {t["name"]: i for i, t in enumerate(table.get("tank", [])) if isinstance(t, dict) and t.get("name")}
@@ -99,7 +103,10 @@ def names_in(table):
 def build(table):
     """The Case of a table of a rig file that has [[tank]]; reference, values, limits and the rest come after (`rig.from_table`)."""
     units = length, drive = _units(table.get("units", list(DEFAULT)))
-    tanks = [_entry("tank", i, e, TANK, units) for i, e in enumerate(_list(table, "tank", at_least=1))]
+    listed = _list(table, "tank", at_least=1)
+    if len(listed) > MOST:
+        raise InputError(f"[[tank]]: {len(listed)} tanks: must be at most {MOST}, for each is a part of the compiled loop")
+    tanks = [_entry("tank", i, e, TANK, units) for i, e in enumerate(listed)]
     pumps = [_entry("pump", i, e, PUMP, units) for i, e in enumerate(_list(table, "pump", at_least=1))]
     links = [_entry("orifice", i, e, LINK, units) for i, e in enumerate(_list(table, "orifice"))]
     pipes = [_entry("pipe", i, e, PIPE, units) for i, e in enumerate(_list(table, "pipe"))]
