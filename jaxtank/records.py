@@ -56,7 +56,7 @@ def check_clock(clock):
     if clock.dt > clock.duration:
         raise InputError(f"clock.dt = {clock.dt:g} s: must be at most clock.duration = {clock.duration:g} s")
     if not clock.duration / clock.dt < LARGEST_RUN:  # before it is rounded: it may be more than any whole number
-        raise InputError(f"clock.duration / clock.dt = {clock.duration / clock.dt:.9g} samples: must be at most {LARGEST_RUN - 1}")
+        raise InputError(f"clock.duration / clock.dt = {clock.duration / clock.dt:.9g} samples: must be below {LARGEST_RUN}")
     if not isinstance(clock.substeps, int) or isinstance(clock.substeps, bool) or not 1 <= clock.substeps <= 10:
         raise InputError(f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 10")
     if clock.integrator not in INTEGRATORS:
