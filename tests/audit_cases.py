@@ -90,6 +90,7 @@ def subject(names, seed=0):
         tolerance=tolerance,
         why=why,
         backwards=functools.partial(value, lp.evaluate_for_reverse),
+        piled=tuple(i for i in range(len(points)) if STARTS[i % POINTS] == "zero"),
     )
 
 
@@ -138,6 +139,7 @@ def carried(name, lanes):
         why="runs of 64 samples amplify rounding",
         backwards=lambda theta: flat(lp.evaluate_for_reverse(at(theta), clock, MEASURES)),
         forwards=forwards,
+        piled=(STARTS.index("zero"),),
     )
 
 

@@ -74,6 +74,23 @@ def test_the_audit_finds_a_wrong_slope():
     assert row.worst < 1e-9 and row.ways == pytest.approx(0.5)
 
 
+def test_on_several_kinks_the_slopes_beside_them_are_judged():
+    """A pump at rest at its limit (clip: slope 1) that moves by nothing (travel: slope 0): together -1, where the left has 0 and the right 1.
+    Where the subject says that a point is so it passes, but not with a slope that is wrong beside it, nor where the subject says nothing."""
+
+    def rest(x):
+        u = numerics.clip(x, 0.0, 10.0)
+        return 2.0 * numerics.magnitude(u) - u
+
+    here = Subject("rest", rest, np.zeros((1, 1)), np.ones((1, 1)), piled=(0,))
+    assert jax.jacfwd(rest)(jnp.zeros(1))[0, 0] == -1.0
+    row = audit(here)
+    assert row.good and row.piled == 1 and row.between == 0
+    assert not audit(here._replace(piled=())).good
+    wrong = lambda x: rest(x) + 0.001 * (x - jax.lax.stop_gradient(x))  # a slope of 1e-3 that is none
+    assert not audit(here._replace(function=wrong)).good
+
+
 def test_differences_of_a_known_function():
     """exp at 0, and |x + 3e-5| at 0, whose kink lies within the larger steps."""
     steps = np.array([1.0, -1.0]) * STEPS[:, None]
