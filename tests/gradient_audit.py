@@ -36,11 +36,16 @@ import numpy as np
 
 STEPS = 0.01 * 0.25 ** np.arange(8)
 NEAR = 0.01 * 0.25 ** np.arange(2, 12)  # of one-sided differences: down to 2e-9
-HAIR, BESIDE = 1e-7, 1e-4  # beside several kinks: how far the derivative is looked at, and how near it must be: curvature moves it by 1e-5
+HAIR, BESIDE = (
+    1e-7,
+    1e-4,
+)  # beside several kinks: how far the derivative is looked at, and how near it must be: curvature moves it by 1e-5
 TOLERANCE = 1e-6
 FLOOR = 1e-3  # share of a component's largest slope below which an error is relative to that share
 BOTH_WAYS = 1e-9  # forward against reverse,
-ROUNDING = 16 * np.finfo(float).eps  # but for this share of the point's largest slope: a slope of 0 is 1e-15 one way, on some processors
+ROUNDING = (
+    16 * np.finfo(float).eps
+)  # but for this share of the point's largest slope: a slope of 0 is 1e-15 one way, on some processors
 IN_HASTE = {"xla_backend_optimization_level": 0}  # reverse mode is compared, not timed: half of the audit was its compilation
 
 
@@ -183,9 +188,8 @@ def told(rows):
     lines = [f"{'subject':44} points  slopes  worst     step      fwd=rev   kinks  between  piled"]
     for r in rows:
         mark = "" if r.good else f"  FAILS at (point, direction, output) {r.where}{'' if r.finite else ', not finite'}"
-        lines.append(
-            f"{r.name:44} {r.points:6d} {r.slopes:7d}  {r.worst:.1e}   {r.step:.0e}   {r.ways:.1e}   {r.kinks:5d}  {r.between:7d}  {r.piled:5d}{mark}"
-        )
+        found = f"{r.points:6d} {r.slopes:7d}  {r.worst:.1e}   {r.step:.0e}   {r.ways:.1e}"
+        lines.append(f"{r.name:44} {found}   {r.kinks:5d}  {r.between:7d}  {r.piled:5d}{mark}")
     if rows:
         lines.append(f"{sum(r.points for r in rows)} points, {summed(rows)}")
     return "\n".join(lines)
@@ -195,10 +199,11 @@ def summed(rows, of=None):
     """What was found, in a line. of: how many subjects there are."""
     worst, failed = max(rows, key=lambda r: r.worst), [r.name for r in rows if not r.good]
     audited = f"{len(rows)} of {of}" if of else len(rows)
+    beside, on, piled = (sum(getattr(r, kind) for r in rows) for kind in ("kinks", "between", "piled"))
     return (
         f"{sum(r.slopes for r in rows)} slopes of {audited} subjects: worst against differences {worst.worst:.1e} ({worst.name}), "
-        f"forward against reverse {max(r.ways for r in rows):.1e}; {sum(r.kinks for r in rows)} slopes beside a kink, "
-        f"{sum(r.between for r in rows)} on one, {sum(r.piled for r in rows)} on several at once; {f'{len(failed)} fail: ' + ', '.join(failed) if failed else 'none fails'}"
+        f"forward against reverse {max(r.ways for r in rows):.1e}; {beside} slopes beside a kink, {on} on one, "
+        f"{piled} on several at once; {f'{len(failed)} fail: ' + ', '.join(failed) if failed else 'none fails'}"
     )
 
 
