@@ -62,6 +62,12 @@ def _umask():
 def check_folder(path):
     """Raise InputError unless `path` is, or can become, a folder to write to. Nothing is made yet."""
     path = Path(path)
+    if "\0" in str(path):
+        raise InputError(f"--out {str(path)!r}: a name cannot hold the character NUL")
+    if path.is_symlink() and not path.exists():
+        raise InputError(
+            f"--out {str(path)!r} is a link to {os.readlink(path)!r}, which is not there: make that folder or give another"
+        )
     if path.exists() and not path.is_dir():
         raise InputError(f"--out {str(path)!r} is a file: give a folder, new or existing")
     parent = path if path.exists() else next((p for p in path.absolute().parents if p.exists()), None)

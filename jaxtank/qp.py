@@ -4,7 +4,8 @@
 
 Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl the slacks of the two sides). Its
 derivative is one Newton step on the optimality conditions: the implicit function theorem at the solution, in forward and in reverse mode
-and under vmap, without a tape of the iterations (khalid spec C.3). A run that is not differentiated does not pay for it.
+and under vmap, without a tape of the iterations (khalid spec C.3). A run that is not differentiated does not pay for it. A second
+derivative is that of this step, whose multipliers and slacks are differentiated through the iterations: right, and slow.
 """
 
 import functools

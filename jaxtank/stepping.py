@@ -189,8 +189,9 @@ def run_of(loop, clock):
 
 
 def zero_of(loop):
-    """0.0 of the type in which the run is done: what x0 becomes inside jax. float32 is named, and what it costs."""
-    dtype = jnp.result_type(loop.x0, jnp.float32 if jnp.result_type(loop.x0) == jnp.float32 else float)
+    """0.0 of the type in which the run is done: that of the most precise of the loop's leaves. float32 is named, and what it costs."""
+    leaves = [leaf for leaf in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+    dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
     if dtype == jnp.float32:
         _warn_float32()
     return jnp.zeros((), dtype)

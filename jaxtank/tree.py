@@ -137,6 +137,8 @@ def check_leaves(tree, names=None):
 
 def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
+    if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
+        raise InputError(f"{name} = {_short(value)}: must be a number or an array, np.array(...)")
     array, low, high = np.asarray(value), meta["low"], meta["high"]
     array = number(value) if array.dtype == object else array  # whole numbers of 2^64 and more are no numbers to numpy
     good = np.isfinite(array)

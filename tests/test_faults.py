@@ -160,6 +160,14 @@ def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen,
     assert contents(frozen) == {"result.json": b"old"}
 
 
+def test_a_folder_that_cannot_be_is_refused_at_the_door(tmp_path, capsys):
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for folder, why in ((tmp_path / "link", "nowhere"), ("a\0b", "NUL")):
+        code, out, err = say([*WRITERS["simulate"], "--out", folder], capsys)
+        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out") and why in err[0], err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link"]
+
+
 def test_output_that_cannot_be_written_is_one_line():
     with open("/dev/full", "w") as full:
         done = subprocess.run([*JAXTANK, "completion", "bash"], stdout=full, stderr=subprocess.PIPE, text=True)

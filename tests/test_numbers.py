@@ -3,15 +3,18 @@
 Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices, processes and shards of an ensemble).
 """
 
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 
-from jaxtank import _xla
+from jaxtank import InputError, _xla, evaluate, presets
+from jaxtank.records import Clock
 
 RUNS = """
 import json, sys
@@ -77,6 +80,23 @@ for run in (lambda: tuning.tune(case), lambda: tuning.identify(case, None), lamb
     except jaxtank.InputError as error:
         print(error)
 """
+
+
+def test_a_run_has_the_precision_of_its_most_precise_leaf():
+    """x0 of 32 bits in a loop of 64, and one gain of 64 bits in a loop of 32: jax's scan would not have a state change its type."""
+    case = presets.find("gouta2015/backstepping")
+    run = lambda loop: np.asarray(evaluate(loop, Clock(dt=0.1, duration=120.0), ("iae",))["iae"])
+    short = lambda tree: jax.tree.map(lambda a: np.asarray(a, np.float32), tree)
+    there = dataclasses.replace(case.loop, x0=short(case.loop.x0))
+    back = dataclasses.replace(case.loop, x0=np.asarray(short(case.loop.x0), np.float64))
+    assert run(there).dtype == np.float64 and np.array_equal(run(there), run(back))
+    single = short(case.loop)
+    one = dataclasses.replace(
+        single, actuator=dataclasses.replace(single.actuator, high=np.asarray(single.actuator.high, np.float64))
+    )
+    assert run(one).dtype == np.float64 and np.allclose(run(one), run(case.loop), rtol=1e-4)
+    with pytest.raises(InputError, match=r"x0 = \[2.*np.array"):
+        run(dataclasses.replace(case.loop, x0=[2.0, 2.0, 2.0, 2.0]))
 
 
 def test_float32_is_refused_where_it_would_be_wrong():

@@ -14,7 +14,7 @@ from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free, Scenario
 from jaxtank.records import CLOCK_UNITS
 from jaxtank.rig.values import by_dotted_name, set_values
-from jaxtank.rig.words import is_finite, is_numeric
+from jaxtank.rig.words import is_finite, is_numeric, name_of
 from jaxtank.signals import Ramps
 from jaxtank.tree import _short, check_value, describe, get_value, split_index
 
@@ -123,8 +123,9 @@ def scenario(case, entry, index):
             raise unknown("key of [[scenario]]", key, SCENARIO_KEYS)
     name, values = entry.get("name", f"scenario {index + 1}"), entry.get("values", {})
     seed, weight = entry.get("seed", 0), entry.get("weight", 1.0)
-    if not isinstance(name, str) or not isinstance(values, dict):
-        raise InputError(f"scenario {index + 1}: name must be a text, and values a table")
+    name_of(f"scenario {index + 1}: name", name)
+    if not isinstance(values, dict):
+        raise InputError(f"scenario {name!r}: values = {_short(values)}: must be a table")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
         raise InputError(f"scenario {name!r}: seed = {_short(seed)} must be a whole number from 0 to {2**31 - 1}")
     if not (is_finite(weight) and np.ndim(weight) == 0 and weight > 0):

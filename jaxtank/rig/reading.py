@@ -10,6 +10,7 @@ from jaxtank.errors import InputError, unknown
 from jaxtank.files import read_text
 from jaxtank.rig import checks, parts, signals, tanks
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule
+from jaxtank.rig.words import name_of
 from jaxtank.tree import _short
 
 TABLES = (
@@ -99,6 +100,7 @@ def start_of(table):
         wanted, words = KINDS.get(key, (dict, "a table"))
         if not isinstance(value, wanted):
             raise InputError(f"{key} = {_short(value)}: must be {words}")
+    name_of("name", table.get("name", ""))
     if "case" in table and (given := [k for k in tanks.TABLES if k in table]):
         raise InputError(
             f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out case, or [{given[0]}]"

@@ -14,7 +14,7 @@ from jaxtank.presets.base import Case
 from jaxtank.records import Clock
 from jaxtank.rig.parts import law_of, observer_of
 from jaxtank.rig.signals import INFLOW, meta_of
-from jaxtank.rig.words import is_numeric
+from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, ramps
 from jaxtank.tree import _short, check_value, number
@@ -227,8 +227,8 @@ def _entry(kind, index, entry, fields, units):
                     f'{where}: {key} is not a key of [[{kind}]]: it is "{part}.{key}" in [values], for all of them at once'
                 )
             raise unknown(f"key of [[{kind}]]" if index is not None else f"key of [{kind}]", key, fields)
-        if key == "name" and not isinstance(value, str):
-            raise InputError(f"{where}: name = {_short(value)}: must be a text")
+        if key == "name":
+            name_of(f"{where}: name", value)
         if key in ("name", "to", "from", "between", "outputs"):
             continue
         truth, meta = isinstance(fields[key], bool), METAS[kind][key]

@@ -25,6 +25,13 @@ def toml(value):
     return repr(value)
 
 
+def name_of(where, value):
+    """`value` if it can be a name: a text of one line without control characters, which a terminal would obey."""
+    if not isinstance(value, str) or not value.isprintable():
+        raise InputError(f"{where} = {_short(value)}: must be a text" + " of printable characters" * isinstance(value, str))
+    return value
+
+
 def is_numeric(value):
     """True for a number that a float can hold, and for lists of such numbers and arrays of a regular shape."""
     if isinstance(value, (np.ndarray, np.generic)):
