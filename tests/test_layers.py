@@ -37,8 +37,10 @@ ABOVE = [
     {"search", "choices", "bound", "tradeoff"},
     {"shards"},
     {"ensemble", "sensitivity"},
-    {"robust", "page", "pictures"},
+    {"robust", "page", "pictures", "tables"},
+    {"saving"},
     {"report"},
+    {"tune_report"},
     {"manual_parts"},
     {"manual", "sensitivity_report", "ensemble_report", "identify_report"},
     {"bench", "compare"},
@@ -56,6 +58,7 @@ RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for 
 DOORS = {
     ("jaxtank.__main__", "tuning.cli"),
     ("tuning.result", "tuning.report"),
+    ("tuning.result", "tuning.tune_report"),
     ("tuning.sensitivity", "tuning.sensitivity_report"),
     ("tuning.ensemble", "tuning.ensemble_report"),
     ("tuning.identify", "tuning.identify_report"),
@@ -114,7 +117,7 @@ def test_only_pictures_import_matplotlib():
                 if any(n.startswith("matplotlib") for n in names):
                     found.add(path.name)
     drawing = {"plotting.py", "schematic.py", "animation.py"}
-    assert found == drawing | {"report.py", "identify_report.py", "pictures.py", "page.py"}
+    assert found == drawing | {"saving.py", "tune_report.py", "identify_report.py", "pictures.py", "page.py"}
 
 
 def test_no_pickle_eval_or_network():

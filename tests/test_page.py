@@ -14,7 +14,7 @@ import pytest
 
 import tuning
 from jaxtank import rig
-from tuning import cli, compare, page, report
+from tuning import cli, compare, page, tables
 from tuning.log_file import read_log
 
 NASTY = "a <b>\"rig\"</b> & $x$ 'y' </style><script>alert(1)</script>"
@@ -149,7 +149,7 @@ def test_what_users_call_things_is_text_and_no_markup(folders, kind):
 def test_the_numbers_of_a_tuning_are_on_its_page(results, folders):
     read = Reader((folders["tune"] / "report.html").read_text(encoding="utf-8"))
     result = results["tune"][0].__self__
-    for said in (*result.message.split("; "), *result.parameters, report.number(result.objective["after"]), "seed"):
+    for said in (*result.message.split("; "), *result.parameters, tables.number(result.objective["after"]), "seed"):
         assert " ".join(said.split()) in read.words
     warned = [a for tag, a in read.tags if a.get("class", "").startswith("status")]
     assert ("warn" in warned[0]["class"]) == (not result.success)
@@ -204,7 +204,7 @@ def test_compare_and_show_write_where_they_are_told(tmp_path, monkeypatch, capsy
 
 
 def test_parts_become_tables_lists_and_paragraphs():
-    table = report.table([["x<1", 2], ["y", "-"]], ["name", "value"])
+    table = tables.table([["x<1", 2], ["y", "-"]], ["name", "value"])
     text = page.document("t", "", "s", True, [], [], [], ["a line", "- first", "- second", "", table, "one   two\n---------"])
     read = Reader(text)
     tags = [tag for tag, _ in read.tags]

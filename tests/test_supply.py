@@ -60,7 +60,7 @@ READ = {
     ("jaxtank.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.reading", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.animation", "animate", "read_bytes"): "the picture that it has just drawn",
-    ("tuning.report", "save_run", "read_bytes"): "the picture that it has just drawn",
+    ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.log_file", "_text", "read_bytes"): "after `refusal`",

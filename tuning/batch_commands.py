@@ -66,12 +66,12 @@ def _ensemble(args, **options):
 
 def _told(found, args):
     """Write, print and end with an Ensemble."""
-    from tuning import report
+    from tuning import tables
 
     try:
         written = found.save(args.out, args.line) if args.out else []
     finally:  # a disk that is full costs the files, not the answer
-        print(report.dumps(found.to_json()) if args.json else repr(found))
+        print(tables.dumps(found.to_json()) if args.json else repr(found))
     tell_written(written, args)
     return 0
 
@@ -93,7 +93,7 @@ def sensitivity(args):
     devices = devices_of(args)
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
-    from tuning import report, sensitivity_report
+    from tuning import sensitivity_report, tables
     from tuning.sensitivity import MOST, sensitivity
 
     terminal, told = sys.stderr.isatty(), [0]
@@ -120,6 +120,6 @@ def sensitivity(args):
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:
-        print(report.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
+        print(tables.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
     tell_written(written, args)
     return 0

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import presets
 from jaxtank.tree import with_values
-from tuning import report
+from tuning import tables
 from tuning.manual import noisy
 from tuning.search import provenance
 
@@ -145,7 +145,7 @@ def text(found):
     lines = [
         f"one run of {found['steps']} steps, float64, {found['provenance']['integrator']}; medians of {found['rounds']} interleaved rounds",
         "",
-        report.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
+        tables.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
     ]
     if "ratio_to_c" in found:
         lines += [
@@ -242,4 +242,4 @@ def text_of_cases(found):
         for name, r in found.items()
     ]
     why = [f"{name}: {reason}" for name, r in found.items() for reason in r["reasons"]]
-    return "\n".join([report.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why])
+    return "\n".join([tables.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why])

@@ -10,16 +10,16 @@ from tuning.options import tell_written
 
 def list_cases(args):
     from jaxtank import presets
-    from tuning import report
+    from tuning import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    print(report.dumps(cases) if args.json else report.table([[n, t] for n, t in cases.items()], ["case", ""]))
+    print(tables.dumps(cases) if args.json else tables.table([[n, t] for n, t in cases.items()], ["case", ""]))
     return 0
 
 
 def show(args):
     case = open_case(args)
-    from tuning import manual, report
+    from tuning import manual, saving, tables
 
     written = []
     if args.out:
@@ -29,8 +29,8 @@ def show(args):
 
         drawn = pictures.rig(case.loop, None, case.name)
         alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
-        written = report.write_files(Path(args.out), alone | report.pngs(drawn))
-    print(report.dumps(manual.json_of(case)) if args.json else manual.text(case))
+        written = saving.write_files(Path(args.out), alone | saving.pngs(drawn))
+    print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
     tell_written(written, args)
     return 0
 
@@ -40,10 +40,10 @@ def init(args):
         raise InputError("--short and --tanks: the short file names its preset; give one of the two")
     case = open_case(args)
     from jaxtank import rig
-    from tuning import report
+    from tuning import tables
 
     text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
-    print(report.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
+    print(tables.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
     return 0
 
 
@@ -52,14 +52,14 @@ def export_law(args):
     from pathlib import Path
 
     from jaxtank.export import export
-    from tuning import report
+    from tuning import saving, tables
 
     text = export(case, args.lang, args.precision, args.name)
     name = args.name or case.name.replace("/", "_").replace("-", "_").replace(" ", "_")
     if args.json:
-        print(report.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
+        print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:
-        tell_written(report.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
+        tell_written(saving.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
     elif not args.json:
         print(text, end="")
     return 0
@@ -73,30 +73,30 @@ def simulate(args):
 
     from jaxtank import loop
     from jaxtank import measures as ms
-    from tuning import manual, report, search
+    from tuning import manual, saving, search, tables
 
     key = jax.random.key(seed) if manual.noisy(case) else None
     values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
     payload = {
         "case": case.name,
-        "measures": report.measures_json(values),
-        "units": report.units(case.loop.units),
-        "reasons": report.reasons(values),
+        "measures": tables.measures_json(values),
+        "units": tables.units(case.loop.units),
+        "reasons": tables.reasons(values),
         "clock": manual.clock(case.clock),
-        "parameters": report.clean(loop.parameters(case.loop)),
+        "parameters": tables.clean(loop.parameters(case.loop)),
         "provenance": search.provenance(case, seed),
     }
-    written = report.save_run(case, report.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
+    written = saving.save_run(case, saving.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
     if args.json:
-        print(report.dumps(payload))
+        print(tables.dumps(payload))
     else:
         print(f"{case.name}: {case.title}\n")
         rows = [
-            [m, ms.unit(m, case.loop.units), report.numbers(values[m]), s.doc]
+            [m, ms.unit(m, case.loop.units), tables.numbers(values[m]), s.doc]
             for m, s in ms.MEASURES.items()
             if m in values and m not in ms.TIMES.values()
         ]
-        print(report.table(rows, ["measure", "unit", "value", ""]))
+        print(tables.table(rows, ["measure", "unit", "value", ""]))
     tell_written(written, args)
     return 0
 
@@ -106,7 +106,7 @@ def compare(args):
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import presets
-    from tuning import compare, report
+    from tuning import compare, tables
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
@@ -118,7 +118,7 @@ def compare(args):
         found[paper] = compare.measure(paper)
     written = compare.save(found, args.out, args.line) if args.out else []
     if args.json:
-        print(report.dumps(found if args.paper == "all" else found[args.paper]))
+        print(tables.dumps(found if args.paper == "all" else found[args.paper]))
     else:
         print(compare.markdown(found) if args.markdown else "\n\n".join(compare.text(page) for page in found.values()))
     tell_written(written, args)
@@ -130,17 +130,17 @@ def bench(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning import bench, report
+    from tuning import bench, tables
 
     if args.cases:
         from jaxtank import presets, rig
 
         names = presets.names() if args.cases == ["all"] else args.cases
         result = bench.measure_cases({name: rig.open_case(name) for name in names}, rounds)
-        print(report.dumps(result) if args.json else bench.text_of_cases(result))
+        print(tables.dumps(result) if args.json else bench.text_of_cases(result))
         return 0
     result = bench.measure(rounds)
-    print(report.dumps(result) if args.json else bench.text(result))
+    print(tables.dumps(result) if args.json else bench.text(result))
     return 0
 
 

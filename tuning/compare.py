@@ -14,7 +14,7 @@ from jaxtank import presets, rig
 from jaxtank.files import check_folder
 from jaxtank.presets.base import Claim
 from jaxtank.tree import get_value
-from tuning import pictures, report
+from tuning import pictures, saving, tables
 from tuning.manual import noisy
 from tuning.page import document, svg
 
@@ -74,8 +74,8 @@ def measure(paper):
                 "quantity": name,
                 "unit": printed.unit,
                 "where": printed.where,
-                "published": report.clean(printed.value),
-                "measured": report.clean(value),
+                "published": tables.clean(printed.value),
+                "measured": tables.clean(value),
                 "verdict": word,
                 "reason": reason,
             }
@@ -110,9 +110,9 @@ def _cell(value):
     return (
         value
         if isinstance(value, str)
-        else ", ".join(report.number(v, 4) for v in np.unique(np.ravel(value)))
+        else ", ".join(tables.number(v, 4) for v in np.unique(np.ravel(value)))
         if _flat(value)
-        else (", ".join(report.number(v, 4) for v in np.ravel(value)))
+        else (", ".join(tables.number(v, 4) for v in np.ravel(value)))
     )
 
 
@@ -124,7 +124,7 @@ def text(page):
     """The page of `jaxtank compare PAPER`."""
     rows = [[r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]] for r in page["rows"]]
     wrapped = [[row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]] for row in rows]
-    lines = [page["citation"], "", report.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"])]
+    lines = [page["citation"], "", tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"])]
     for row, cells in zip(page["rows"], rows):
         note = "; ".join(filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]]))
         if note:
@@ -162,7 +162,7 @@ def save(pages, folder, command=None):
         {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
     )
     table = pages if len(pages) > 1 else next(iter(pages.values()))
-    return report.write_files(Path(folder), {"result.json": report.dumps(table) + "\n", "report.html": html, **report.pngs(drawn)})
+    return saving.write_files(Path(folder), {"result.json": tables.dumps(table) + "\n", "report.html": html, **saving.pngs(drawn)})
 
 
 def _in_full(found):
@@ -171,7 +171,7 @@ def _in_full(found):
         [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"], r["where"], r["reason"]]
         for r in found["rows"]
     ]
-    return [report.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"])]
+    return [tables.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"])]
 
 
 def markdown(pages):

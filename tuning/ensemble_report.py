@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.files import check_folder
-from tuning import page, parts, report, search
+from tuning import page, parts, saving, search, tables
 from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
@@ -26,11 +26,11 @@ def json_of(ensemble):
         "infeasible": None if ensemble.infeasible is None else int(ensemble.infeasible.sum()),
         "draws": ensemble.method,
         "distributions": {
-            n: {"kind": type(d).__name__, **report.clean(dataclasses.asdict(d))} for n, d in ensemble.distributions.items()
+            n: {"kind": type(d).__name__, **tables.clean(dataclasses.asdict(d))} for n, d in ensemble.distributions.items()
         },
-        "measures": report.clean(ensemble.summary()),
+        "measures": tables.clean(ensemble.summary()),
         "units": {m: ms.unit(m, ensemble.case.loop.units) for m in ensemble.measures},
-        "violations": report.clean(ensemble.violations()),
+        "violations": tables.clean(ensemble.violations()),
         "wall_s": ensemble.wall_s,
         "provenance": search.provenance(ensemble.case, ensemble.seed),
     }
@@ -61,13 +61,13 @@ def parts_of(ensemble):
                 if found["mean_interval95"] is not None
                 else [np.nan] * 2
             )
-            shown = [report.number(columns[w][i], 4) for w in WORDS]
+            shown = [tables.number(columns[w][i], 4) for w in WORDS]
             rows.append(
                 [
                     label,
                     ms.unit(name, units),
                     shown[0],
-                    f"{report.number(interval[0], 4)} : {report.number(interval[1], 4)}",
+                    f"{tables.number(interval[0], 4)} : {tables.number(interval[1], 4)}",
                     *shown[1:],
                 ]
             )
@@ -77,21 +77,21 @@ def parts_of(ensemble):
         f"{ensemble.case.name}: {ensemble.samples} draws ({ensemble.method}, seed {ensemble.seed}), {ensemble.wall_s:.1f} s",
         f"uncertain: {spread}",
         "",
-        report.table(rows, head),
+        tables.table(rows, head),
         "",
     ]
     if ensemble.limits:
         rows = [
             [
                 v["name"],
-                f"{report.number(v['limit'])} {v['unit']}",
+                f"{tables.number(v['limit'])} {v['unit']}",
                 v["count"],
                 f"{v['probability']:.4g}",
                 "{:.4g} : {:.4g}".format(*v["interval95"]),
             ]
             for v in ensemble.violations()
         ]
-        words += [report.table(rows, ["limit", "value", "broken in", "probability", "95 % interval"]), ""]
+        words += [tables.table(rows, ["limit", "value", "broken in", "probability", "95 % interval"]), ""]
     if ensemble.method != "random":
         words.append(f"{INTERVALS} (here draws are {ensemble.method})")
     words.append(
@@ -171,7 +171,7 @@ def page_of(ensemble, drawn, command=None):
         worst = max(broken, key=lambda v: v["probability"])
         low, high = worst["interval95"]
         facts.insert(1, ("the limit most often broken", f"{100 * worst['probability']:.3g} %"))
-        which = f"{worst['name']} ({report.number(worst['limit'])} {worst['unit']})"
+        which = f"{worst['name']} ({tables.number(worst['limit'])} {worst['unit']})"
         said.append(
             f"{which} is the limit most often broken: in {worst['count']} of {ensemble.samples} draws, "
             f"a probability between {low:.3g} and {high:.3g} with 95 % confidence"
@@ -181,7 +181,7 @@ def page_of(ensemble, drawn, command=None):
     found = ensemble.summary().get("rms_error_total")
     if found is not None and found["p50"] is not None:
         unit = ms.unit("rms_error_total", ensemble.case.loop.units)
-        shown = [report.number(np.ravel(found[k])[0], 4) for k in ("p50", "p05", "p95")]
+        shown = [tables.number(np.ravel(found[k])[0], 4) for k in ("p50", "p05", "p95")]
         facts.insert(1, ("median rms_error_total", f"{shown[0]} {unit}"))
         said.append(
             f"rms_error_total: half of the draws lie below {shown[0]} {unit}, 9 in 10 between {shown[1]} and {shown[2]} {unit}"
@@ -212,9 +212,9 @@ def save(ensemble, folder, command=None):
     """
     check_folder(folder)
     folder = Path(folder)
-    files = {"result.json": report.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
+    files = {"result.json": tables.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
     drawn = figures(ensemble)
-    written = report.write_files(folder, files | {"report.html": page_of(ensemble, drawn, command)} | report.pngs(drawn))
+    written = saving.write_files(folder, files | {"report.html": page_of(ensemble, drawn, command)} | saving.pngs(drawn))
     if (folder / parts.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):
             if parts.NAME.fullmatch(path.name):

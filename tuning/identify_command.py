@@ -62,7 +62,7 @@ def run(args):
         return plan(args, case, free)
     if not args.data:
         raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
-    from tuning import report
+    from tuning import tables
     from tuning.identify import identify
     from tuning.log_file import read_log
     from tuning.memo import discard
@@ -103,7 +103,7 @@ def run(args):
     try:
         written = found.save(args.out, args.line) if args.out else []
     finally:  # a disk that is full costs the files, not the answer; and the log is kept
-        print(report.dumps(found.to_json()) if args.json else repr(found))
+        print(tables.dumps(found.to_json()) if args.json else repr(found))
     if args.out and found.status != "interrupted":
         discard(args.out)  # the result is whole: there is nothing left to go on with
     if written and not args.quiet:
@@ -138,7 +138,7 @@ def plan(args, case, free):
     """Compare experiments; returns the exit code."""
     import numpy as np
 
-    from tuning import report
+    from tuning import tables
     from tuning.experiments import compare_experiments, most_telling
 
     duration, dt = arguments.number("--duration", args.duration), 0.0
@@ -170,8 +170,8 @@ def plan(args, case, free):
     best = most_telling(found)
     if args.json:
         print(
-            report.dumps(
-                report.clean(
+            tables.dumps(
+                tables.clean(
                     {"case": case.name, "noise": noise, "duration": duration, "dt": dt, "experiments": found, "most_telling": best}
                 )
             )
@@ -191,7 +191,7 @@ def plan(args, case, free):
     print(
         f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with noise of {noise:g} {length} would leave\n"
     )
-    print(report.table(rows, ["parameter", "value", *letters]) + "\n")
+    print(tables.table(rows, ["parameter", "value", *letters]) + "\n")
     print("\n".join(f"{letter}  {words}" for letter, words in letters.items()))
     print(f"\nIt tells most: {best}." if best else "\nNone of them tells all of these parameters.")
     return 0

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.files import check_folder
 from tuning import identifiability as idf
-from tuning import page, pictures, report, search
+from tuning import page, pictures, saving, search, tables
 from tuning.identify import stopped
 
 FEW = 0.5
@@ -64,7 +64,7 @@ def _table(found):
         )
         sd = f"{100 * p['sd'] / abs(p['value']):.2g} %" if p["sd"] is not None and p["value"] else "-"
         rows.append([n, p["unit"], f"{p['before']:.5g}", f"{p['value']:.5g}", interval, sd])
-    return report.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
+    return tables.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
 
 
 def text(found):
@@ -90,7 +90,7 @@ def parts_of(found):
         "",
         _levels(found),
         "",
-        report._wrap(message(found)),
+        tables.wrap(message(found)),
     ]
     if found.validation:
         lines += ["", *_validation(found)]
@@ -126,7 +126,7 @@ def _validation(found):
             rmse, share = v[side]["rmse"][c], v[side]["nrmse_percent"][c]
             rows.append([name, words, "-" if rmse is None else f"{rmse:.4g} {unit}", "-" if share is None else f"{share:.1f} %"])
     head = f"fit to the first {', '.join(map(str, v['samples']))} samples, the rest predicted from the same start"
-    return [head, report.table(rows, ["reading", "part", "RMS", "fit"])]
+    return [head, tables.table(rows, ["reading", "part", "RMS", "fit"])]
 
 
 def json_of(found):
@@ -138,18 +138,18 @@ def json_of(found):
         "status": found.status,
         "success": found.status == "converged",
         "message": message(found),
-        "parameters": {n: report.clean(p) for n, p in found.parameters.items()},
-        "fit": report.clean({k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}),
+        "parameters": {n: tables.clean(p) for n, p in found.parameters.items()},
+        "fit": tables.clean({k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}),
         "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in zip(channel_names(found), quality["noise"])],
         "intervals_widened": quality["widened"],
-        "initial_levels": [[report.clean(v) for v in row] for row in found.levels],
+        "initial_levels": [[tables.clean(v) for v in row] for row in found.levels],
         "covariance": {"names": list(found.covariance[0]), "matrix": np.asarray(found.covariance[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "free_combinations": report.clean(found.directions),
+        "free_combinations": tables.clean(found.directions),
         "remedies": found.remedies,
-        "validation": report.clean(found.validation),
-        "profile": report.clean(found.profile),
-        "starts": report.clean(found.starts),
+        "validation": tables.clean(found.validation),
+        "profile": tables.clean(found.profile),
+        "starts": tables.clean(found.starts),
         "data": [{"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())} for one in est.logs],
         "substeps": est.substeps,
         "wall_s": found.wall_s,
@@ -269,7 +269,7 @@ def page_of(found, drawn, command=None):
         facts,
         said.split("; "),
         [(n, page.svg(f, n, captions[n]), captions[n]) for n, f in drawn.items()],
-        [part for part in parts_of(found)[1:] if part != report._wrap(said)],
+        [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
         command,
         search.provenance(found.case, found.seed),
         {} if found.status == "not_identifiable" else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)},
@@ -282,14 +282,14 @@ def save(found, folder, command=None):
     command: the line that made it, for the report, where there is one.
     """
     check_folder(folder)
-    files = {"result.json": report.dumps(json_of(found)), "fit.csv": fit_csv(found)}
+    files = {"result.json": tables.dumps(json_of(found)), "fit.csv": fit_csv(found)}
     if all(p["identifiable"] for p in found.parameters.values()):
         files["rig.toml"] = rigs.dump(found.identified)
     drawn = figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
     files["report.html"] = page_of(found, drawn, command)
-    files |= report.pngs(drawn)
+    files |= saving.pngs(drawn)
     stale = _left_over(Path(folder), files)
-    written = report.write_files(Path(folder), files)
+    written = saving.write_files(Path(folder), files)
     for path in stale:
         path.unlink()
     return written

@@ -13,7 +13,7 @@ from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free
 from jaxtank.records import CLOCK
 from jaxtank.tree import walk
-from tuning import manual_parts, report
+from tuning import manual_parts, tables
 from tuning.objective import LOWER
 
 WIDTH = 100
@@ -44,7 +44,7 @@ def json_of(case):
         for name, value, meta in walk(case.loop, kind=kind):
             low, high = list(Free(*ranges[name]))[:2] if name in ranges else (None, None)
             parameters[name] = {
-                "value": report.clean(value),
+                "value": tables.clean(value),
                 "unit": meta["unit"],
                 "low": low,
                 "high": high,
@@ -65,9 +65,9 @@ def json_of(case):
         "observer": type(case.loop.observer).__name__,
         "parameters": parameters,
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
-        "limits": report.clean(dict(case.limits)),
+        "limits": tables.clean(dict(case.limits)),
         "objective": dict(case.objective),
-        "published": {n: [report.clean(p.value), " ".join(filter(None, [p.unit, p.where]))] for n, p in preset.published.items()}
+        "published": {n: [tables.clean(p.value), " ".join(filter(None, [p.unit, p.where]))] for n, p in preset.published.items()}
         if preset
         else {},
         "departures": list(preset.departures) if preset else [],
@@ -222,7 +222,7 @@ def _published(case, preset):
 def _plain(value):
     if isinstance(value, (tuple, list)):
         return " ".join(_plain(v) for v in value)
-    return report.number(value, 6) if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
+    return tables.number(value, 6) if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
 
 
 def _shown(value, is_static):
@@ -230,4 +230,4 @@ def _shown(value, is_static):
         return "not in use"
     if is_static:
         return str(value).lower() if isinstance(value, bool) else str(value)
-    return " ".join(report.number(v, 6) for v in np.ravel(value))
+    return " ".join(tables.number(v, 6) for v in np.ravel(value))

@@ -67,13 +67,13 @@ class TuningResult:
 
     def save(self, folder, command=None):
         """Write result.json, rig.toml, trajectory.csv, the pictures and report.html, which says the line `command`, to a folder."""
-        from tuning.report import save
+        from tuning.tune_report import save
 
         return save(self, folder, command)
 
     def plot(self):
         """Matplotlib figures {name: figure}: responses before and after, convergence, landscape, and what else there is to show."""
-        from tuning.report import figures
+        from tuning.tune_report import figures
 
         return figures(self)
 

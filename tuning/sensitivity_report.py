@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxtank.files import check_folder
 from jaxtank.tree import describe, get_value
-from tuning import page, report, search
+from tuning import page, saving, search, tables
 from tuning.distributions import Correlated, Normal
 from tuning.effects import NORMAL_WIDTH
 
@@ -87,7 +87,7 @@ def json_of(result):
         },
         "parameters": {
             n: {
-                "value": report.clean(np.asarray(get_value(result.case.loop, n))),
+                "value": tables.clean(np.asarray(get_value(result.case.loop, n))),
                 "unit": describe(result.case.loop, n)["unit"],
                 **({"half_width": result.half_width[n], "half_width_is": _width_words(result, n)} if result.half_width else {}),
             }
@@ -112,20 +112,20 @@ def _column_json(result, c):
     extra = {}
     if result.method == "sobol":
         extra = {
-            "sd": report.clean(float(c.felt["sd"])),
-            "sum_of_first": report.clean(float(np.sum(c.felt["first"]))),
+            "sd": tables.clean(float(c.felt["sd"])),
+            "sum_of_first": tables.clean(float(np.sum(c.felt["first"]))),
             "base_points_used": int(c.felt["kept"]),
         }
     rows = {}
     for i in result.order(c):
-        rows[result.parameters[i]] = {q: report.clean(c.felt[q][i]) for q in HEADS[result.method]}
+        rows[result.parameters[i]] = {q: tables.clean(c.felt[q][i]) for q in HEADS[result.method]}
         if result.method == "morris":
-            rows[result.parameters[i]]["mu_interval95"] = report.clean(c.felt["mu_interval95"][i])
+            rows[result.parameters[i]]["mu_interval95"] = tables.clean(c.felt["mu_interval95"][i])
             rows[result.parameters[i]]["effects_used"] = int(c.felt["kept"][i])
     return {
         "measure": c.measure,
         "unit": c.unit,
-        "nominal": report.clean(c.nominal),
+        "nominal": tables.clean(c.nominal),
         "not_finite": c.not_finite,
         "reason": c.reason or None,
         **extra,
@@ -150,7 +150,7 @@ def parts_of(result):
     ]
     heads = HEADS[result.method]
     for c in result.columns:
-        title = f"{c.label} [{c.unit}], {report.number(c.nominal)} in the case's own run"
+        title = f"{c.label} [{c.unit}], {tables.number(c.nominal)} in the case's own run"
         if c.empty:
             parts += [f"{title}: no indices, {c.reason}", ""]
             continue
@@ -159,7 +159,7 @@ def parts_of(result):
         tail = [f"and {more} more parameters, each below these"] if more > 0 else []
         if result.method == "sobol":
             tail.append(f"first-order shares sum to {np.sum(c.felt['first']):.3f}; to 1 where nothing interacts")
-        parts += [title, report.table(rows, ["parameter", *heads.values()]), *tail, ""]
+        parts += [title, tables.table(rows, ["parameter", *heads.values()]), *tail, ""]
     return parts
 
 
@@ -169,7 +169,7 @@ def _said(distribution):
 
 
 def _cell(value):
-    return " : ".join(report.number(v, 3) for v in value) if np.ndim(value) else report.number(value, 4)
+    return " : ".join(tables.number(v, 3) for v in value) if np.ndim(value) else tables.number(value, 4)
 
 
 def table_csv(result):
@@ -201,7 +201,7 @@ def figures(result):
         order = result.order(c)
         names = [result.parameters[i] for i in order]
         felt = {q: np.asarray(c.felt[q])[order] for q in HEADS[result.method]}
-        title = f"{c.label} ({report.number(c.nominal, 4)} {c.unit})"
+        title = f"{c.label} ({tables.number(c.nominal, 4)} {c.unit})"
         draws.append(lambda ax, n=names, f=felt, u=c.unit, t=title: _panel(plotting, result.method, ax, n, f, u, t))
     name = "sobol" if result.method == "sobol" else "tornado"
     rows = min(len(result.parameters), plotting.BARS)
@@ -247,6 +247,6 @@ def save(result, folder, command=None):
     command: the line that made the result, for the report, where there is one.
     """
     check_folder(folder)
-    files = {"result.json": report.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
+    files = {"result.json": tables.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
     drawn = figures(result)
-    return report.write_files(Path(folder), files | {"report.html": page_of(result, drawn, command)} | report.pngs(drawn))
+    return saving.write_files(Path(folder), files | {"report.html": page_of(result, drawn, command)} | saving.pngs(drawn))

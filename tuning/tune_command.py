@@ -21,7 +21,7 @@ def tune(args):
 def _tune(args):
     seed, case = seed_of(args), open_case(args)
     from jaxtank.rig import check_objective
-    from tuning import report, search
+    from tuning import report, search, tables
 
     free = once("--free", [pair("--free", text, span) for text in args.free])
     objective = once("--objective", [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective])
@@ -64,7 +64,7 @@ def _tune(args):
         seed=seed,
         screening=whole("--screening", args.screening, 1, 65536),
         iterations=whole("--iterations", args.iterations, 1, 100_000),
-        progress=Progress(report.objective_unit(objective or case.objective, case.loop.units), args.quiet),
+        progress=Progress(tables.objective_unit(objective or case.objective, case.loop.units), args.quiet),
     )
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
@@ -82,7 +82,7 @@ def _tune(args):
     try:
         written = result.save(folder, args.line) if folder else []
     finally:  # a disk that is full costs the files, not the answer; and the log is kept
-        print(report.dumps(report.json_of(result)) if args.json else report.text(result))
+        print(tables.dumps(report.json_of(result)) if args.json else report.text(result))
     if folder and result.status != "interrupted":
         from tuning.memo import discard
 

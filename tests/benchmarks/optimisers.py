@@ -32,7 +32,7 @@ from jaxtank import presets
 from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
 from jaxtank.signals import ramps
-from tuning import report
+from tuning import tables
 from tuning.objective import Problem
 from tuning.scenarios import rough_clock
 from tuning.screening import distinct_starts, screen
@@ -323,7 +323,7 @@ def shown(found):
     text = [
         f"{found['parameters']} parameters, {found['scenarios']} scenario(s) of {found['samples']} samples; best cost {found['best']:.6g}",
         f"run times (over a simulation; population: per lane): {cost}; compiling took {sum(found['compile_s'].values()):.0f} s",
-        report.table(rows, head),
+        tables.table(rows, head),
     ]
     for method, when in itertools.product(("trf", "coarse-trf"), ("arrived", "ended")):
         mine = [r for r in found.get("race", []) if (r["method"], r["when"]) == (method, when)]

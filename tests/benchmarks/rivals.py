@@ -26,7 +26,7 @@ import numpy as np
 import jaxtank
 from jaxtank import presets
 from jaxtank.files import write_atomic
-from tuning import bench, report
+from tuning import bench, tables
 
 README = Path(__file__).parents[2] / "README.md"
 BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
@@ -322,7 +322,7 @@ def main(words):
             ]
         )
     heads = ["one run in float64", "ns per step", "times ours (range)", "first call, s more", "RMS error from ours, cm", "samples"]
-    print(report.table(rows, heads))
+    print(tables.table(rows, heads))
     print(f"not here: {', '.join(missing)}")
     if "--markdown" in words:
         lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(row)} |" for row in rows)]

@@ -25,7 +25,7 @@ from jaxtank import _xla, loop, presets
 from jaxtank.derivatives import _sensitivities
 from jaxtank.files import write_atomic
 from jaxtank.tree import with_values
-from tuning import bench, report
+from tuning import bench, tables
 from tuning.manual import noisy
 
 README = Path(__file__).parents[2] / "README.md"
@@ -263,7 +263,7 @@ def main(words):
     if cores:
         os.sched_setaffinity(0, cores)
     rows += cold()
-    print(report.table(rows, HEADS))
+    print(tables.table(rows, HEADS))
     if "--markdown" in words:
         table = "\n".join([f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|", *(f"| {' | '.join(row)} |" for row in rows)])
         text = README.read_text()

@@ -1,0 +1,77 @@
+"""Files of a result: trajectories, pictures, and a folder that takes all of them or none."""
+
+import io
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank import loop as lp
+from jaxtank.errors import InputError
+from jaxtank.files import check_folder, write_together
+from jaxtank.neighbours import columns
+from jaxtank.units import DEFAULT
+from tuning.tables import dumps
+
+
+def trajectory_csv(run, rig_units=DEFAULT):
+    """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
+    known = bool(np.asarray(run.d_hat).any())
+    kept = {n: v for n, v in columns(run, rig_units).items() if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))}
+    out = io.StringIO()
+    out.write(",".join(kept) + "\n")
+    np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
+    return out.getvalue()
+
+
+def run_for_people(case, key=None, rows=3000):
+    """A Trajectory of about `rows` rows, as host arrays."""
+    steps = case.clock.samples - 1
+    least = max(1, steps // rows)
+    # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that rests; one that ends at the end, if any
+    every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
+    run = lp.simulate(case.loop, case.clock, key, save_every=every)
+    return type(run)(*(np.asarray(v) for v in run))
+
+
+def png(figure):
+    import matplotlib.pyplot as plt
+
+    out = io.BytesIO()
+    figure.savefig(out, format="png", metadata={"Software": None})
+    plt.close(figure)
+    return out.getvalue()
+
+
+def pngs(drawn):
+    """{file name: bytes} of {name: figure}; the figures are closed."""
+    return {f"{name}.png": png(figure) for name, figure in drawn.items()}
+
+
+def save_run(case, run, payload, folder, gif=False):
+    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`."""
+    from jaxtank import plotting
+
+    check_folder(folder)
+    picture = plotting.responses(case.loop, {case.name: run}, case.title)
+    files = {
+        "result.json": dumps(payload) + "\n",
+        "trajectory.csv": trajectory_csv(run, case.loop.units),
+        "responses.png": png(picture),
+    }
+    if gif:
+        from jaxtank.animation import animate
+
+        with tempfile.TemporaryDirectory() as aside:
+            files["run.gif"] = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
+    return write_files(Path(folder), files)
+
+
+def write_files(folder, files):
+    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; returns the paths."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_together(folder, files)
+    except OSError as error:
+        raise InputError(f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder that can") from None
+    return [folder / name for name in files]

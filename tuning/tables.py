@@ -1,0 +1,103 @@
+"""How results are written: numbers, tables and JSON, for people and for programs."""
+
+import json
+import math
+
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.units import DEFAULT
+
+REASONS = {
+    "overshoot_percent": "the reference does not change",
+    "rise_time": "no change of the setpoint was followed to 90 % of its height",
+    "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
+    "recovery_time": "an output was still outside the band when it was watched no longer",
+}
+
+ABSENT = "the value is not a finite number"
+
+UNSERVED = {
+    "overshoot_percent": "the reference has no changes that end",
+    "rise_time": "the reference has no changes that end",
+    "settling_time": "the reference has no changes that end",
+    "recovery_time": "this case has no disturbance to recover from",
+}
+
+
+def number(value, digits=5):
+    """A number for people: at most `digits` significant digits, a dash where there is none."""
+    value = float(value)
+    if not math.isfinite(value):
+        return "-"
+    if value == 0:
+        return "0"
+    text = f"{value:.{digits}g}"
+    return text if "e" not in text else f"{value:.{digits - 1}e}"
+
+
+def numbers(value, digits=5):
+    """The entries of a measure, side by side."""
+    return "  ".join(number(v, digits) for v in np.ravel(value))
+
+
+def clean(value):
+    """`value` for JSON: arrays as lists, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {k: clean(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [clean(v) for v in value]
+    if isinstance(value, (np.ndarray, np.generic)) or hasattr(value, "__jax_array__") or type(value).__module__.startswith("jax"):
+        return clean(np.asarray(value).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def reasons(measures):
+    """{measure: why} for every measure that is absent or has an entry that is not a number."""
+    found = {m: REASONS.get(m, ABSENT) for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float)))}
+    return {**found, **{m: why for m, why in UNSERVED.items() if m not in measures}}
+
+
+def measures_json(measures):
+    """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
+    return {**dict.fromkeys(UNSERVED), **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()})}
+
+
+def dumps(table):
+    """One JSON object as text; refuses NaN."""
+    return json.dumps(table, indent=2, allow_nan=False)
+
+
+def units(rig_units):
+    """{measure: unit} of everything that is reported, on a rig with these (length, pump input) units."""
+    return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
+
+
+class Table(str):
+    """Aligned columns as text, which still knows its `head` and `rows`, so that a page may set them in its own way."""
+
+    head: list
+    rows: list
+
+
+def table(rows, head=None):
+    """Rows of text as aligned columns, the first to the left: a Table."""
+    body = [[str(c) for c in row] for row in rows]
+    rows = ([head] if head else []) + body
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
+    found = Table("\n".join(lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines))
+    found.head, found.rows = head or [], body
+    return found
+
+
+def wrap(message):
+    return "\n".join(f"- {part}" for part in message.split("; "))
+
+
+def objective_unit(terms, rig_units=DEFAULT):
+    """Unit of a weighted sum: that of its only measure, or a plain number."""
+    found = {ms.unit(m, rig_units) for m in terms}
+    return found.pop() if len(found) == 1 else "-"

@@ -1,0 +1,204 @@
+"""Pictures, page and folder of a tuning result."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank import rig
+from jaxtank.files import check_folder
+from tuning.report import json_of, parts_of, worst_of_scenarios
+from tuning.saving import pngs, run_for_people, trajectory_csv, write_files
+from tuning.tables import dumps, number, objective_unit
+
+
+def result_key(result):
+    """The key of the sensor noise of the case's own run, None where it has none."""
+    import jax
+
+    return jax.random.key(result.problem.seed) if bool(np.any(np.asarray(result.case.loop.sensor.noise) > 0)) else None
+
+
+def figures(result, runs=None):
+    """Matplotlib figures of a tuning result: those of CAPTIONS that have something to show."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank import plotting
+    from tuning import pictures
+
+    key = result_key(result)
+    runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level" and limit.lane == 0}
+    limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
+    told = {"before": "", "after": ""}
+    if result.problem.limits:
+        told = {
+            k: ", breaks a limit" if (result.problem.margins(t) < 0).any() else ", holds all limits"
+            for k, t in result.tables.items()
+        }
+    title = (
+        f"{result.tuned.name}: objective {number(result.objective['before'], 4)}{told['before']} -> "
+        f"{number(result.objective['after'], 4)}{'' if unit == '-' else f' {unit}'}{told['after']}\n("
+        + ", ".join(
+            f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}"
+            for n, p in list(result.parameters.items())[:4]
+        )
+        + ")"
+    )
+    drawn = {
+        "responses": plotting.responses(result.tuned.loop, runs, title, limits),
+        **pictures.rig(result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"),
+        **pictures.margins(worst_of_scenarios(result.constraints)),
+        **pictures.inner(result.tuned.loop, runs),
+        **pictures.saturation(result.tuned.loop, runs),
+        **pictures.estimates(
+            result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
+        ),
+    }
+    with plotting.styled():
+        if result.cloud is not None and len(result.cloud["objective"]):
+            drawn["clouds"] = _clouds(plt, result, unit)
+        if result.history:
+            figure, ax = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+            plotting.convergence(ax, result.history, unit, bool(result.problem.limits))
+            drawn["convergence"] = figure
+        figure, ax = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
+        _landscape(ax, result, unit)
+        drawn["landscape"] = figure
+    if result.tradeoff:
+        of = ms.unit(result.tradeoff["measure"], result.tuned.loop.units)
+        drawn |= pictures.tradeoff(result.tradeoff, of, unit)
+    return drawn
+
+
+CAPTIONS = {
+    "responses": "The run before tuning (orange, dashed) and after (blue): controlled levels with their setpoints, tracking errors, the other "
+    "tanks, and what the pumps were given. Shaded: past a limit.",
+    "margins": "Room that the tuned run leaves to each limit; a bar to the left of zero is a limit that is broken.",
+    "inner": "The tanks that are not controlled, one against the other, from the dot to the square.",
+    "saturation": "When pumps were commanded past their limits: up past the upper, down past the lower, as tall as the share of the time.",
+    "estimates": "What the observer believed beside what was true, in the tuned run.",
+    "clouds": "Runs that the search never saw, on perturbed plants and fresh noise where the case has them: a dot each, before across, after up.",
+    "convergence": "Every evaluation of the search in its order.",
+    "landscape": "The objective around the answer, at the case's own step.",
+    "tradeoff": "The least objective that each value of the limit leaves.",
+    "rig": "The rig, drawn from its own topology; triangles are setpoints, a heavier outline is a tank that is controlled.",
+}
+
+
+def page_of(result, drawn, command=None):
+    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the line that made it."""
+    from tuning import page
+
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
+    before, after = result.objective["before"], result.objective["after"]
+    broken = [c for c in result.constraints if c["margin"] < 0]
+    limits = f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold" if result.constraints else "none"
+    facts = [
+        ("objective before", f"{number(before)} {unit}".strip()),
+        ("objective after", f"{number(after)} {unit}".strip()),
+        ("limits", limits),
+        ("gains tuned", str(len(result.parameters))),
+        ("simulations", str(result.evaluations["simulations"])),
+        ("time", f"{result.wall_s:.1f} s"),
+    ]
+    if np.isfinite(before) and before and not broken:
+        facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
+    return page.document(
+        f"{result.tuned.name}: tuned",
+        result.case.title,
+        result.status.replace("_", " ") + ("; every limit holds" if result.constraints and not broken else ""),
+        result.success,
+        facts,
+        result.message.split("; "),
+        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        parts_of(result)[1:],
+        command,
+        result.provenance,
+        {"The tuned rig as a file (rig.toml)": rig.dump(result.tuned)},
+    )
+
+
+def _clouds(plt, result, unit):
+    """The runs that the search never saw, before against after: the objective, and the level that comes nearest to its limit."""
+    from jaxtank import plotting
+
+    found, length = result.cloud, result.tuned.loop.units[0]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 4.9), layout="constrained")
+    plotting.cloud(left, found["objective"], found["held"], "objective", unit)
+    name = "highest level over its limit" if found["past"] else "highest level"
+    plotting.cloud(right, found["level"], found["held"], name, length, found["limit"])
+    handles, labels = right.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.suptitle(plotting.plain(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"), fontsize=10)
+    return figure
+
+
+def _landscape(ax, result, unit):
+    """The objective around the answer at the case's own step: along one parameter, or over the two that it feels most."""
+    from jaxtank import plotting
+
+    problem = result.problem
+    z = np.array([float(b.to_unit(p["after"])) for b, p in zip(problem.bounds, result.parameters.values())])
+    z0 = problem.start()
+    if len(z) == 1:
+        grid = np.linspace(0.0, 1.0, 128)
+        costs, margins = problem.screen(grid[:, None])
+        violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
+        b = problem.bounds[0]
+        return plotting.curve(
+            ax,
+            b.from_unit(grid),
+            costs,
+            violation,
+            b.name,
+            b.unit,
+            unit,
+            (result.parameters[b.name]["before"], result.objective["before"]),
+            (result.parameters[b.name]["after"], result.objective["after"]),
+            b.scale == "log",
+        )
+    first, second = sorted(np.argsort([-(p["felt_percent"] or 0.0) for p in result.parameters.values()], kind="stable")[:2])
+    side = np.linspace(0.0, 1.0, 24)
+    a, c = np.meshgrid(side, side)
+    points = np.tile(z, (a.size, 1))
+    points[:, first], points[:, second] = a.ravel(), c.ravel()
+    costs, margins = problem.screen(points)
+    worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
+    x, y = problem.bounds[first], problem.bounds[second]
+    plotting.contours(
+        ax,
+        x.from_unit(a),
+        y.from_unit(c),
+        costs.reshape(a.shape),
+        worst.reshape(a.shape),
+        (x.name, y.name),
+        (x.unit, y.unit),
+        unit,
+        (x.from_unit(z0[first]), y.from_unit(z0[second])),
+        (x.from_unit(z[first]), y.from_unit(z[second])),
+        (x.scale == "log", y.scale == "log"),
+    )
+    if len(z) > 2:
+        ax.set_title("landscape (slice through the answer)")
+    return ax
+
+
+def save(result, folder, command=None):
+    """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
+
+    command: the line that made the result, for the report, where there is one.
+    """
+    check_folder(folder)
+    folder = Path(folder)
+    key = result_key(result)
+    runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    files = {
+        "result.json": dumps(json_of(result)) + "\n",
+        "rig.toml": rig.dump(result.tuned),
+        "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
+        "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
+    }
+    drawn = figures(result, runs)
+    return write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
