@@ -33,7 +33,9 @@ class PumpBank:
        zone, as that of u - dead_zone (gouta2022, spec 1.2). "hysteresis": a pump that turns stops
        below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
        volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
-    3. Lag, if given: first order with time constant `lag` [s], exact over a sample.  4. Transport delay: `delay` [s], whole samples.
+    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. What the plant is given over a sample is the
+       mean of v over it, so that the volume delivered is that of the lag itself, whatever the sampling period.
+    4. Transport delay: `delay` [s], whole samples.
 
     The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its edge, and through "pulse" it is
     that of the mean flow, 1.
@@ -87,8 +89,9 @@ class PumpBank:
             # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
             slow = [self.lag[i] > 0 for i in range(self.pumps)]
             keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
-            u = tuple(keep[i] * state.lagged[i] + (1.0 - keep[i]) * u[i] for i in range(self.pumps))
-            state = state._replace(lagged=u)
+            short = [v - u[i] for i, v in enumerate(state.lagged)]  # v at the start of the sample, from where it is drawn to
+            state = state._replace(lagged=tuple(u[i] + keep[i] * s for i, s in enumerate(short)))
+            u = tuple(u[i] + self.lag[i] / dt * (1.0 - keep[i]) * s for i, s in enumerate(short))
         if state.line:
             head = state.head
             out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)

@@ -463,15 +463,15 @@ def test_verdicts_follow_the_numbers():
 
 
 def test_the_rig_that_was_fitted_to_the_paper():
-    """Spec 5.3, means over six draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9, 34.2 s (E), tolerances as in 5.1 with
-    what six draws leave open. The dead zone comes before the lag: rectified after it, noise costs another 0.4 V."""
+    """Spec 5.3, means over nine draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9, 34.2 s (E), tolerances as in 5.1 with
+    what so many draws leave open. The dead zone comes before the lag: rectified after it, noise costs another 0.4 V."""
     case = rig.set_values(CASES["enmpc"], paper.PAPER_LIKE)
     found = [
         paper.figures(type(t)(*(np.asarray(v) for v in t)))
-        for t in (jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(6))
+        for t in (jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(9))
     ]
     mean = lambda name: np.mean([f[name] for f in found], axis=0)
     np.testing.assert_allclose(mean("voltage"), (7.97, 8.70), atol=0.03)
     np.testing.assert_allclose(mean("error"), (0.622, 1.171), atol=0.01)
-    # the noise throws the second level out of its band once more, much later, in one of these draws: the median
+    # the noise throws the second level out of its band once more, much later, in three of these draws: the median
     np.testing.assert_allclose(np.median([f["settling"] for f in found], axis=0), (24.9, 34.2), atol=0.6)

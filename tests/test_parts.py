@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import measures as ms
@@ -216,10 +217,31 @@ def test_pulses_deliver_the_mean():
 
 
 def test_lag_is_exact_over_a_sample():
+    """The mean over each sample of 0.1 s of 6 - 4 exp(-t / 1 s)."""
     got = drive(pumps(lag=[1.0, 0.0]), [(6.0, 6.0)] * 20)
-    t = 0.1 * np.arange(1, 21)
-    np.testing.assert_allclose(got[:, 0], 6 + (2 - 6) * np.exp(-t), rtol=1e-12)
+    t = 0.1 * np.arange(21)
+    np.testing.assert_allclose(got[:, 0], 6 + (2 - 6) * -np.diff(np.exp(-t)) / 0.1, rtol=1e-12)
     np.testing.assert_array_equal(got[:, 1], 6.0)
+
+
+@pytest.mark.parametrize("dt", [0.2, 1.0, 4.0])
+def test_a_lag_delivers_its_volume_whatever_the_sampling_period(dt):
+    """Pumps of 0.8 s whose command changes every 4 s: the volume is that of lag v' = u - v by scipy, sampled fast or slowly."""
+    lag, commands = 0.8, (5.0, 1.0, 8.0)
+    got = drive(pumps(lag=[lag, lag]), [(u, u) for u in commands for _ in range(round(4.0 / dt))], dt=dt)
+    v, volume = 2.0, 0.0
+    for u in commands:
+        run = solve_ivp(lambda t, y, u=u: [(u - y[0]) / lag, y[0]], (0.0, 4.0), [v, volume], rtol=1e-11, atol=1e-12)
+        v, volume = run.y[:, -1]
+    assert got[:, 0].sum() * dt == pytest.approx(volume, rel=1e-9)
+
+
+def test_the_slope_by_a_lag_that_follows_at_once():
+    """From 2 V to 6 V: the mean over a sample of 0.1 s is short by 4 V lag / 0.1 s, of a lag of 0 s too."""
+    start = pumps(lag=[1.0, 1.0]).init(Clock(dt=0.1, duration=1.0))
+    at = lambda lag: pumps(lag=jnp.stack([lag, lag])).deliver(start, (6.0, 6.0), 0.1)[0][0]
+    assert float(at(0.0)) == 6.0 and float(at(1e-3)) == pytest.approx(6.0 - 0.04, rel=1e-12)
+    assert float(jax.grad(at)(0.0)) == pytest.approx(-40.0, rel=1e-12)
 
 
 def test_delay_is_whole_samples_and_starts_from_the_initial_voltage():
