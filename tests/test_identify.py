@@ -724,6 +724,23 @@ def test_what_is_written(identified):
     assert np.sqrt(np.mean(np.square(left))) == pytest.approx(found["fit"]["rmse"][0], rel=1e-4)
 
 
+def test_a_rig_whose_setpoints_its_own_plant_cannot_hold_is_read_back(tmp_path):
+    """Pumps that fill their own tanks hold 12 and 2 cm; those of the log, which fill the others' by way of the upper tanks, do not."""
+    case = rig.set_values(presets.find("mirakhorli/sfc"), {"plant.split": [0.9, 0.9]})
+    case = case.replace(scenarios=(), loop=with_values(case.loop, {"reference.targets": [12.0, 2.0]}))
+    (tmp_path / "log.csv").write_text(csv_text())
+    rig.save(case, tmp_path / "rig.toml")
+    assert rig.load(tmp_path / "rig.toml").reachable
+    words = ("--data", str(tmp_path / "log.csv"), *FLAGS[:2], "--starts", "1", *FLAGS[4:], "--json", "--out", str(tmp_path / "out"))
+    code, out, err = command("identify", str(tmp_path / "rig.toml"), *words)
+    assert code == 0, err
+    again = rig.load(tmp_path / "out" / "rig.toml")
+    assert not again.reachable and "(12, 2) cm have no steady state" in rig.unreachable(again)
+    np.testing.assert_allclose(again.loop.plant.split, [0.42, 0.34], atol=0.01)
+    said = json.loads(out)["message"]
+    assert rig.unreachable(again) in said and "reachable = false" in said and rig.unreachable(again) in err
+
+
 def test_plants_are_drawn_from_the_covariance(identified):
     """The ensemble of the written rig scatters as the estimates do, correlations included."""
     again = rig.load(identified[0] / "out" / "rig.toml")

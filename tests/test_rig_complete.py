@@ -67,6 +67,16 @@ def test_every_suggestion_can_be_used(name):
     assert len(tried) > 60
 
 
+@pytest.mark.parametrize("tankwise", [False, True])
+def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwise):
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]})
+    text = rig.dump(case, tankwise)
+    again = rig.loads(text)
+    assert case.reachable and not again.reachable
+    assert f"reachable = false  # {rig.unreachable(case)}" in text.splitlines()
+    assert_same(again, case)
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_tank_by_tank_it_is_the_same_rig(name):
     case = presets.find(name)

@@ -5,6 +5,7 @@ import sys
 from jaxtank.errors import InputError
 from tuning import arguments
 from tuning.interrupts import Interrupts, put_back
+from tuning.options import tell_unreachable
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
@@ -108,6 +109,7 @@ def run(args):
         discard(args.out)  # the result is whole: there is nothing left to go on with
     if written and not args.quiet:
         print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)
+        tell_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(d["words"] for d in found.directions)
         print(f"jaxtank: {', '.join(args.data)}: cannot tell apart {words}: no rig is written", file=sys.stderr)

@@ -51,7 +51,14 @@ def message(found):
     for n, p in found.parameters.items():
         if p["at_bound"]:
             words.append(f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval")
+    if identifiable(found) and found.case.reachable and (why := rigs.unreachable(found.identified)):
+        words.append(f"{why}; rig.toml says reachable = false for it: choose other setpoints before tuning")
     return "; ".join(words)
+
+
+def identifiable(found):
+    """Whether every parameter is identified, so that a rig may be written."""
+    return all(p["identifiable"] for p in found.parameters.values())
 
 
 def _table(found):
@@ -283,7 +290,7 @@ def save(found, folder, command=None):
     """
     check_folder(folder)
     files = {"result.json": tables.dumps(json_of(found)), "fit.csv": fit_csv(found)}
-    if all(p["identifiable"] for p in found.parameters.values()):
+    if identifiable(found):
         files["rig.toml"] = rigs.dump(found.identified)
     drawn = figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
     files["report.html"] = page_of(found, drawn, command)

@@ -126,3 +126,11 @@ def devices_of(args):
 def tell_written(paths, args):
     if paths and not args.quiet:
         print(f"written to {args.out}: " + ", ".join(p.name for p in paths), file=sys.stderr)
+
+
+def tell_unreachable(case, paths, args):
+    """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false` and the case itself did not."""
+    from jaxtank import rig
+
+    if any(p.name == "rig.toml" for p in paths) and case.reachable and not args.quiet and (why := rig.unreachable(case)):
+        print(f"jaxtank: {args.out.rstrip('/')}/rig.toml: note: {why}; the file says reachable = false for it", file=sys.stderr)

@@ -7,7 +7,7 @@ from jaxtank.errors import InputError
 from tuning.arguments import number, open_case, pair, span, whole
 from tuning.arguments import seed as seed_of
 from tuning.interrupts import Interrupts, put_back
-from tuning.options import choices_of, distributions_of, limits_of, once, scenarios_of, tell_written, tradeoff_of
+from tuning.options import choices_of, distributions_of, limits_of, once, scenarios_of, tell_unreachable, tell_written, tradeoff_of
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -88,6 +88,7 @@ def _tune(args):
 
         discard(folder)  # the result is whole: there is nothing left to go on with
     tell_written(written, args)
+    tell_unreachable(result.tuned, written, args)
     if not args.out and not args.json and not args.quiet:
         print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
     return EXIT[result.status]

@@ -67,7 +67,7 @@ values = { "sensor.noise" = 0.02, "plant.pump_gain" = 7.5 }
 """
 
 from jaxtank.presets.base import Case
-from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered
+from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered, unreachable
 from jaxtank.rig.doubts import doubts
 from jaxtank.rig.reading import from_table, load, loads, open_case
 from jaxtank.rig.values import has, set_and_schedule, set_values
@@ -95,4 +95,5 @@ __all__ = [
     "short",
     "toml",
     "uncovered",
+    "unreachable",
 ]

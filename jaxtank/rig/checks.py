@@ -24,13 +24,21 @@ SCENARIO_KEYS = ("name", "values", "seed", "weight")
 def check(case):
     """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
     lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
-    if case.reachable and isinstance(case.loop.reference, Ramps) and case.loop.plant.pumps == len(case.loop.plant.outputs):
-        for values in case.loop.reference.plateaus(case.clock.duration):
-            try:
-                equilibrium(case.loop.plant, values)
-            except EquilibriumError as error:
-                raise EquilibriumError(f"reference: {error}") from None
+    if case.reachable and (why := unreachable(case)):
+        raise EquilibriumError(why)
     return case
+
+
+def unreachable(case):
+    """Which plateau of the reference has no steady state on this plant, and why, in a sentence; None where all of them have one."""
+    plant, reference = case.loop.plant, case.loop.reference
+    if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
+        for values in reference.plateaus(case.clock.duration):
+            try:
+                equilibrium(plant, values)
+            except EquilibriumError as error:
+                return f"reference: {error}"
+    return None
 
 
 def check_uncertain(loop, uncertain):

@@ -9,6 +9,7 @@ from jaxtank.errors import InputError
 from jaxtank.presets.base import Free
 from jaxtank.records import CLOCK
 from jaxtank.rig import examples, parts, signals, tanks
+from jaxtank.rig.checks import unreachable
 from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of
 from jaxtank.rig.origin import origin_of, structures
 from jaxtank.rig.reading import start_of
@@ -32,7 +33,7 @@ def sections(case, tankwise=False):
         raise InputError(f"{case.name}: cannot be written as a rig file: its law or observer has another model than its rig")
     top = [
         *built[0].keys,
-        *([Key("reachable", case.reachable, REACHABLE)] if case.reachable != base.reachable else []),
+        *_reachable(case, base),
         *([Key("scenario", [], {**BARE, "doc": "none of the preset's runs"})] if base.scenarios and not case.scenarios else []),
     ]
     found = [
@@ -46,6 +47,15 @@ def sections(case, tankwise=False):
     if any(k.name == "sine" for f in found for k in f.keys):
         have.add("[reference.sine]")
     return [*found, *examples.sections(case, have)]
+
+
+def _reachable(case, base):
+    """The key `reachable` where it is not as in `base`. A file whose plateaus have no steady state is only read with `false`, and a plant
+    that was identified or tuned may have lost one: the file then says false, and why."""
+    why = unreachable(case) if case.reachable else None
+    if why:
+        return [Key("reachable", False, {**BARE, "doc": why})]
+    return [Key("reachable", case.reachable, REACHABLE)] if case.reachable != base.reachable else []
 
 
 def _building(case, origin, same):
