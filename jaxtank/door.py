@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.records import check_clock
+from jaxtank.records import check_clock, check_key
 from jaxtank.tree import check_leaves
 
 
@@ -13,7 +13,10 @@ def check(loop, clock, key=None):
 
     Only concrete leaves are looked at, so that it costs nothing inside a trace.
     """
+    if not hasattr(loop, "plant"):
+        raise InputError(f"loop is a {type(loop).__name__}: must be a ClosedLoop, as case.loop (first the loop, then the clock)")
     check_clock(clock)
+    check_key(key)
     plant, actuator = loop.plant, loop.actuator
     if np.shape(loop.x0)[-1:] != (plant.tanks,):
         raise InputError(f"x0 has shape {np.shape(loop.x0)}: must be ({plant.tanks},), one level per tank")
@@ -32,7 +35,7 @@ def check(loop, clock, key=None):
         raise InputError(
             f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of {clock.dt:g} s, at most {clock.duration:g} s"
         )
-    check_leaves(loop)
+    check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in getattr(loop.controller, "gains", ())])
     _check_order(actuator, "low", "high")
     if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
         _check_order(actuator, "stop", "dead_zone", equal=True)

@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jaxtank.errors import InputError
 
@@ -49,6 +50,10 @@ LARGEST_RUN = 100_000_000  # samples
 
 def check_clock(clock):
     """Raise InputError unless the clock describes a run."""
+    if not isinstance(clock, Clock):
+        raise InputError(
+            f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, as case.clock (first the loop, then the clock)"
+        )
     for name in ("dt", "duration"):
         value = getattr(clock, name)
         if not (isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < float("inf")):
@@ -61,6 +66,18 @@ def check_clock(clock):
         raise InputError(f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 10")
     if clock.integrator not in INTEGRATORS:
         raise InputError(f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}")
+
+
+def check_key(key):
+    """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the older one, a row of unsigned integers;
+    traced ones and placeholders too."""
+    kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
+    typed = kind is not None and jax.dtypes.issubdtype(kind, jax.dtypes.prng_key)
+    if (typed and ndim == 0) or (kind == np.uint32 and (ndim == 1 or isinstance(key, jax.ShapeDtypeStruct))):
+        return
+    if key is not None:
+        told = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
+        raise InputError(f"key {told}: must be one random key, as jax.random.key(0), or None where there is no noise")
 
 
 class Tick(NamedTuple):

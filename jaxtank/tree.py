@@ -9,6 +9,7 @@ JAX rebuilds components through `__init__` with whatever it carries (tracers, ba
 """
 
 import dataclasses
+import numbers
 import re
 
 import jax
@@ -53,6 +54,18 @@ def is_component(value):
 def number(value):
     """`value` as a host array of the default float: the form in which constructors store leaves."""
     return np.asarray(value, dtype=np.float64)
+
+
+def is_real(value):
+    """Whether a value, or every entry of a list or array, is a real number: no text, truth value, complex number, random key or None."""
+    if isinstance(value, list | tuple):
+        return all(is_real(v) for v in value)
+    kind = getattr(value, "dtype", None)
+    if kind is None:
+        return isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if kind == np.dtype(object):  # whole numbers of 2^64 and more, or anything
+        return all(is_real(v) for v in np.ravel(value).tolist())
+    return jnp.issubdtype(kind, np.integer) or jnp.issubdtype(kind, np.floating)  # jnp: its own short floats too
 
 
 def walk(tree, prefix="", kind="leaf", units=DEFAULT):
@@ -102,8 +115,8 @@ def with_values(tree, values):
     """A copy of `tree` with the leaves named in `values` replaced.
 
     values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf fills it.
-    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name (with the three closest)
-    and for a value of the wrong shape.
+    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name (with the three closest), for a
+    value that is no real number (a text, a truth value, a complex number, None) and for one of the wrong shape.
     """
     for name, value in values.items():
         base, index = split_index(name)
@@ -125,12 +138,13 @@ def split_index(name):
     return ".".join([*parts[:-1], base]), index
 
 
-def check_leaves(tree, names=None):
-    """Raise InputError if a concrete leaf is not finite or out of its range. Traced leaves are passed over."""
+def check_leaves(tree, names=None, vacant=()):
+    """Raise InputError if a concrete leaf is no real number, not finite or out of its range. Traced leaves are passed over, and so is
+    None of an optional leaf and of the names in `vacant`, which a schedule fills."""
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
-        if value is None or isinstance(value, jax.core.Tracer):
+        if isinstance(value, jax.core.Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
             continue
         check_value(name, value, meta)
 
@@ -139,6 +153,8 @@ def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
     if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
         raise InputError(f"{name} = {_short(value)}: must be a number or an array, np.array(...)")
+    if not is_real(value):
+        raise InputError(f"{name} = {_short(value)}: must be a real number or an array of real numbers")
     array, low, high = np.asarray(value), meta["low"], meta["high"]
     array = number(value) if array.dtype == object else array  # whole numbers of 2^64 and more are no numbers to numpy
     good = np.isfinite(array)
@@ -164,6 +180,7 @@ def _short(value):
         text = repr(value)
     except (ValueError, RecursionError):  # an int of thousands of digits, or a list in a list in a list ...
         return f"a {type(value).__name__} too large to print"
+    text = text.replace("\n", " ")  # of an array
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
@@ -205,12 +222,13 @@ def _replace(tree, path, index, value, name):
 def _fitted(old, index, value, name):
     """`value` in the shape and type of the leaf `old`; a number fills, an index sets one entry."""
     on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
+    wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
+    if not is_real(value):  # numpy would make 1 of True, 3 of "3", and drop what is imaginary
+        raise InputError(f"{name} = {_short(value)}: {wanted}")
     try:
         value = jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{name} = {_short(value)}: must be a number{'' if np.ndim(old) == 0 else ' or a list of numbers'}"
-        ) from None
+        raise InputError(f"{name} = {_short(value)}: {wanted}") from None
     shape = np.shape(old)
     if index:
         _entry(old, index, name)

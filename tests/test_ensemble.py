@@ -21,8 +21,9 @@ from jaxtank.errors import InputError
 from jaxtank.presets import Scenario
 from jaxtank.tree import with_values
 from tuning import evidence, parts, robust, shards
-from tuning.distributions import Draws, parse
+from tuning.distributions import Draws, parse, stated
 from tuning.ensemble import clopper_pearson, probabilities
+from tuning.sensitivity import what_varies
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
@@ -570,3 +571,19 @@ def test_distributions_are_told_in_words():
     assert _words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (even, all entries together)"
     assert _words(Normal(relative=0.05)) == "5 % sd (normal, cut at 3 sd)"
     assert _words(pair) == "2 of them together, with a covariance"
+
+
+def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain(case):
+    assert stated({"plant.pump_gain": 0.05, "plant.drain": 1e-3}) == {
+        "plant.pump_gain": tuning.Uniform(relative=0.05),
+        "plant.drain": tuning.Uniform(relative=1e-3),
+    }
+    for given in (5, "5%", -0.05, None, True, 0.05j):
+        with pytest.raises(
+            InputError, match=r"uncertain plant\.pump_gain = .*: must be a distribution, .* or a share between 0 and 1"
+        ):
+            tuning.ensemble(case, {"plant.pump_gain": given}, samples=2)
+        with pytest.raises(InputError, match="must be a distribution"):
+            what_varies(case, {"plant.pump_gain": given})
+    with pytest.raises(InputError, match="what varies is a list"):
+        tuning.ensemble(case, ["plant.pump_gain"], samples=2)

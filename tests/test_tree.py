@@ -1,6 +1,7 @@
 """Dotted names: every leaf can be listed, described, read and set, inside and outside a trace."""
 
 import dataclasses
+import fractions
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 import jaxtank
 from jaxtank import rig
 from jaxtank.errors import InputError
-from jaxtank.records import Clock
+from jaxtank.records import Clock, check_key
 from jaxtank.tree import check_leaves, describe, get_value, parameters, with_values
 
 OPTIONAL = ("actuator.dead_zone", "actuator.lag")
@@ -72,10 +73,52 @@ def test_a_wrong_shape_is_told(loop, name, value, shape):
     assert name in str(caught.value) and shape in str(caught.value)
 
 
-@pytest.mark.parametrize("value", ["abc", [1.0, "a", 2.0, 3.0], [[1.0], [2.0, 3.0]], {}, object()])
+NO_NUMBERS = ["abc", "3", True, None, 1 + 2j, np.bool_(True), np.array([1j, 1, 1, 1]), [1.0, "a", 2.0, 3.0], [1.0, True, 2.0, 3.0]]
+NO_NUMBERS += [
+    [None, 1.0, 1.0, 1.0],
+    ["1", "2", "3", "4"],
+    [[1.0], [2.0, 3.0]],
+    {},
+    object(),
+    jnp.array([1j, 1, 1, 1]),
+    jax.random.key(0),
+]
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=str)
 def test_what_is_no_number_is_told(loop, value):
-    with pytest.raises(InputError, match=r"plant\.area = .*must be a number or a list of numbers"):
+    with pytest.raises(InputError, match=r"plant\.area = .*must be a real number or a list of real numbers"):
         with_values(loop, {"plant.area": value})
+
+
+@pytest.mark.parametrize("value", [True, None, 1 + 2j, np.array([1j, 1, 1, 1]), jnp.ones(4) > 0, jax.random.key(0)], ids=str)
+def test_a_leaf_that_is_no_number_is_told_at_the_door(loop, value):
+    with pytest.raises(InputError, match=r"^plant\.drain = .*: must be a real number or an array of real numbers$"):
+        check_leaves(dataclasses.replace(loop, plant=dataclasses.replace(loop.plant, drain=value)))
+
+
+def test_real_numbers_of_every_kind_are_taken(loop):
+    for value in (
+        3,
+        2.5,
+        np.float32(2.5),
+        np.int8(3),
+        jnp.bfloat16(2.5),
+        2**70,
+        [1, 2.0, np.int16(3), 4],
+        np.arange(4),
+        fractions.Fraction(5, 2),
+    ):
+        found = with_values(loop, {"plant.area": value}).plant.area
+        np.testing.assert_array_equal(found, np.broadcast_to(np.array(value, dtype=float), 4))
+
+
+def test_complex_values_are_told_inside_a_trace(loop):
+    with pytest.raises(InputError, match=r"plant\.area"):
+        jax.jit(lambda v: with_values(loop, {"plant.area": v}).plant.area)(1j)
+    np.testing.assert_array_equal(
+        jax.vmap(lambda v: with_values(loop, {"plant.area": v}).plant.area)(jnp.arange(1, 3)), [[1.0] * 4, [2.0] * 4]
+    )
 
 
 @pytest.mark.parametrize(
@@ -258,3 +301,28 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
 def test_a_component_is_frozen(loop):
     with pytest.raises(dataclasses.FrozenInstanceError):
         loop.plant.area = 1.0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda case: jaxtank.simulate(case.clock, case.loop), "loop is a Clock: must be a ClosedLoop"),
+        (lambda case: jaxtank.evaluate(case, case.clock, ["ise"]), "loop is a Case: must be a ClosedLoop, as case.loop"),
+        (lambda case: jaxtank.simulate(case.loop, 10.0), "clock is a float: must be a jaxtank.Clock"),
+        (lambda case: jaxtank.simulate(case.loop, case.clock, key=0), "key is a int: must be one random key, as jax.random.key(0)"),
+        (lambda case: jaxtank.simulate(case.loop, case.clock, key=np.arange(2)), "key is a ndarray: must be one random key"),
+        (lambda case: jaxtank.simulate(case.loop, case.clock, key=jax.random.split(jax.random.key(0), 3)), "key has shape (3,)"),
+    ],
+)
+def test_arguments_in_each_others_place_are_told(gouta, call, words):
+    with pytest.raises(InputError) as caught:
+        call(gouta("backstepping"))
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_keys_of_both_kinds_are_taken_traced_or_not():
+    for key in (None, jax.random.key(1), jax.random.PRNGKey(1), jax.random.key(1, impl="rbg"), np.arange(2, dtype=np.uint32)):
+        check_key(key)
+    for keys in (jax.random.split(jax.random.key(0), 3), jax.random.split(jax.random.PRNGKey(0), 3)):
+        jax.vmap(lambda key: check_key(key) or 0)(keys)
+        jax.jit(lambda key: check_key(key))(keys[0])

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.errors import InputError
-from jaxtank.tree import check_value, describe, get_value, split_index
+from jaxtank.tree import _short, check_value, describe, get_value, is_real, split_index
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -153,6 +154,28 @@ def _one_kind(distribution, name, absolute, relative):
             raise InputError(f"{name}: {field} = {value!r} must be a finite number")
 
 
+KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discrete": Discrete}
+
+
+def stated(distributions):
+    """{name: distribution} of what a study was given: a bare number is a share, uniform to either side, as a case's `uncertain` has it.
+    Raises InputError for what is neither."""
+    if not isinstance(distributions, Mapping):
+        raise InputError(
+            f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as tuning.Normal(relative=0.05)"
+        )
+    found = {}
+    for name, given in distributions.items():
+        if is_real(given) and np.ndim(given) == 0 and 0 < given < 1:
+            given = Uniform(relative=float(given))
+        if not isinstance(given, (*KINDS.values(), Correlated)):
+            raise InputError(
+                f"uncertain {name} = {_short(given)}: must be a distribution, as tuning.Normal(relative=0.05), or a share between 0 and 1"
+            )
+        found[name] = given
+    return found
+
+
 class Draws:
     """The distributions of a case as a map from the unit cube: `dimensions` probabilities in, {name: (draws, ...)} out.
 
@@ -236,9 +259,6 @@ def _moves(distribution, nominal):
     """Which entries a distribution moves: a relative spread leaves zeros alone."""
     relative = getattr(distribution, "relative", None) is not None or getattr(distribution, "factor", None) is not None
     return nominal != 0 if relative else np.ones(nominal.shape, dtype=bool)
-
-
-KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discrete": Discrete}
 
 
 def parse(name, text):

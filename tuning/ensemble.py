@@ -19,7 +19,7 @@ from jaxtank.analysis import steady_flows
 from jaxtank.errors import InputError
 from jaxtank.tree import with_values
 from tuning import parts, shards
-from tuning.distributions import Correlated, Draws, Uniform
+from tuning.distributions import Correlated, Draws, Uniform, stated
 from tuning.objective import LOWER, resolve_limits
 from tuning.scenarios import noisy
 
@@ -203,13 +203,13 @@ def ensemble(
 ):
     """Run a case on `samples` draws of what is uncertain.
 
-    distributions: {dotted name: distribution}, the case's own uncertain parameters where None; key: seed of draws and sensor noise (draw i
-    has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures: names, SUMMARISED where None;
-    limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in a batch; devices: local devices to use; shard:
-    (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them); folder: where finished batches are kept,
-    with which resume=True goes on; merge: run nothing, only join what lies there, and refuse
-    an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its
-    share of the batches and all get the whole. Numbers of a draw do not depend on any of it. Returns an Ensemble (None for a shard).
+    distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's own where None; key: seed of draws
+    and sensor noise (draw i has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures:
+    names, SUMMARISED where None; limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in a batch;
+    devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them);
+    folder: where finished batches are kept, with which resume=True goes on; merge: run nothing, only join what lies there, and
+    refuse an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its share
+    of the batches and all get the whole. Numbers of a draw do not depend on any of it. Returns an Ensemble (None for a shard).
     Raises InputError before anything is run.
     """
     began = time.perf_counter()
@@ -218,7 +218,7 @@ def ensemble(
     for name, value in (("samples", samples), ("key", key)):
         if isinstance(value, bool) or not isinstance(value, int) or not (0 if name == "key" else 1) <= value <= 2**31 - 1:
             raise InputError(f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to {2**31 - 1}")
-    distributions = spread_of(case) if distributions is None else dict(distributions)
+    distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
     held = resolve_limits(case, limits)
     wanted = tuple(m for m in SUMMARISED if ms.serves(m, case.loop)) if measures is None else tuple(measures)

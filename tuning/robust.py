@@ -10,7 +10,7 @@ from jaxtank.errors import InputError
 from jaxtank.presets.base import Scenario
 from jaxtank.rig import check_limits
 from jaxtank.tree import split_index
-from tuning.distributions import Draws
+from tuning.distributions import Draws, stated
 from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of
 from tuning.evidence import HELD_OUT, summary_of, validate
 from tuning.objective import LOWER, Problem
@@ -38,7 +38,7 @@ class Certificate(NamedTuple):
 def scenarios_of(case, distributions=None, samples=64, seed=0):
     """`samples` Scenarios of a case: each of its own in turn (its own run, where it has none) on a plant drawn from `distributions`, with
     noise of its own. Latin hypercube draws. Raises InputError for what cannot be drawn."""
-    distributions = spread_of(case) if distributions is None else distributions
+    distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
     base, found = case.scenarios or (Scenario("run"),), []
@@ -99,7 +99,7 @@ def tune_robust(
             raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
     if isinstance(back_off, bool) or not isinstance(back_off, (int, float)) or not 0.0 <= back_off < 1.0:
         raise InputError(f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1")
-    distributions = spread_of(case) if distributions is None else dict(distributions)
+    distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = check_limits(case.loop, case.limits if options.get("limits") is None else options["limits"])
     options["limits"] = _kept_off(case, limits, back_off)
     plants = scenarios_of(case, distributions, samples, seed)

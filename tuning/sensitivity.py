@@ -14,7 +14,7 @@ from jaxtank.errors import InputError, unknown
 from jaxtank.tree import get_value
 from tuning import indices
 from tuning import scenarios as sc
-from tuning.distributions import Correlated, Draws
+from tuning.distributions import Correlated, Draws, stated
 from tuning.effects import Column, entries_of, local_columns
 from tuning.ensemble import check_devices, spread_of
 
@@ -175,7 +175,7 @@ def what_varies(case, distributions=None, spread=None):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
     if distributions is not None and spread is not None:
         raise InputError("distributions say what varies, spread how much of the case's own: give one of them")
-    return spread_of(case, spread) if distributions is None else dict(distributions)
+    return spread_of(case, spread) if distributions is None else stated(distributions)
 
 
 def check_measures(case, measures, method):
