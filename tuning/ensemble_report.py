@@ -52,25 +52,14 @@ def parts_of(ensemble):
     """What `text` says: a list of lines and tables."""
     units, rows = ensemble.case.loop.units, []
     for name, found in ensemble.summary().items():
-        columns = {w: np.ravel(found[w] if found[w] is not None else np.nan) for w in WORDS}
+        shape, per = ensemble.measures[name].shape[1:], ms.MEASURES[name].per
+        columns = {w: np.broadcast_to(np.nan if found[w] is None else found[w], shape).ravel() for w in WORDS}
+        ends = None if found["mean_interval95"] is None else [np.ravel(v) for v in found["mean_interval95"]]
         for i in range(len(columns["mean"])):
-            per = ms.MEASURES[name].per
             label = name if per == "run" else f"{name} of {per} {i + 1}"
-            interval = (
-                np.ravel([np.ravel(v)[i] for v in found["mean_interval95"]])
-                if found["mean_interval95"] is not None
-                else [np.nan] * 2
-            )
+            interval = "-" if ends is None else " : ".join(tables.number(end[i], 4) for end in ends)
             shown = [tables.number(columns[w][i], 4) for w in WORDS]
-            rows.append(
-                [
-                    label,
-                    ms.unit(name, units),
-                    shown[0],
-                    f"{tables.number(interval[0], 4)} : {tables.number(interval[1], 4)}",
-                    *shown[1:],
-                ]
-            )
+            rows.append([label, ms.unit(name, units), shown[0], interval, *shown[1:]])
     head = ["measure", "unit", "mean", "95 % of the mean", "sd", "5 %", "median", "95 %", "worst 5 %", "highest"]
     spread = ", ".join(f"{n} {_words(d)}" for n, d in ensemble.distributions.items())
     words = [
@@ -80,6 +69,11 @@ def parts_of(ensemble):
         tables.table(rows, head),
         "",
     ]
+    finite = int(np.sum(~ensemble.failed))
+    if finite < 2:
+        words.append("one run has no spread: " if finite else "no run is left: ")
+        words[-1] += "a standard deviation and an interval of the mean need two draws that end in numbers"
+        words.append("")
     if ensemble.limits:
         rows = [
             [
