@@ -158,7 +158,7 @@ def _substeps(rig, t, u, x0, tanks):
     """How many steps each sample of an experiment needs."""
     channels, own = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
     blank = pb.Record(np.append(np.diff(t), 0.0)[None], u[None], np.zeros((1, len(t), len(tanks))), channels)
-    return pb.substeps_for(rig, blank, own, 1e-5 * float(np.max(np.asarray(rig.plant.rim))))
+    return pb.substeps_for(rig, blank, own, 1e-5 * float(np.max(np.asarray(rig.plant.rim))))[0]
 
 
 def _jacobian(rig, moved, p, t, u, x0, tanks, start, count=None):

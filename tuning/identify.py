@@ -38,6 +38,12 @@ ENOUGH = 10
 
 STARTS = ("free", "measured", "case")
 LOSSES = ("linear", "soft_l1", "huber")
+FEWEST = 3
+"""Samples of a log that can be fitted: residuals have a correlation from sample to sample from three on."""
+
+UNSOLVED = 0.05
+"""Share of a channel's largest reading by which the last halving of the steps may move a reading."""
+
 LARGEST = 1e60
 """Slope of a reading, in standard deviations per unit of a coordinate, above which the integration has broken down."""
 
@@ -101,11 +107,20 @@ class Estimation:
         self.box = self._box()
         self.passes = 0
         middle = self.at(self.origin())
-        self.substeps = (
-            pb.substeps_for(middle, self.record, self.levels(self.origin()), 0.1 * self.noise)
-            if substeps is None
-            else int(substeps)
-        )
+        self.substeps = self._substeps(middle) if substeps is None else int(substeps)
+
+    def _substeps(self, middle):
+        """Runge-Kutta steps per sample at the Rig `middle`; DataError where a step between samples is too long for any number of them."""
+        found, moved = pb.substeps_for(middle, self.record, self.levels(self.origin()), 0.1 * self.noise)
+        largest = np.nanmax(np.abs(self.record.y), axis=(0, 1), initial=0.0)
+        if not np.all(moved <= np.maximum(UNSOLVED * largest, self.noise)):
+            e = int(np.argmax([np.diff(one.t).max() for one in self.logs]))
+            one, k = self.logs[e], int(np.argmax(np.diff(self.logs[e].t)))
+            raise DataError(
+                f"{one.where(k + 1, 0)}: {one.t[k + 1] - one.t[k]:g} s after the sample before: too long for this rig to be simulated from one "
+                f"to the next in {found} Runge-Kutta steps; cut the log in two (give both with --data)"
+            )
+        return found
 
     @property
     def names(self):
@@ -403,6 +418,7 @@ def identify(
     folder=None,
     resume=False,
     progress=None,
+    ready=None,
 ):
     """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
 
@@ -417,7 +433,7 @@ def identify(
     substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
     gap: longest step between samples, in median steps; folder: where a log of the searches is kept, with which resume=True goes on after a
     kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
-    KeyboardInterrupt, the best of them is gone on with.
+    KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
@@ -434,14 +450,21 @@ def identify(
         if not isinstance(count, int) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name} = {count!r}: must be a whole number above 0")
     for one in logs:
+        if one.samples < FEWEST:
+            raise DataError(f"{one.name}: has {one.samples} samples, an identification needs at least {FEWEST}")
         lg.check_gaps(one, gap)
         lg.check_fits(one, case.loop)
     kept = [_kept(one, hold_back) for one in logs]
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
-    partial = Estimation(case, [one.part(0, n) for one, n in zip(logs, kept)], **options)
+    begin = [one.part(0, n) for one, n in zip(logs, kept)]
+    if substeps is None and max(np.diff(one.t).max() for one in logs) > max(np.diff(one.t).max() for one in begin):
+        options["substeps"] = Estimation(case, logs, **options).substeps  # the longest step is in what is held back
+    partial = Estimation(case, begin, **options)
     memo = Memo()
     if folder is not None:
         memo = Log(folder, _problem(case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}), resume)
+    if ready is not None:
+        ready()
     fits, interrupted = [], False
     try:
         for z in partial.begin(starts, seed):
@@ -465,6 +488,8 @@ def identify(
         values = estimation.coordinates.values(best.p)
         start_at = np.concatenate([plain.coordinates.point(values), best.own.ravel() / plain.level_scale])
         estimation, best = plain, plain.solve(np.clip(start_at, *plain.box), loss, iterations)
+    if not np.isfinite(best.cost):
+        raise DataError(f"{logs[0].name}: what fits the first {kept[0]} samples cannot be simulated over all of them")
     quality = idf.quality(estimation, best)
     spread = idf.Spread(estimation, best, quality)
     if spread.open.any():

@@ -82,8 +82,11 @@ def run(args):
     gap = arguments.number("--gap", args.gap)
     if not gap >= 1:
         raise InputError(f"--gap {args.gap!r}: must be at least 1")
-    if not args.quiet:
-        print(f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)} samples", file=sys.stderr, flush=True)
+
+    def ready():  # not before: data that are refused get one line
+        if not args.quiet:
+            print(f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)} samples", file=sys.stderr, flush=True)
+
     found = identify(
         case,
         logs,
@@ -100,6 +103,7 @@ def run(args):
         folder=args.out,
         resume=args.resume is not None,
         progress=Interrupts().check,  # between two searches
+        ready=ready,
     )
     try:
         written = found.save(args.out, args.line) if args.out else []

@@ -84,13 +84,13 @@ class _Column:
 
 
 def _text(path):
-    if not path.exists():
-        raise DataError(f"log {str(path)!r} does not exist")
     try:
         if why := refusal(path, LARGEST):
             raise DataError(f"log {str(path)!r} {why}")
         data = path.read_bytes()
-    except OSError as error:
+    except FileNotFoundError:
+        raise DataError(f"log {str(path)!r} does not exist") from None
+    except OSError as error:  # a name that is too long for the disk, too
         raise DataError(f"log {str(path)!r} cannot be read: {error.strerror}") from None
     try:
         text = data.decode("utf-8-sig")
@@ -208,7 +208,7 @@ def _columns(header, name, line, loop, given):
 
 def _slot(stem, plant):
     """The slot ("t", "pump1", "h2") that a column's name says, or None."""
-    word = re.fullmatch(r"([a-z]+)[ _]?(\d*)", stem.strip().lower())
+    word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())  # no rig has a tank of seven digits
     if word is None:
         return None
     for kind, names in NAMES.items():

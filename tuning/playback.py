@@ -148,11 +148,15 @@ MOST_SUBSTEPS = 64
 
 
 def substeps_for(rig, rec, own, error):
-    """How many steps each sample needs: twice as many move no reading by more than `error` (channels,), in the channels' units. At most 64."""
+    """(how many steps each sample needs: twice as many move no reading by more than `error` (channels,), in the channels' units, at most 64;
+    (channels,) by how much they do: NaN or infinite where the levels leave the numbers)."""
     own, before, count = np.asarray(own), None, 1
     while count <= MOST_SUBSTEPS:
         y = np.asarray(play(rig, rec.dt, rec.u, own, channels=rec.channels, substeps=count))
-        if before is not None and np.all(np.nanmax(np.abs(y - before), axis=(0, 1)) <= error):
-            return count // 2
+        if before is not None:
+            with np.errstate(invalid="ignore", over="ignore"):
+                moved = np.max(np.abs(y - before), axis=(0, 1))
+            if np.all(moved <= error):
+                return count // 2, moved
         before, count = y, 2 * count
-    return MOST_SUBSTEPS
+    return MOST_SUBSTEPS, moved
