@@ -450,8 +450,6 @@ def identify(
         if not isinstance(count, int) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name} = {count!r}: must be a whole number above 0")
     for one in logs:
-        if one.samples < FEWEST:
-            raise DataError(f"{one.name}: has {one.samples} samples, an identification needs at least {FEWEST}")
         lg.check_gaps(one, gap)
         lg.check_fits(one, case.loop)
     kept = [_kept(one, hold_back) for one in logs]
@@ -460,6 +458,9 @@ def identify(
     if substeps is None and max(np.diff(one.t).max() for one in logs) > max(np.diff(one.t).max() for one in begin):
         options["substeps"] = Estimation(case, logs, **options).substeps  # the longest step is in what is held back
     partial = Estimation(case, begin, **options)
+    for one in logs:
+        if one.samples < FEWEST:
+            raise DataError(f"{one.name}: has {one.samples} samples, an identification needs at least {FEWEST}")
     memo = Memo()
     if folder is not None:
         memo = Log(folder, _problem(case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}), resume)
