@@ -1,8 +1,8 @@
 """From a traced function to straight-line statements on scalars, which a printer turns into C or MATLAB.
 
 Every element of every array becomes a `Ref` or a number; what only moves elements about (slices, transposes, broadcasts) costs nothing, what
-depends on constants alone is computed here, and what nobody uses is left out. Loops (`jax.lax.scan`) stay loops, products of large
-matrices too.
+depends on constants alone is computed here, and what nobody uses is left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) stay loops,
+products of large matrices too.
 """
 
 from typing import Any, NamedTuple
@@ -52,10 +52,16 @@ class Matrix(NamedTuple):
     sizes: tuple
 
 
-class Loop(NamedTuple):
-    """`count` times: body, then every carried variable takes its new value, all at once."""
+class Until(NamedTuple):
+    """Where a loop ends: unless `test`, a variable, is true."""
 
-    count: int
+    test: Ref
+
+
+class Loop(NamedTuple):
+    """`count` times (None: until it ends by itself): body, then every carried variable takes its new value, all at once."""
+
+    count: int | None
     carried: tuple  # ((kind, name, start), ...)
     body: list
     new: tuple
@@ -308,6 +314,8 @@ def _equation(writer, eqn, operands):
         return [_product(writer, *operands, params["dimension_numbers"])]
     if name == "scan":
         return _scan(writer, eqn, operands)
+    if name == "while":
+        return _while(writer, eqn, operands)
     if name == "cholesky":
         n = operands[0].shape[-1]
         return [writer.matrix("cholesky", operands, (n,), (n, n))]
@@ -416,7 +424,26 @@ def _scan(writer, eqn, operands):
     )
     if xs or len(eqn.outvars) > p["num_carry"]:
         raise InputError("this law cannot be written as code: a loop in it reads or writes a sequence")
-    closed, carried, names = p["jaxpr"], [], []
+    closed = p["jaxpr"]
+    return _loop(writer, eqn, carry, p["length"], lambda names: _run(writer, closed.jaxpr, closed.consts, [*consts, *names]))
+
+
+def _while(writer, eqn, operands):
+    p = eqn.params
+    test, body = p["cond_jaxpr"], p["body_jaxpr"]
+    first, second = operands[: p["cond_nconsts"]], operands[p["cond_nconsts"] : p["cond_nconsts"] + p["body_nconsts"]]
+
+    def once(names):
+        (on,) = _run(writer, test.jaxpr, test.consts, [*first, *names])
+        writer.scopes[-1].append(Until(on.item()))
+        return _run(writer, body.jaxpr, body.consts, [*second, *names])
+
+    return _loop(writer, eqn, operands[p["cond_nconsts"] + p["body_nconsts"] :], None, once)
+
+
+def _loop(writer, eqn, carry, count, once):
+    """The carried variables after a loop of `once`, a function of them."""
+    carried, names = [], []
     for v, start in zip(eqn.outvars, carry):
         kind, mine = kind_of(v.aval.dtype), np.empty(start.shape, dtype=object)
         for i in np.ndindex(start.shape):
@@ -425,11 +452,11 @@ def _scan(writer, eqn, operands):
         names.append(mine)
     writer.scopes.append([])
     writer.known.append({})
-    out = _run(writer, closed.jaxpr, closed.consts, [*consts, *names])
+    out = once(names)
     body = writer.scopes.pop()
     writer.known.pop()
     new = tuple(e for o in out for e in o.ravel())
-    writer.scopes[-1].append(Loop(p["length"], tuple(carried), body, new))
+    writer.scopes[-1].append(Loop(count, tuple(carried), body, new))
     return names
 
 
@@ -447,6 +474,8 @@ def _used(statements, wanted):
             body = _used(s.body, _names(s.new))
             s = s._replace(body=body)
             wanted = wanted | _names(start for _, _, start in s.carried) | _inside(body) | _names(s.new)
+        elif isinstance(s, Until):
+            wanted = wanted | _names([s.test])
         elif s.name not in wanted:
             continue
         elif isinstance(s, Define):
@@ -469,9 +498,11 @@ def _inside(body):
             found |= _names(s.entries)
         elif isinstance(s, Matrix):
             found |= set(s.operands)
+        elif isinstance(s, Until):
+            found |= _names([s.test])
         else:
             found |= _names(start for _, _, start in s.carried) | _inside(s.body) | _names(s.new)
     return found
 
 
-__all__ = ["Any", "Array", "Define", "Loop", "Matrix", "Ref", "Writer", "function"]
+__all__ = ["Any", "Array", "Define", "Loop", "Matrix", "Ref", "Until", "Writer", "function"]

@@ -173,9 +173,12 @@ class C:
                 size = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}.get(s.op, lambda n, k: n * k)(*s.sizes)
                 out.append(f"{indent}real {s.name}[{size}];")
                 out.append(f"{indent}{s.op}({', '.join([*map(str, s.sizes), *s.operands, s.name])});")
+            elif isinstance(s, cg.Until):
+                out.append(f"{indent}if (!({self.value(s.test)})) break;")
             else:
                 out += [f"{indent}{C_TYPES[kind]} {name} = {self.value(start)};" for kind, name, start in s.carried]
-                out += [f"{indent}for (int i = 0; i < {s.count}; ++i) {{", *self.lines(s.body, indent + "    ")]
+                head = "for (;;)" if s.count is None else f"for (int i = 0; i < {s.count}; ++i)"
+                out += [f"{indent}{head} {{", *self.lines(s.body, indent + "    ")]
                 for (kind, name, _), new in zip(s.carried, s.new):
                     out.append(f"{indent}    const {C_TYPES[kind]} n{name} = {self.value(new)};")
                 out += [f"{indent}    {name} = n{name};" for _, name, _ in s.carried] + [f"{indent}}}"]
@@ -373,9 +376,12 @@ class Matlab(C):
                 out += _wrapped(f"{indent}{s.name} = [", map(self.value, s.entries), indent, "];", more=" ...")
             elif isinstance(s, cg.Matrix):
                 out.append(f"{indent}{s.name} = {s.op}_({', '.join([*map(str, s.sizes), *s.operands])});")
+            elif isinstance(s, cg.Until):
+                out.append(f"{indent}if ~({self.value(s.test)}), break; end")
             else:
                 out += [f"{indent}{name} = {self.value(start)};" for _, name, start in s.carried]
-                out += [f"{indent}for i = 1:{s.count}", *self.lines(s.body, indent + "    ")]
+                head = "while true" if s.count is None else f"for i = 1:{s.count}"
+                out += [f"{indent}{head}", *self.lines(s.body, indent + "    ")]
                 out += [f"{indent}    n{name} = {self.value(new)};" for (_, name, _), new in zip(s.carried, s.new)]
                 out += [f"{indent}    {name} = n{name};" for _, name, _ in s.carried] + [f"{indent}end"]
         return out

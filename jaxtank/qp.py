@@ -1,11 +1,11 @@
-"""Small quadratic programmes with two-sided rows, solved in a fixed number of steps and differentiable in everything.
+"""Small quadratic programmes with two-sided rows, solved by an interior point and differentiable in everything.
 
     min_x 1/2 x'H x + f'x    subject to    l <= G x <= u
 
-Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl the slacks of the two sides). Its
-derivative is one Newton step on the optimality conditions: the implicit function theorem at the solution, in forward and in reverse mode
-and under vmap, without a tape of the iterations (khalid spec C.3). A run that is not differentiated does not pay for it. A second
-derivative is that of this step, whose multipliers and slacks are differentiated through the iterations: right, and slow.
+Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl the slacks of the two sides), which
+ends when it has arrived. Its derivatives are those of the optimality conditions: the implicit function theorem at the solution, in forward
+and in reverse mode, under vmap and of any order, without a tape of the iterations (khalid spec C.3). A run that is not differentiated does
+not pay for them.
 """
 
 import functools
@@ -21,6 +21,10 @@ digits in the normal matrix (khalid spec C.3)."""
 
 LEFT = 4.0  # largest complementarity of a row, in MU_MIN, of a solution that is left alone
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
+MOST = 40
+"""Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to 20 (8 leave 3e-7 of the answer in easy
+ones, khalid spec C.1; 15 left a pump at 0.003 V that belonged at 0)."""
+
 UNROLLED = 20  # variables up to which the elimination is written out
 BACK = 0.99  # share of the way to the nearest bound that a step may go
 
@@ -36,12 +40,12 @@ class Point(NamedTuple):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
-def solve(H, f, G, l, u, iterations=15):
+def solve(H, f, G, l, u, iterations=MOST):
     """x (n,) that minimises 1/2 x'Hx + f'x within l <= G x <= u.
 
-    H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u; iterations: 12 to 15 are enough for the
-    problems of predictive control (8 leave 3e-7 of the answer, khalid spec C.1). Rows may be collinear, and x is unique all the same.
-    A problem without a feasible point gives a meaningless x: nothing is raised inside a trace. Differentiable in all five.
+    H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u; iterations: the most that are done. Rows may
+    be collinear, and x is unique all the same. A problem without a feasible point gives a meaningless x: nothing is raised inside a trace.
+    Differentiable in all five.
     """
     return interior_point(*_scaled(H, f), G, l, u, iterations).x
 
@@ -53,13 +57,37 @@ def _scaled(H, f):
 
 @solve.defjvp
 def _slope(iterations, primals, tangents):
-    """One Newton step on the optimality conditions, whose residual moves with the data: the implicit function theorem at the solution.
+    (H, f), (dH, df) = jax.jvp(_scaled, primals[:2], tangents[:2])
+    data, moved = (H, f, *primals[2:]), (dH, df, *tangents[2:])
+    found = _held(interior_point(*jax.lax.stop_gradient(data), iterations), *data)
+    return found.x, _implicit(found, data, moved)
+
+
+@jax.custom_jvp
+def _held(point, H, f, G, l, u):
+    """The solution `point` as it is, but knowing how it moves with the data: what derivatives of derivatives ask for."""
+    return point
+
+
+@_held.defjvp
+def _held_slope(primals, tangents):
+    point, *data = primals
+    moved = tangents[1:]
+    found = _held(point, *data)
+    x, su, sl, lu, ll = found
+    dx = _implicit(found, data, moved)
+    dg = data[2] @ dx + moved[2] @ x
+    dsu, dsl = moved[4] - dg, dg - moved[3]
+    return found, Point(dx, dsu, dsl, -lu / su * dsu, -ll / sl * dsl)  # along the path on which every product s lam stays
+
+
+def _implicit(point, data, moved):
+    """How x moves when the `data` (H, f, G, l, u) do: one Newton step on the optimality conditions at the solution.
 
     Newton's equations of x and w = lu - ll with the slacks eliminated; each row is scaled so that every entry of the matrix is of the
     order of 1 (`_normal` would lose H in the shadow of binding rows)."""
-    H, f, G, l, u = primals
-    H, f = _scaled(H, f)
-    x, su, sl, lu, ll = interior_point(H, f, G, l, u, iterations)
+    H, _, G, _, _ = data
+    x, su, sl, lu, ll = point
     up, low = lu / su, ll / sl
     both = up + low
     row = jnp.sqrt(jnp.minimum(both, 1.0))
@@ -67,23 +95,33 @@ def _slope(iterations, primals, tangents):
     matrix = jnp.block([[H, held.T], [held, -jnp.diag(jnp.minimum(1.0, 1.0 / both))]])
 
     def residual(H, f, G, l, u):
-        H, f = _scaled(H, f)
         return jnp.concatenate([H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)])
 
-    moved = jax.jvp(residual, primals, tangents)[1]
-    return x, -jnp.linalg.solve(matrix, moved)[: x.shape[0]]
+    return -jnp.linalg.solve(matrix, jax.jvp(residual, tuple(data), tuple(moved))[1])[: x.shape[0]]
 
 
-def interior_point(H, f, G, l, u, iterations):
-    """The last iterate, a `Point`, of `iterations` predictor-corrector steps; arguments as in `solve`. Not for differentiation."""
+def interior_point(H, f, G, l, u, iterations=MOST):
+    """The `Point` at which the iterates have arrived, or the last of `iterations`; arguments as in `solve`. Not for reverse mode."""
     rows = G.shape[0]
     x = jnp.zeros_like(f)
     one = jnp.full(rows, 0.1, f.dtype)
     start = Point(x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), one, one)
 
-    def advance(p, _):
+    def residuals(p):
         g = G @ p.x
-        dual, up, low = H @ p.x + f + G.T @ (p.lu - p.ll), p.su + g - u, p.sl - g + l
+        return H @ p.x + f + G.T @ (p.lu - p.ll), p.su + g - u, p.sl - g + l
+
+    def under_way(state):
+        k, p = state
+        worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in residuals(p)]))
+        # every product, not their mean: a row that is left behind at 7e-11 bends the slopes by 1e-4. Further steps would only stir the
+        # last digits
+        left = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll))
+        return (k < iterations) & ~((left < LEFT * MU_MIN) & (worst < RESIDUAL))
+
+    def advance(state):
+        k, p = state
+        dual, up, low = residuals(p)
         mu = (p.su @ p.lu + p.sl @ p.ll) / (2 * rows)
         factor = _factor(_normal(H, G, p))
 
@@ -102,15 +140,9 @@ def interior_point(H, f, G, l, u, iterations):
         centre = jnp.maximum((after / mu) ** 3 * mu, MU_MIN)
         step = towards(p.su * p.lu + guess.su * guess.lu - centre, p.sl * p.ll + guess.sl * guess.ll - centre)
         reach = _reach(p, step, BACK)
-        new = jax.tree.map(lambda a, b: a + reach * b, p, step)
-        worst = jnp.maximum(jnp.max(jnp.abs(dual)), jnp.maximum(jnp.max(jnp.abs(up)), jnp.max(jnp.abs(low))))
-        # every product, not their mean: a row that is left behind at 7e-11 bends the slopes by 1e-4. Further steps would only stir the
-        # last digits
-        left = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll))
-        done = (left < LEFT * MU_MIN) & (worst < RESIDUAL)
-        return jax.tree.map(lambda a, b: jnp.where(done, a, b), p, new), None
+        return k + 1, jax.tree.map(lambda a, b: a + reach * b, p, step)
 
-    return jax.lax.scan(advance, start, None, length=iterations)[0]
+    return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 
 
 def _normal(H, G, p):
