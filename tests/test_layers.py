@@ -44,6 +44,7 @@ ABOVE = [
     {"manual_parts"},
     {"manual", "sensitivity_report", "ensemble_report", "identify_report"},
     {"bench", "compare"},
+    {"streams"},
     {"arguments", "interrupts", "completion", "holds"},
     {"options"},
     {"identify_command", "tune_command", "batch_commands"},

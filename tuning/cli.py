@@ -9,7 +9,7 @@ import shlex
 import sys
 
 from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
-from tuning import batch_commands, case_commands, identify_command, tune_command
+from tuning import batch_commands, case_commands, identify_command, streams, tune_command
 from tuning.arguments import folder_of
 from tuning.holds import hold
 from tuning.interrupts import listen
@@ -36,9 +36,14 @@ def main(argv=None):
     """Run the command; returns the exit code."""
     if argv is None:  # a program of its own
         listen()
+        streams.guard()
     try:
         top = parser()
-        args, rest = top.parse_known_args(argv)
+        try:
+            args, rest = top.parse_known_args(argv)
+        except SystemExit:  # --help, which may wait in a buffer
+            sys.stdout.flush()
+            raise
         if rest:
             kind = "option" if rest[0].startswith("-") else "argument"
             raise InputError(

@@ -5,6 +5,8 @@ import os
 import signal
 import threading
 
+from tuning.streams import say_at_once
+
 heard = []
 """Holds something once Ctrl-C has come before anything ran."""
 
@@ -30,10 +32,10 @@ class Interrupts:
     def interrupt(self, *_):
         """The handler of SIGINT."""
         if self.stop:
-            os.write(2, b"\njaxtank: stopped at once\n")
+            say_at_once(b"\njaxtank: stopped at once\n")
             os._exit(130)
         self.stop = True
-        os.write(2, b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
+        say_at_once(b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
 
     def check(self, *_):
         """Raise KeyboardInterrupt if Ctrl-C was pressed."""

@@ -1,6 +1,7 @@
 """The argument parser of the command `jaxtank`: what may be said, apart from what is done. Nothing heavy is imported."""
 
 import argparse
+import sys
 
 from jaxtank.errors import InputError, nearest
 from tuning import identify_command
@@ -15,6 +16,10 @@ class Parser(argparse.ArgumentParser):
             choices = [w.strip("(),'") for w in message.split("choose from")[-1].split()]
             message = f"unknown command {words[0]!r}{nearest(words[0], choices)}"
         raise InputError(message)
+
+    def _print_message(self, message, file=None):
+        """Help that cannot be written is an OSError; argparse passes over it."""
+        (sys.stderr if file is None else file).write(message)
 
     def options(self, command):
         """The options of one command."""
