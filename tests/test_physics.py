@@ -267,3 +267,15 @@ def test_the_clock_does_not_drift():
     from jaxtank.signals import sample_times
 
     assert sample_times(clock)[-1] == 1200.0 and sample_times(clock)[47000] == 470.0
+
+
+def test_a_knee_too_small_for_its_powers_is_refused():
+    """At the least that is taken, value and slope of a root at an empty tank are numbers, in the shorter floats too."""
+    with pytest.raises(InputError, match=r"plant\.knee = 1e-300 m: must be at least 1e-09 m"):
+        network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("m", "V"), knee=1e-300)
+    least = network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, knee=1e-9).knee
+    for level in (0.0, 1e-10, 1e-9, 1.0):
+        for kind in (np.float32, np.float64):
+            value, slope = jax.value_and_grad(root)(kind(level), least)
+            assert np.isfinite(value) and np.isfinite(slope)
+        assert level in (0.0, 1e-10) or float(value) == np.sqrt(level)

@@ -221,6 +221,8 @@ TANK += '[law]\nkind = "pid"\nKc = 1.0\nTi = 9.0\n'
             + '[[pour]]\ntime = 1.0\nduration = 0.0\ntank = "left"\nvolume = 1.0\n',
             "pour 1 into tank 'left': duration = 0 s",
         ),
+        (TANK + "[plant]\nknee = 1e-300\n", "plant: knee = 1e-300 cm: must be at least 1e-09 cm"),
+        ('units = ["m", "V"]\n' + TANK + "[plant]\nknee = 1e-10\n", "plant: knee = 1e-10 m: must be at least 1e-09 m"),
         (TANK.replace("high = 12.0", "high = 0.0"), "pump 1: high = 0 V: must be above its low, 0 V"),
         (TANK.replace("high = 12.0", "low = 13.0\nhigh = 12.0"), "pump 1: high = 12 V: must be above its low, 13 V"),
         (

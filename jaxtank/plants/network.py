@@ -1,5 +1,7 @@
 """Tanks, orifices, pipes, pumps: one network serves every rig."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,7 +9,7 @@ from jaxtank.errors import InputError
 from jaxtank.numerics import at_least, clip, root, signed_root
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import GRAVITY, efflux
-from jaxtank.tree import component, leaf, number, static
+from jaxtank.tree import check_value, component, leaf, number, static
 from jaxtank.units import DEFAULT
 
 
@@ -44,7 +46,8 @@ class TankNetwork(Plant):
         doc="rims are physics: a level stops there and the liquid is lost", choices=(False, True), default=False
     )
     bottom: bool = static(doc="a level stops at zero whatever is drawn from it", choices=(False, True), default=False)
-    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=0.0, strict=True, default=0.01)
+    # its least: a nanometre or less, the root is then exact for any level that means something, and knee^-3/2 still is a number
+    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-9, default=0.01)
 
     @property
     def tanks(self):
@@ -170,6 +173,8 @@ def network(
     for i in outputs:
         if not 0 <= i < n:
             raise InputError(f"plant.outputs names tank {i}: there are {n}, counted from 0")
+    of_knee = next(field.metadata for field in dataclasses.fields(TankNetwork) if field.name == "knee")
+    check_value("plant.knee", float(knee), {**of_knee, "unit": units[0]})
     return TankNetwork(
         area=fit("plant.area", area, n),
         drain=fit("plant.drain", drain, n),
