@@ -139,10 +139,39 @@ def test_nearly_collinear_rows_of_laguerre_functions():
         np.testing.assert_allclose(x, found.x, atol=1e-7)
 
 
-def test_twelve_iterations_are_those_of_thirty():
+@pytest.mark.parametrize("error, before, least_step", [(63.4, 0.36, 0.113), (66.3, 0.0, 0.212), (-73.7, 0.275, 0.159)])
+def test_limits_that_bind_over_the_whole_horizon(error, before, least_step):
+    """A predictive law of ten increments far from its setpoint: rates bind, then the range. After 15 iterations the first increment was still
+    off by up to 0.04 of the range. Against SLSQP."""
+    n = 10
+    response = 1.0 - 0.9 ** np.arange(1, 31)
+    ahead = np.array([[response[i - j] if i >= j else 0.0 for j in range(n)] for i in range(30)])
+    H, f = 2.0 * (ahead.T @ ahead + 0.01 * np.eye(n)), -2.0 * error * ahead.sum(axis=0)
+    G = np.concatenate([np.eye(n), np.tril(np.ones((n, n)))])
+    l = np.concatenate([np.full(n, -least_step), np.full(n, -before)])
+    u = np.concatenate([np.full(n, least_step), np.full(n, 1.0 - before)])
+    x = np.asarray(solve(H, f, G, l, u))
+    assert np.abs(np.asarray(solve(H, f, G, l, u, iterations=15)) - x).max() > 1e-3
+    rows = [{"type": "ineq", "fun": lambda x: np.concatenate([u - G @ x, G @ x - l]), "jac": lambda x: np.concatenate([-G, G])}]
+    scale = np.trace(H)
+    cost, slope = (lambda x: (0.5 * x @ H @ x + f @ x) / scale), (lambda x: (H @ x + f) / scale)
+    found = minimize(cost, x, jac=slope, method="SLSQP", constraints=rows, options={"ftol": 1e-15, "maxiter": 500})
+    np.testing.assert_allclose(x, found.x, atol=1e-6)
+
+
+def test_it_ends_when_it_has_arrived():
+    """More iterations change nothing, and no bit: they are not done."""
     for seed in range(4):
         data = problem(4, 12, seed)
-        np.testing.assert_allclose(solve(*data, iterations=15), solve(*data, iterations=30), atol=1e-7)
+        np.testing.assert_array_equal(solve(*data), solve(*data, iterations=400))
+
+
+@pytest.mark.parametrize("way", [lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacrev(jax.jacfwd(f))])
+def test_second_derivatives_in_reverse(way):
+    """No loop is gone through backwards."""
+    H, f, G, l, u = problem(3, 6, 1)
+    value = lambda shift: jnp.sum(jnp.sin(qp.solve(H, f + shift, G, l, u)))
+    np.testing.assert_allclose(way(value)(jnp.zeros(3)), jax.jacfwd(jax.jacfwd(value))(jnp.zeros(3)), rtol=1e-9, atol=1e-12)
 
 
 def test_no_row_is_left_behind():
