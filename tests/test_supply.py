@@ -71,6 +71,7 @@ READ = {
     ("tuning.parts", "read_part", "load"): "after that; allow_pickle=False",
     ("tuning.parts", "read_manifest", "read_text"): "after `refusal`",
     ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
+    ("tuning.streams", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.holds", "_locked", "open"): "its own lock, of which 20 bytes are read",
 }
 

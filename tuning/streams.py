@@ -44,7 +44,7 @@ def guard():
         except OSError:
             os.open(os.devnull, mode)  # gets the lowest number that is free: this one
     if sys.stdout is None:
-        sys.stdout = open(os.open(os.devnull, os.O_RDONLY), "w", encoding="utf-8")  # noqa: SIM115 (lives as long as the program)
+        sys.stdout = io.TextIOWrapper(io.FileIO(os.open(os.devnull, os.O_RDONLY), "w"), encoding="utf-8")
     there = sys.stderr is not None
     raw = Forgiving(sys.stderr.fileno() if there else os.open(os.devnull, os.O_WRONLY))
     encoding = sys.stderr.encoding if there else "utf-8"
