@@ -89,6 +89,36 @@ def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
 
 
+@pytest.mark.parametrize("change", ["a bit of a number", "another key", "a line of another log", "no digest"])
+def test_a_line_that_was_changed_is_refused(tmp_path, change):
+    """Every one of them is JSON that could be an entry; the file is left as it is."""
+    log = Log(tmp_path, {"p": 1})
+    for i in range(3):
+        log.recall("x", [np.array(float(i))], lambda i=i: (1.0 + i, np.arange(2.0)))
+    lines = (tmp_path / NAME).read_bytes().splitlines(keepends=True)
+    if change == "a bit of a number":
+        assert b"0x1.0000000000000p+1" in lines[2]
+        lines[2] = lines[2].replace(b"0x1.0000000000000p+1", b"0x1.0000000000001p+1")
+    elif change == "another key":
+        keys = [json.loads(line)["key"].encode() for line in lines[1:]]
+        lines[2] = lines[2].replace(keys[1], keys[1][::-1])
+    elif change == "a line of another log":
+        (tmp_path / "other").mkdir()
+        other = Log(tmp_path / "other", {"p": 2})
+        other.recall("x", [np.array(1.0)], lambda: (9.0, np.arange(2.0)))
+        lines[2] = other.path.read_bytes().splitlines(keepends=True)[1]
+    else:
+        entry = json.loads(lines[2])
+        lines[2] = json.dumps({k: entry[k] for k in ("kind", "key", "result")}).encode() + b"\n"
+    data = b"".join(lines)
+    (tmp_path / NAME).write_bytes(data)
+    with pytest.raises(InputError, match=r"^--resume: line 3 of evaluations\.jsonl is not one of its entries, or was changed"):
+        Log(tmp_path, {"p": 1}, resume=True)
+    assert (tmp_path / NAME).read_bytes() == data
+    (tmp_path / NAME).write_bytes(b"".join(lines[:2] + lines[3:]))  # as the message says
+    assert Log(tmp_path, {"p": 1}, resume=True).resumed == 2
+
+
 def test_numbers_go_through_a_log_without_loss(tmp_path):
     result = (np.nan, np.array([[0.1, -np.inf], [5e-324, -0.0]]), ({"a": np.array([1 / 3])},), np.zeros((0, 2)))
     log = Log(tmp_path, {"p": 1})

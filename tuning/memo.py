@@ -15,6 +15,9 @@ NAME = "evaluations.jsonl"
 LARGEST = 1 << 30
 """Largest log that is read [bytes]."""
 
+MARK, SIZE = b', "digest": "', 16
+"""What stands before the digest that closes a line, and the digest's length."""
+
 BROKEN = (ValueError, KeyError, TypeError, RecursionError)
 """What reading a line of JSON raises that is not one of ours; the last where it is nested without end."""
 
@@ -41,13 +44,15 @@ class Memo:
 class Log(Memo):
     """A Memo that is also a file, a line per evaluation, numbers in hexadecimal so that not a bit is lost.
 
-    The first line says what problem it belongs to. A line that a kill cut short is dropped. Raises InputError for a log of another
-    problem, or one that is no log.
+    The first line says what problem it belongs to, and every other one ends with a digest of itself and that problem: a line that was changed,
+    by hand or by a bad disk, or that comes from another log is refused. One that a kill cut short is dropped. Raises InputError for those,
+    for a log of another problem, and for what is no log.
     """
 
     def __init__(self, folder, problem, resume=False):
         super().__init__()
-        self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 1, "problem": problem}, sort_keys=True)
+        self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 2, "problem": problem}, sort_keys=True)
+        self.head = head.encode()
         whole = self._read(head) if resume else b""
         with self._told():
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,17 +88,26 @@ class Log(Memo):
             )
         for i, line in enumerate(lines[1:]):
             try:
-                entry = json.loads(line)
+                body, mark, tail = line.rpartition(MARK)
+                if not mark or tail != self._tail(body):
+                    raise ValueError(tail)
+                entry = json.loads(body + b"}")
                 self.found[entry["key"]] = tuple(_read(v) for v in entry["result"])
             except BROKEN:
-                raise InputError(f"--resume: line {i + 2} of {NAME} is not one of its entries") from None
+                raise InputError(
+                    f"--resume: line {i + 2} of {NAME} is not one of its entries, or was changed: without that line it is evaluated again"
+                ) from None
         return b"".join(lines)
 
     def keep(self, kind, key, result):
-        text = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]})
+        body = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]}).encode()[:-1]
         with self._told(), open(self.path, "ab") as file:
-            file.write(text.encode() + b"\n")
+            file.write(body + MARK + self._tail(body))
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
+
+    def _tail(self, body):
+        """What follows MARK on the line that begins with `body`."""
+        return hashlib.sha256(self.head + body).hexdigest()[:SIZE].encode() + b'"}\n'
 
     @contextlib.contextmanager
     def _told(self):
