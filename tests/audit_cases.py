@@ -19,10 +19,16 @@ from jaxtank.tree import parameters, with_values
 MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")
 SAMPLES = 64
 """A square: reverse mode then has no rest to compile."""
-POINTS = 8
 STARTS = ("near", "far", "dry", "empty", "equal", "full", "over", "zero")
-ROUGH = {}
+ROUGH = dict.fromkeys(
+    ("khalid/laguerre-constrained", "khalid/laguerre-mimo-constrained"),
+    (1e-3, "sums of Laguerre functions bring rows to within 1e-8 of binding, where an interior point rounds the corner off"),
+)
 """{case: (tolerance, why)} where differences, or the run, are good to less."""
+JUMPS = {"mirakhorli/smc-printed": ("zero", "its sign function is 0 at exactly 0 and jumps by 4 V on either side: no slope there")}
+"""{case: (a kind of start, why)} that is left out."""
+TIED = {"mirakhorli/hybrid": "the law's limits and the pumps' are both 0 V: moved apart, they are a kink of every sample at rest"}
+"""{case: why} every point lies on several kinks at once."""
 
 
 def start(kind, rng, loop):
@@ -57,10 +63,10 @@ def short(name):
     return rig.set_values(case, changes)
 
 
-def points_of(loop, rng):
-    """(points, scales) of one case, POINTS of each."""
+def points_of(loop, rng, kinds):
+    """(points, scales) of one case, one of each kind of start."""
     points, scales = [], []
-    for kind in STARTS[:POINTS]:
+    for kind in kinds:
         here = jax.tree.map(lambda a: np.asarray(a, dtype=float) * (1.0 + 0.02 * rng.standard_normal(np.shape(a))), loop)
         here = dataclasses.replace(here, x0=start(kind, rng, loop))
         points.append(np.asarray(ravel_pytree(here)[0]))
@@ -72,7 +78,8 @@ def subject(names, seed=0):
     """The Subject of cases that differ in their numbers alone: one program, points of each."""
     cases, rng = [short(name) for name in names], np.random.default_rng(seed)
     loop, clock = cases[0].loop, cases[0].clock
-    points, scales = (np.concatenate(column) for column in zip(*(points_of(case.loop, rng) for case in cases)))
+    kinds = tuple(kind for kind in STARTS if kind != JUMPS.get(names[0], ("",))[0])
+    points, scales = (np.concatenate(column) for column in zip(*(points_of(case.loop, rng, kinds) for case in cases)))
     unravel = ravel_pytree(jax.tree.map(lambda a: np.asarray(a, dtype=float), loop))[1]
 
     def value(run, theta):
@@ -90,7 +97,7 @@ def subject(names, seed=0):
         tolerance=tolerance,
         why=why,
         backwards=functools.partial(value, lp.evaluate_for_reverse),
-        piled=tuple(i for i in range(len(points)) if STARTS[i % POINTS] == "zero"),
+        piled=tuple(i for i in range(len(points)) if names[0] in TIED or kinds[i % len(kinds)] == "zero"),
     )
 
 
