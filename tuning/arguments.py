@@ -17,8 +17,10 @@ def open_case(args):
     if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
         for sentence in rig.doubts(case):
             print(f"jaxtank: {args.case}: note: {sentence}", file=sys.stderr)
-    values = dict(pair("--set", text, parse_value) for text in args.values)
+    values = once("--set", [pair("--set", text, parse_value) for text in args.values]) or {}
     if args.dt is not None:
+        if "clock.dt" in values:
+            raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
         values["clock.dt"] = number("--dt", args.dt)
     return rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
 
@@ -26,6 +28,7 @@ def open_case(args):
 def schedule(texts):
     """The table of a rig file's [schedule] for the options --schedule."""
     found = [pair("--schedule", text, lambda v: v) for text in texts]
+    once("--schedule", found)
     if len({rule for _, rule in found}) > 1:
         raise InputError(f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains")
     for name, rule in found:
@@ -41,6 +44,15 @@ def pair(option, text, read):
     if not equals or not name.strip():
         raise InputError(f"{option} {text!r}: must be NAME=VALUE")
     return name.strip(), read(value.strip())
+
+
+def once(option, pairs):
+    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is given twice."""
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{option} {name} is given {names.count(name)} times: give it once")
+    return dict(pairs) or None
 
 
 def parse_value(text):

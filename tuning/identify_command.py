@@ -7,6 +7,9 @@ from tuning import arguments
 from tuning.interrupts import Interrupts, put_back
 from tuning.options import tell_unreachable
 
+LONGEST = 1e7
+"""Longest experiment that is planned [s]: four months."""
+
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
 
 
@@ -47,7 +50,7 @@ def add(commands, parents):
     one.add_argument("--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber")
     one.add_argument("--profile", action="store_true", help="also: profile likelihood of the parameter known worst")
     one.add_argument("--plan", action="store_true", help="no log: compare experiments by the standard deviations they would leave")
-    one.add_argument("--duration", default="300", metavar="S", help="of a planned experiment [s] (default 300)")
+    one.add_argument("--duration", metavar="S", help="of a planned experiment [s] (default 300)")
     one.add_argument(
         "--voltage", metavar="V1,V2", help="pump inputs that a planned experiment works about (default: the case's own)"
     )
@@ -58,9 +61,12 @@ def run(args):
     """Run the command; returns the exit code."""
     args.out = args.resume or args.out
     seed, case = arguments.seed(args), arguments.open_case(args)
-    free = dict(arguments.pair("--free", text, arguments.span) for text in args.free) or None
+    free = arguments.once("--free", [arguments.pair("--free", text, arguments.span) for text in args.free])
     if args.plan:
         return plan(args, case, free)
+    for option, given in (("--duration", args.duration), ("--voltage", args.voltage), ("--measure", args.measure)):
+        if given is not None:
+            raise InputError(f"{option} {given!r}: is of an experiment that is planned, with --plan")
     if not args.data:
         raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
     from tuning import tables
@@ -68,7 +74,8 @@ def run(args):
     from tuning.log_file import read_log
     from tuning.memo import discard
 
-    columns = dict(case.log) | dict(arguments.pair("--column", text, _column) for text in args.column)
+    given = arguments.once("--column", [arguments.pair("--column", text, _column) for text in args.column])
+    columns = dict(case.log) | (given or {})
     logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
     hold = arguments.number("--hold-back", args.hold_back)
     if not 0 <= hold < min(one.samples for one in logs):
@@ -142,14 +149,18 @@ def _column(text):
 
 def plan(args, case, free):
     """Compare experiments; returns the exit code."""
+    if args.data:
+        raise InputError(f"--plan compares experiments before there is a log: leave it out to fit --data {args.data[0]!r}")
+    if args.out:
+        raise InputError(f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)")
     import numpy as np
 
     from tuning import tables
     from tuning.experiments import compare_experiments, most_telling
 
-    duration, dt = arguments.number("--duration", args.duration), 0.0
-    if not 0 < duration < 1e7:
-        raise InputError(f"--duration {args.duration!r}: must be above 0 s")
+    duration = 300.0 if args.duration is None else arguments.number("--duration", args.duration)
+    if not 0 < duration <= LONGEST:
+        raise InputError(f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s")
     dt = duration / 300
     tanks = None
     if args.measure:

@@ -3,7 +3,7 @@
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import number, pair, parse_value, plain_number, whole
+from tuning.arguments import number, once, pair, parse_value, plain_number, whole
 
 
 def limits_of(args, case):
@@ -26,15 +26,6 @@ def limits_of(args, case):
     return limits
 
 
-def once(option, pairs):
-    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is given twice."""
-    names = [name for name, _ in pairs]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"{option} {name} is given {names.count(name)} times: give it once")
-    return dict(pairs) or None
-
-
 def scenarios_of(args):
     from jaxtank.presets import Scenario
 
@@ -44,7 +35,7 @@ def scenarios_of(args):
         return ()
     found = []
     for i, text in enumerate(args.scenario):
-        values = dict(pair("--scenario", part, parse_value) for part in text.split(";") if part.strip())
+        values = once("--scenario", [pair("--scenario", part, parse_value) for part in text.split(";") if part.strip()]) or {}
         seed = values.pop("seed", i)
         weight = values.pop("weight", 1.0)
         found.append(Scenario(values.pop("name", text), values, seed, weight))
@@ -52,11 +43,10 @@ def scenarios_of(args):
 
 
 def choices_of(args):
-    found = {}
-    for text in args.choose:
-        name, values = pair("--choose", text, lambda v: [parse_value(p.strip()) for p in v.split(",") if p.strip()])
-        found[name] = values
-    return found or None
+    def values(text):
+        return [parse_value(part.strip()) for part in text.split(",") if part.strip()]
+
+    return once("--choose", [pair("--choose", text, values) for text in args.choose])
 
 
 def tradeoff_of(args):

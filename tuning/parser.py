@@ -7,8 +7,24 @@ from jaxtank.errors import InputError, nearest
 from tuning import identify_command
 
 
+class Once(argparse.Action):
+    """Keeps the value of an option that may be given once: of two neither can be known to be meant."""
+
+    def __call__(self, parser, namespace, values, option_string=None):
+        given = vars(namespace).setdefault("given", set())
+        if option_string is not None and self.dest in given:
+            raise InputError(f"{option_string} is given twice, the second time as {values!r}: give it once")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
 class Parser(argparse.ArgumentParser):
-    """Errors in one line, with the nearest valid word."""
+    """Errors in one line, with the nearest valid word; an option that is not made to be repeated is refused the second time."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        for kind in (None, "store"):
+            self.register("action", kind, Once)
 
     def error(self, message):
         words = [w.strip("'") for w in message.split() if w.startswith("'")] if "invalid choice" in message else []
@@ -40,11 +56,11 @@ def parser():
     top.add_argument("--version", action="store_true", help="print the version and exit")
     commands = top.add_subparsers(dest="command", metavar="COMMAND")
 
-    common = argparse.ArgumentParser(add_help=False)
+    common = Parser(add_help=False)
     common.add_argument("--json", action="store_true", help="one JSON object on stdout instead of tables")
     common.add_argument("--quiet", action="store_true", help="no progress on stderr")
 
-    case = argparse.ArgumentParser(add_help=False)
+    case = Parser(add_help=False)
     case.add_argument("case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml')
     case.add_argument(
         "--set",
@@ -63,7 +79,7 @@ def parser():
     )
     case.add_argument("--dt", type=str, metavar="S", help="sampling period [s], short for --set clock.dt=S")
 
-    run = argparse.ArgumentParser(add_help=False)
+    run = Parser(add_help=False)
     run.add_argument("--seed", default="0", metavar="N", help="seed of the sensor noise and of the search (default 0)")
     run.add_argument("--out", metavar="DIR", help="folder for result.json, CSV, pictures and the rig")
 

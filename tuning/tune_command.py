@@ -4,10 +4,10 @@ import functools
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import number, open_case, pair, span, whole
+from tuning.arguments import number, once, open_case, pair, span, whole
 from tuning.arguments import seed as seed_of
 from tuning.interrupts import Interrupts, put_back
-from tuning.options import choices_of, distributions_of, limits_of, once, scenarios_of, tell_unreachable, tell_written, tradeoff_of
+from tuning.options import choices_of, distributions_of, limits_of, scenarios_of, tell_unreachable, tell_written, tradeoff_of
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
