@@ -9,6 +9,7 @@ from jaxtank import presets, record_tables
 from jaxtank.errors import InputError, unknown
 from jaxtank.files import read_text
 from jaxtank.rig import checks, parts, signals, tanks
+from jaxtank.rig.lexing import check_keys
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule
 from jaxtank.rig.words import name_of
 from jaxtank.tree import _short
@@ -56,6 +57,10 @@ def load(path):
 
 def loads(text, words="rig file"):
     """The Case of the text of a rig file, called `words` in errors."""
+    try:
+        check_keys(text)
+    except InputError as error:
+        raise InputError(f"{words}: {error}") from None
     try:
         table = tomllib.loads(text.removeprefix("\ufeff"))  # a byte-order mark, as some editors write
     except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits

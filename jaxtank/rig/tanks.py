@@ -92,7 +92,7 @@ def tank_index(value, where, named, count):
 
 
 MOST = 100
-"""Tanks that a rig file may have."""
+"""Tanks that a rig file may have; as many pumps, orifices, pipes and spills."""
 
 
 def names_in(table):
@@ -103,10 +103,7 @@ def names_in(table):
 def build(table):
     """The Case of a table of a rig file that has [[tank]]; reference, values, limits and the rest come after (`rig.from_table`)."""
     units = length, drive = _units(table.get("units", list(DEFAULT)))
-    listed = _list(table, "tank", at_least=1)
-    if len(listed) > MOST:
-        raise InputError(f"[[tank]]: {len(listed)} tanks: must be at most {MOST}, for each is a part of the compiled loop")
-    tanks = [_entry("tank", i, e, TANK, units) for i, e in enumerate(listed)]
+    tanks = [_entry("tank", i, e, TANK, units) for i, e in enumerate(_list(table, "tank", at_least=1))]
     pumps = [_entry("pump", i, e, PUMP, units) for i, e in enumerate(_list(table, "pump", at_least=1))]
     links = [_entry("orifice", i, e, LINK, units) for i, e in enumerate(_list(table, "orifice"))]
     pipes = [_entry("pipe", i, e, PIPE, units) for i, e in enumerate(_list(table, "pipe"))]
@@ -211,6 +208,8 @@ def _list(table, key, at_least=0):
         raise InputError(f"{key}: must be a list of tables, [[{key}]]")
     if len(entries) < at_least:
         raise InputError(f"a rig needs at least one [[{key}]]")
+    if len(entries) > MOST:
+        raise InputError(f"[[{key}]]: {len(entries)} {key}s: must be at most {MOST}, for each is a part of the compiled loop")
     return entries
 
 
