@@ -17,7 +17,8 @@ class Clock:
     """When the law samples and how the plant is integrated between samples.
 
     dt: sampling period of the law (Ts) [s]; duration: length of the run [s]; substeps: integrator steps per sample [-];
-    integrator: "rk4" (fourth order) or "midpoint" (second order). Sample k is at t_k = k dt, k = 0 .. duration/dt.
+    integrator: "rk4" (fourth order) or "midpoint" (second order). Sample k is at t_k = k dt, k = 0 .. duration/dt rounded to
+    a whole number: a run is made of whole samples, and ends at (samples - 1) dt.
     """
 
     dt: float = 0.01

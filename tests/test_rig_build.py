@@ -156,6 +156,8 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),
         ({"plant": {"overflow": 1}}, "true or false"),
         ({"units": ["ft", "V"]}, "gravity"),
+        ({"units": ["cm", "V\x1b[31m\n"]}, "units: entry = 'V.x1b.31m.n': must be a text of printable characters"),
+        ({"units": ["cm\u202e", "V"]}, "must be a text of printable characters"),
         ({"case": "gouta2015/ngpc"}, "leave out case"),
         ({"observer": {"kind": "luenberger"}}, "unknown observer kind"),
     ],

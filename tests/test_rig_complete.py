@@ -1,5 +1,6 @@
 """The complete rig file of `init`: it is the case, every suggestion in it can be used, and a rig is described without Python."""
 
+import json
 import re
 import tomllib
 import warnings
@@ -12,6 +13,7 @@ import jaxtank
 from jaxtank import parameters, presets, rig
 from jaxtank.errors import InputError
 from jaxtank.measures import MEASURES, TIMES
+from jaxtank.records import Clock
 from jaxtank.tree import walk
 from tuning import cli
 
@@ -369,6 +371,11 @@ def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
         ("[reference]\nchanges = [[100.0, 1, 31.0]]\n", "asked for 31 cm, above the rim of tank 1 at 30 cm: rims are limits"),
         ("[plant]\noverflow = true\n[reference]\ninitial = [31.0]\n", "a level cannot get there"),
         ('[values]\nx0 = 31.0\n"actuator.initial" = 3.0\n', "tank 1 starts at 31 cm, above its rim at 30 cm"),
+        ("[values]\nclock.dt = 7.0\n", "of samples of clock.dt = 7 s: the run ends at 602 s"),
+        (
+            "[values]\nclock.dt = 6.0\nclock.duration = 10.0\n",
+            "clock.duration = 10 s is no whole number of samples of clock.dt = 6 s: the",
+        ),
         ('[values]\n"actuator.initial" = 13.0\n', "pump 1 runs at 13 V before t = 0, outside its limits of 0 and 12 V"),
     ],
 )
@@ -379,6 +386,25 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
     assert words in sentence
     assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
     assert capsys.readouterr().err.splitlines() == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+
+
+@pytest.mark.parametrize(
+    "options", [["--set", "clock.dt=7", "--set", "clock.duration=300"], ["--dt", "7", "--set", "clock.duration=300"]]
+)
+def test_a_run_of_another_length_than_asked_for_is_told(options, capsys, tmp_path):
+    assert cli.main(["simulate", "mirakhorli/sfc", *options, "--json", "--out", str(tmp_path)]) == 0
+    said, told = capsys.readouterr()
+    note = "jaxtank: note: clock.duration = 300 s is no whole number of samples of clock.dt = 7 s: the run ends at 301 s"
+    assert told.splitlines()[0] == note
+    assert (tmp_path / "trajectory.csv").read_text().splitlines()[-1].startswith("301,")
+    assert json.loads(said)["clock"]["duration"] == 300.0
+    assert cli.main(["show", "mirakhorli/sfc", *options, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_whole_samples_in_floating_point_are_no_doubt():
+    for dt, duration in ((0.1, 0.3), (0.01, 1200.0), (1e-3, 9e4), (0.7, 0.7 * 3), (1 / 3, 100.0)):
+        assert rig.clock_doubts(Clock(dt=dt, duration=duration)) == []
 
 
 def test_a_doubt_calls_a_tank_by_its_name():

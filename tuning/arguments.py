@@ -22,7 +22,11 @@ def open_case(args):
         if "clock.dt" in values:
             raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
         values["clock.dt"] = number("--dt", args.dt)
-    return rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
+    clock, case = case.clock, rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
+    if case.clock != clock and not args.quiet:
+        for sentence in rig.clock_doubts(case.clock):
+            print(f"jaxtank: note: {sentence}", file=sys.stderr)
+    return case
 
 
 def schedule(texts):

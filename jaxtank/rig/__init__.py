@@ -68,7 +68,7 @@ values = { "sensor.noise" = 0.02, "plant.pump_gain" = 7.5 }
 
 from jaxtank.presets.base import Case
 from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered, unreachable
-from jaxtank.rig.doubts import doubts
+from jaxtank.rig.doubts import clock_doubts, doubts
 from jaxtank.rig.reading import from_table, load, loads, open_case
 from jaxtank.rig.values import has, set_and_schedule, set_values
 from jaxtank.rig.words import toml
@@ -81,6 +81,7 @@ __all__ = [
     "check_limits",
     "check_objective",
     "check_uncertain",
+    "clock_doubts",
     "complete",
     "doubts",
     "dump",

@@ -8,10 +8,10 @@ from jaxtank.signals import Pours
 
 
 def doubts(case):
-    """Sentences on what of a case can hardly be meant: changes and pours after the end of the run, changes that overlap, levels and
-    setpoints above the rim, pumps that start outside their limits."""
+    """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours after the end of the run, changes
+    that overlap, levels and setpoints above the rim, pumps that start outside their limits."""
     loop, (length, drive) = case.loop, case.loop.units
-    found, end, rim = [], case.clock.duration, np.asarray(loop.plant.rim)
+    found, end, rim = clock_doubts(case.clock), case.clock.duration, np.asarray(loop.plant.rim)
     reference, bank = steps(loop.reference), loop.actuator
     events = [] if reference is None else list(reference.changes)
     _late(found, "changes of the reference", [t for t, _ in events], end)
@@ -42,6 +42,16 @@ def doubts(case):
         if not low <= volts <= high:
             found.append(f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of {low:g} and {high:g} {drive}")
     return found
+
+
+def clock_doubts(clock):
+    """Sentences on a clock: where the run does not end when it is asked to, for it is made of whole samples."""
+    end = (clock.samples - 1) * clock.dt
+    if abs(end - clock.duration) <= 1e-6 * clock.dt:
+        return []
+    return [
+        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt = {clock.dt:.9g} s: the run ends at {end:.9g} s"
+    ]
 
 
 def _tank(case, i):

@@ -193,7 +193,7 @@ def build(table):
 def _units(value):
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, str) and v for v in value)):
         raise InputError(f'units = {_short(value)}: must be [length, pump input], as ["cm", "V"]')
-    return tuple(value)
+    return tuple(name_of("units: entry", v) for v in value)
 
 
 def _gravity(length):
