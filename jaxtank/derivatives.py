@@ -10,7 +10,7 @@ from jaxtank import measures as ms
 from jaxtank.dependence import reached
 from jaxtank.invariants import scan
 from jaxtank.materialise import materialised
-from jaxtank.stepping import initial, inputs, is_broken, run_of, step
+from jaxtank.stepping import initial, inputs, is_broken, keyed, run_of, step
 from jaxtank.tree import with_values
 
 OUTER = 12
@@ -61,7 +61,7 @@ def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_squar
     feels = reached(known, flat)  # which of them depend on the parameters: only theirs are tangents to be carried
 
     def begin(theta):
-        here = at(theta)
+        here = keyed(at(theta), key)
         floats, rest = split((initial(here, clock), ms.start(run_of(here, clock), kept)))
         xs = known(theta)
         return (floats, [x for x, f in zip(xs, feels) if f]), (rest, [x for x, f in zip(xs, feels) if not f])

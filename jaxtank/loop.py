@@ -18,7 +18,7 @@ from jaxtank.door import check
 from jaxtank.errors import InputError, NonFiniteError
 from jaxtank.invariants import scan
 from jaxtank.records import Clock, Trajectory
-from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, run_of, step, zero_of
+from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, keyed, run_of, step, zero_of
 from jaxtank.tree import parameters, with_values
 
 
@@ -39,8 +39,9 @@ def simulate(loop, clock, key=None, save_every=1):
 def evaluate(loop, clock, measures, key=None):
     """Run the loop and keep only running measures.
 
-    measures: names of `jaxtank.measures.MEASURES`; returns {name: scalar, or array with one entry per output, tank or pump}.
-    Raises InputError at the door and NonFiniteError if a level stops being finite (outside a trace).
+    measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or None; returns {name: scalar, or array with one
+    entry per output, tank or pump}. Raises InputError at the door and NonFiniteError if a level stops being finite (outside a trace; inside
+    one, the values of such a run are NaN, and so are those of a run with noise and no key).
     """
     names = _names(measures)
     check(loop, clock, key)
@@ -94,6 +95,7 @@ def _names(measures):
 
 @functools.partial(jax.jit, static_argnames=("clock", "names", "checkpoint"))
 def _evaluate(loop, clock, names, key, checkpoint):
+    loop = keyed(loop, key)
     run = run_of(loop, clock)
 
     def body(carry, now):
@@ -123,6 +125,7 @@ def _checkpointed_scan(body, carry, xs, length):
 
 @functools.partial(jax.jit, static_argnames=("clock", "save_every"))
 def _simulate(loop, clock, key, save_every):
+    loop = keyed(loop, key)
     rows = (clock.samples - 1) // save_every + 1
     xs = inputs(loop, clock, (), key)
     spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
@@ -156,6 +159,8 @@ def _report_broken(broken, loop, clock, key):
     if not bad.any():  # only the step after the last sample
         return
     first = int(np.argmax(bad.any(axis=1)))
+    if first == 0 and key is None:  # `keyed` saw to it
+        raise InputError("sensor.noise is above 0: give a key, or set it to 0")
     tanks = ", ".join(str(i + 1) for i in np.flatnonzero(bad[first]))
     shown = {n: v for n, v in parameters(loop).items() if n.startswith("controller.") and not n.startswith("controller.model.")}
     text = ", ".join(f"{n} = {np.asarray(v)}" for n, v in shown.items())

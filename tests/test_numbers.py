@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxtank import InputError, _xla, evaluate, presets
+from jaxtank import InputError, _xla, evaluate, presets, sensitivities, with_values
 from jaxtank.records import Clock
 
 RUNS = """
@@ -97,6 +97,26 @@ def test_a_run_has_the_precision_of_its_most_precise_leaf():
     assert run(one).dtype == np.float64 and np.allclose(run(one), run(case.loop), rtol=1e-4)
     with pytest.raises(InputError, match=r"x0 = \[2.*np.array"):
         run(dataclasses.replace(case.loop, x0=[2.0, 2.0, 2.0, 2.0]))
+
+
+def test_noise_that_no_key_draws_is_no_answer():
+    """Outside a trace it is refused at the door; inside one the noise is not known there, and a run without it looked like an answer."""
+    case, clock = presets.find("gouta2015/backstepping"), Clock(dt=0.5, duration=50.0)
+
+    def travel(noise, key=None):
+        return evaluate(with_values(case.loop, {"sensor.noise": noise}), clock, ("input_travel",), key)["input_travel"].sum()
+
+    def slope(noise, key=None):
+        loop = with_values(case.loop, {"sensor.noise": noise})
+        return sensitivities(loop, clock, ("input_travel",), {"controller.k": 1.0}, key)[1]["input_travel"]
+
+    key = jax.random.key(0)
+    for run in (travel, jax.grad(travel)):
+        with pytest.raises(InputError, match="give a key"):
+            run(0.1)
+    assert np.isnan(jax.jit(travel)(0.1)) and np.isnan(jax.jit(jax.grad(travel))(0.1)) and np.isnan(jax.jit(slope)(0.1)).all()
+    assert np.isfinite(jax.jit(travel)(0.0)) and np.isfinite(jax.jit(slope)(0.0)).all()
+    assert jax.jit(travel)(0.1, key) == pytest.approx(float(travel(0.1, key)), rel=1e-12) and jax.grad(travel)(0.1, key) > 1.0
 
 
 def test_float32_is_refused_where_it_would_be_wrong():
