@@ -25,7 +25,7 @@ LAYERS = [
     {"export", "animation"},
 ]
 ABOVE = [
-    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects", "parts", "logs", "coordinates"},
+    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects", "parts", "logs", "coordinates", "one_line"},
     {"log_file", "playback"},
     {"experiments"},
     {"identifiability"},

@@ -4,6 +4,7 @@ import os
 import sys
 
 from jaxtank.errors import InputError
+from tuning.one_line import printable
 
 
 def open_case(args):
@@ -16,7 +17,7 @@ def open_case(args):
     case = rig.open_case(args.case)
     if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
         for sentence in rig.doubts(case):
-            print(f"jaxtank: {args.case}: note: {sentence}", file=sys.stderr)
+            print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values = once("--set", [pair("--set", text, parse_value) for text in args.values]) or {}
     if args.dt is not None:
         if "clock.dt" in values:

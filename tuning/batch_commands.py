@@ -6,6 +6,7 @@ import sys
 from jaxtank.errors import InputError
 from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
+from tuning.one_line import printable
 from tuning.options import devices_of, distributions_of, limits_of, tell_written
 
 
@@ -21,7 +22,7 @@ def uncertainty(args):
     found = _ensemble(args, devices=devices, shard=shard, folder=args.out, resume=args.resume is not None, progress=progress)
     if found is None:
         if not args.quiet:
-            print(f"shard {args.shard} is in {args.out}; `jaxtank merge` joins the shards when all are", file=sys.stderr)
+            print(f"shard {args.shard} is in {printable(args.out)}; `jaxtank merge` joins the shards when all are", file=sys.stderr)
         return 0
     return _told(found, args)
 

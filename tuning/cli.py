@@ -13,6 +13,7 @@ from tuning import batch_commands, case_commands, identify_command, streams, tun
 from tuning.arguments import folder_of
 from tuning.holds import hold
 from tuning.interrupts import listen
+from tuning.one_line import one_line
 from tuning.parser import parser
 
 COMMANDS = {
@@ -63,7 +64,7 @@ def main(argv=None):
         sys.stdout.flush()
         return code
     except (InputError, NonFiniteError) as error:
-        print(f"jaxtank: {_one_line(error)}", file=sys.stderr)
+        print(f"jaxtank: {one_line(error)}", file=sys.stderr)
         return 5 if isinstance(error, DataError) else 2
     except KeyboardInterrupt:
         print("jaxtank: interrupted", file=sys.stderr, flush=True)
@@ -74,14 +75,14 @@ def main(argv=None):
         _drop_output()
         return 0
     except OSError as error:
-        print(f"jaxtank: {_one_line(error.filename or 'output')}: {error.strerror or _one_line(error)}", file=sys.stderr)
+        print(f"jaxtank: {one_line(error.filename or 'output')}: {error.strerror or one_line(error)}", file=sys.stderr)
         _drop_output()
         return 2
     except Exception as error:
         if os.environ.get("JAXTANK_TRACEBACK"):
             raise
         print(
-            f"jaxtank: internal error: {type(error).__name__}: {_one_line(error)} (JAXTANK_TRACEBACK=1 shows where)",
+            f"jaxtank: internal error: {type(error).__name__}: {one_line(error)} (JAXTANK_TRACEBACK=1 shows where)",
             file=sys.stderr,
         )
         return 1
@@ -93,10 +94,6 @@ def _drop_output():
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _one_line(error):
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

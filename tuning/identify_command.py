@@ -5,6 +5,7 @@ import sys
 from jaxtank.errors import InputError
 from tuning import arguments
 from tuning.interrupts import Interrupts, put_back
+from tuning.one_line import printable
 from tuning.options import tell_unreachable
 
 LONGEST = 1e7
@@ -119,13 +120,13 @@ def run(args):
     if args.out and found.status != "interrupted":
         discard(args.out)  # the result is whole: there is nothing left to go on with
     if written and not args.quiet:
-        print(f"written to {args.out}: " + ", ".join(p.name for p in written), file=sys.stderr)
+        print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in written), file=sys.stderr)
         tell_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(d["words"] for d in found.directions)
-        print(f"jaxtank: {', '.join(args.data)}: cannot tell apart {words}: no rig is written", file=sys.stderr)
+        print(f"jaxtank: {printable(', '.join(args.data))}: cannot tell apart {words}: no rig is written", file=sys.stderr)
     elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
-        print(f"go on with: jaxtank tune {args.out.rstrip('/')}/rig.toml --robust cvar", file=sys.stderr)
+        print(f"go on with: jaxtank tune {printable(args.out.rstrip('/'))}/rig.toml --robust cvar", file=sys.stderr)
     return STATUS[found.status]
 
 

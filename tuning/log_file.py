@@ -11,6 +11,7 @@ import numpy as np
 from jaxtank.errors import DataError, InputError, nearest
 from jaxtank.files import refusal
 from tuning.logs import FLOWS, LENGTHS, VOLTS, log
+from tuning.one_line import printable
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
@@ -35,13 +36,13 @@ def read_log(path, loop, columns=None, decimal="."):
     path = Path(path)
     if decimal not in (".", ","):
         raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
-    text = _text(path)
-    rows = _rows(text, path.name)
+    text, called = _text(path), printable(path.name)
+    rows = _rows(text, called)
     first, header = next(rows, (0, None))
     if header is None:
-        raise DataError(f"{path.name}: is empty: a header line and samples are needed")
+        raise DataError(f"{called}: is empty: a header line and samples are needed")
     header = [cell.strip() for cell in header]
-    wanted = _columns(header, path.name, first, loop, columns or {})
+    wanted = _columns(header, called, first, loop, columns or {})
     lines, table = [], []
     for line, cells in rows:
         while len(cells) > len(header) and not cells[-1].strip():  # a separator at the end of the line
@@ -52,13 +53,13 @@ def read_log(path, loop, columns=None, decimal="."):
                 if len(cells) > len(header)
                 else ""
             )
-            raise DataError(f"{path.name}, line {line}: {len(cells)} cells under {len(header)} column names{hint}")
+            raise DataError(f"{called}, line {line}: {len(cells)} cells under {len(header)} column names{hint}")
         if len(table) >= MOST_ROWS:
-            raise DataError(f"{path.name}: more than {MOST_ROWS} samples")
-        table.append([_number(cells[w.index], decimal, path.name, line, w) for w in wanted])
+            raise DataError(f"{called}: more than {MOST_ROWS} samples")
+        table.append([_number(cells[w.index], decimal, called, line, w) for w in wanted])
         lines.append(line)
     if not table:
-        raise DataError(f"{path.name}: has a header, but no samples")
+        raise DataError(f"{called}: has a header, but no samples")
     data = np.array(table) * [w.factor for w in wanted]
     inputs = [i for i, w in enumerate(wanted) if w.kind == "pump"]
     levels = [i for i, w in enumerate(wanted) if w.kind == "level"]
@@ -68,7 +69,7 @@ def read_log(path, loop, columns=None, decimal="."):
         y=data[:, levels],
         tanks=[wanted[i].number for i in levels],
         in_volts=[wanted[i].in_volts for i in levels],
-        name=path.name,
+        name=called,
         lines=lines,
         headers=tuple(w.header for w in wanted),
         units=tuple(w.unit for w in wanted),
@@ -191,7 +192,7 @@ def _columns(header, name, line, loop, given):
             if kind != "level":
                 raise DataError(
                     f"{name}, line {line}: no column for {slot} ({'time' if kind == 'time' else f'pump {number + 1}'}) among "
-                    f"{', '.join(map(repr, header))}; name it with --column {slot}=HEADER"
+                    f"{_listed(header)}; name it with --column {slot}=HEADER"
                 )
             continue
         index, unit = taken[slot]
@@ -200,10 +201,14 @@ def _columns(header, name, line, loop, given):
         factor, in_volts = _factor(kind, unit, length, drive, f"{name}, line {line}, column {header[index]!r}")
         found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
     if not any(c.kind == "level" for c in found):
-        raise DataError(
-            f"{name}, line {line}: no column for a level among {', '.join(map(repr, header))}; name it with --column h1=HEADER"
-        )
+        raise DataError(f"{name}, line {line}: no column for a level among {_listed(header)}; name it with --column h1=HEADER")
     return found
+
+
+def _listed(header, most=20):
+    """The names of the columns, the first of them where there are many."""
+    more = f" and {len(header) - most} more" if len(header) > most else ""
+    return ", ".join(map(repr, header[:most])) + more
 
 
 def _slot(stem, plant):

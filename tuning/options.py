@@ -4,6 +4,7 @@ import sys
 
 from jaxtank.errors import InputError
 from tuning.arguments import number, once, pair, parse_value, plain_number, whole
+from tuning.one_line import printable
 
 
 def limits_of(args, case):
@@ -115,7 +116,7 @@ def devices_of(args):
 
 def tell_written(paths, args):
     if paths and not args.quiet:
-        print(f"written to {args.out}: " + ", ".join(p.name for p in paths), file=sys.stderr)
+        print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths), file=sys.stderr)
 
 
 def tell_unreachable(case, paths, args):
@@ -123,4 +124,7 @@ def tell_unreachable(case, paths, args):
     from jaxtank import rig
 
     if any(p.name == "rig.toml" for p in paths) and case.reachable and not args.quiet and (why := rig.unreachable(case)):
-        print(f"jaxtank: {args.out.rstrip('/')}/rig.toml: note: {why}; the file says reachable = false for it", file=sys.stderr)
+        print(
+            f"jaxtank: {printable(args.out.rstrip('/'))}/rig.toml: note: {why}; the file says reachable = false for it",
+            file=sys.stderr,
+        )

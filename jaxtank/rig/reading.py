@@ -63,8 +63,10 @@ def loads(text, words="rig file"):
         raise InputError(f"{words}: {error}") from None
     try:
         table = tomllib.loads(text.removeprefix("\ufeff"))  # a byte-order mark, as some editors write
-    except ValueError as error:  # TOMLDecodeError, or a number of thousands of digits
+    except tomllib.TOMLDecodeError as error:
         raise InputError(f"{words} is not TOML: {' '.join(str(error).split())}") from None
+    except ValueError:  # of Python, which reads no whole number of thousands of digits
+        raise InputError(f"{words}: a whole number in it has more digits than can be read: write it with an exponent, as 1e30") from None
     except RecursionError:
         raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
     try:

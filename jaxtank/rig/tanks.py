@@ -233,7 +233,9 @@ def _entry(kind, index, entry, fields, units):
         truth, meta = isinstance(fields[key], bool), METAS[kind][key]
         good = isinstance(value, bool) if truth else not isinstance(value, bool) and isinstance(value, (int, float))
         if not (good and is_numeric(float(value) if truth else value) and abs(value) <= 1e300):
-            raise InputError(f"{where}: {key} = {_short(value)}: must be {'true or false' if truth else 'a finite number'}")
+            huge = good and abs(value) > 1e300 and value not in (float("inf"), -float("inf"))
+            wanted = "true or false" if truth else "within +-1e300" if huge else "a finite number"
+            raise InputError(f"{where}: {key} = {_short(value)}: must be {wanted}")
         if not truth:
             check_value(f"{where}: {key}", value, {"low": None, "high": None, **meta, "unit": local(meta["unit"], units)})
     for key, value in fields.items():
