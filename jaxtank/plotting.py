@@ -333,8 +333,9 @@ def fan(loop, bands, title):
             ax.set_title(f"tank {i + 1}")
             ax.set_ylabel(f"level [{loop.units[0]}]")
             ax.legend(loc="best", fontsize="x-small")
-        for ax in axes[-1]:
+        for ax in axes.ravel()[max(0, tanks - columns) : tanks]:  # the lowest panel of each column, above one that stays empty too
             ax.set_xlabel("time [s]")
+            ax.tick_params(labelbottom=True)
         for ax in axes.ravel()[tanks:]:
             ax.set_visible(False)
         figure.suptitle(plain(title))

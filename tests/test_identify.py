@@ -698,6 +698,12 @@ def test_json_as_in_the_contract(identified):
     np.testing.assert_allclose(np.sqrt(np.diag(matrix)), sd)
 
 
+def test_every_picture_says_of_which_rig_it_is(identified):
+    page = (identified[0] / "out" / "report.html").read_text()
+    for words in ("correlation of the estimates", "profile likelihood", "measured less simulated"):
+        assert f">mirakhorli/sfc: {words}</text>" in page
+
+
 def test_what_is_written(identified):
     folder = identified[0] / "out"
     assert {p.name for p in folder.iterdir()} == {

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
-from jaxtank import plotting, run_plots
+from jaxtank import plotting, rig, run_plots
 from jaxtank.records import Trajectory
 
 
@@ -132,3 +132,24 @@ def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
         "limit cannot be kept": [[8.0, 0.3]],
     }
     assert ax.get_xlabel() == "limit of max_level [cm]" and ax.get_ylabel() == "objective [cm]"
+
+
+@pytest.mark.parametrize(("tanks", "labelled"), [(1, {0}), (2, {0, 1}), (3, {1, 2}), (4, {2, 3})])
+def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
+    """With three tanks the panel below the second stays empty: the times stand below the second."""
+    table = {
+        "tank": [{"area": 10.0, "rim": 30.0, "drain": 0.1, "level": 3.0}] * tanks,
+        "pump": [{"gain": 5.0, "to": 1, "high": 12.0}],
+        "law": {"kind": "open-loop", "initial": [3.0]},
+        "reachable": False,
+    }
+    t = np.linspace(0.0, 10.0, 11)
+    bands = {"t": t, "r": np.full((11, 1), 3.0), "x": np.full((5, 11, tanks), 3.0)}
+    figure = plotting.fan(rig.from_table(table).loop, bands, "bands")
+    figure.canvas.draw()
+    panels = figure.axes[:tanks]
+    assert {i for i, ax in enumerate(panels) if ax.get_xlabel() == "time [s]"} == labelled
+    assert {
+        i for i, ax in enumerate(panels) if any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
+    } == labelled
+    plt.close(figure)

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import json
+import re
 import subprocess
 import sys
 
@@ -471,3 +472,27 @@ def test_pictures():
         np.sort(segments[:, :, 0], axis=1), np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1)
     )
     plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("unit", "of", "words"),
+    [("cm", "cm^2", "cm per cm^2"), ("cm", "-", "cm"), ("-", "V", "1 per V"), ("-", "-", "-"), ("V^2 s", "cm^3/(s V)", "V^2 s per cm^3/(s V)")],
+)
+def test_the_unit_of_a_derivative(unit, of, words):
+    assert sensitivity_report.per(unit, of) == words
+
+
+def test_numbers_with_a_unit_say_it(tmp_path):
+    """Centimetres of error for a square centimetre of an outlet, or for a volt and second of a pump: in table, JSON and CSV."""
+    words = ("mirakhorli/sfc", "--vary", "plant.drain=uniform:5%", "--vary", "plant.split=uniform:5%:tied")
+    words += ("--set", "clock.duration=20", "--measure", "max_level", "--measure", "ise")
+    code, out, err = say(*words, "--method", "local", "--out", str(tmp_path))
+    assert code == 0, err
+    assert "effect [cm]" in out and "effect [cm^2 s]" in out and re.search(r"\d cm per cm\^2\b", out) and "cm^2 s per cm^2" in out
+    said = json.loads((tmp_path / "result.json").read_text())["measures"]
+    assert said["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"] == "cm per cm^2"
+    assert said["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
+    rows = list(csv.DictReader((tmp_path / "sensitivity.csv").open()))
+    assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {"cm^2 s per cm^2", "cm^2 s"}
+    code, out, _ = say(*words, "--method", "morris", "--samples", "4", "--quiet")
+    assert code == 0 and "mu* [cm]" in out and "sigma [cm^2 s]" in out

@@ -220,10 +220,12 @@ def figures(found):
             side = 2.6 + 0.42 * len(kept)
             figure, ax = plt.subplots(figsize=(side + 1.0, side), layout="constrained")
             record_plots.correlation(ax, kept, matrix)
+            figure.suptitle(plotting.plain(f"{found.case.name}: correlation of the estimates"), fontsize=9)
             made["correlation"] = figure
         if found.profile:
             figure, ax = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
             record_plots.profile(ax, found.profile)
+            figure.suptitle(plotting.plain(f"{found.case.name}: profile likelihood"), fontsize=9)
             made["profile"] = figure
     return made
 

@@ -47,6 +47,22 @@ LOST = {
 }
 
 
+def per(unit, of):
+    """The unit of a derivative: of a measure in `unit` by a parameter in the unit `of`."""
+    return unit if of == "-" else f"{'1' if unit == '-' else unit} per {of}"
+
+
+def derivative_unit(result, c, name):
+    """The unit of the derivative of a Column by a parameter."""
+    return per(c.unit, describe(result.case.loop, name)["unit"])
+
+
+def _heads(method, unit):
+    """Headings of the table of a measure in `unit`: what is in that unit says so."""
+    shares = {"elasticity", "derivative"} if method == "local" else set(HEADS["sobol"])
+    return [head if q in shares else f"{head} [{unit}]" for q, head in HEADS[method].items()]
+
+
 def notes_of(result):
     """Sentences that go with the numbers: what they are, what was left out, where more samples are advised."""
     found = [WORDS[result.method], *result.notes]
@@ -119,6 +135,8 @@ def _column_json(result, c):
     rows = {}
     for i in result.order(c):
         rows[result.parameters[i]] = {q: tables.clean(c.felt[q][i]) for q in HEADS[result.method]}
+        if result.method == "local":
+            rows[result.parameters[i]]["derivative_unit"] = derivative_unit(result, c, result.parameters[i])
         if result.method == "morris":
             rows[result.parameters[i]]["mu_interval95"] = tables.clean(c.felt["mu_interval95"][i])
             rows[result.parameters[i]]["effects_used"] = int(c.felt["kept"][i])
@@ -148,24 +166,31 @@ def parts_of(result):
         f"varied: {spread}",
         "",
     ]
-    heads = HEADS[result.method]
     for c in result.columns:
         title = f"{c.label} [{c.unit}], {tables.number(c.nominal)} in the case's own run"
         if c.empty:
             parts += [f"{title}: no indices, {c.reason}", ""]
             continue
-        rows = [[result.parameters[i], *(_cell(c.felt[q][i]) for q in heads)] for i in result.order(c)[:SHOWN]]
+        rows = [[result.parameters[i], *_cells(result, c, i)] for i in result.order(c)[:SHOWN]]
         more = len(result.parameters) - len(rows)
         tail = [f"and {more} more parameters, each below these"] if more > 0 else []
         if result.method == "sobol":
             tail.append(f"first-order shares sum to {np.sum(c.felt['first']):.3f}; to 1 where nothing interacts")
-        parts += [title, tables.table(rows, ["parameter", *heads.values()]), *tail, ""]
+        parts += [title, tables.table(rows, ["parameter", *_heads(result.method, c.unit)]), *tail, ""]
     return parts
 
 
 def _said(distribution):
     fields = {n: v for n, v in dataclasses.asdict(distribution).items() if v is not None and v is not False}
     return f"{type(distribution).__name__.lower()} ({', '.join(f'{n} {v}' for n, v in fields.items())})"
+
+
+def _cells(result, c, i):
+    """What a table says of parameter `i`; a derivative with its unit, which differs from row to row."""
+    cells = {q: _cell(c.felt[q][i]) for q in HEADS[result.method]}
+    if "derivative" in cells and np.isfinite(c.felt["derivative"][i]):
+        cells["derivative"] += f" {derivative_unit(result, c, result.parameters[i])}"
+    return cells.values()
 
 
 def _cell(value):
@@ -177,17 +202,28 @@ def table_csv(result):
     quantities = list(HEADS[result.method])
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
+    local = ["derivative unit"] if result.method == "local" else []
     heads = [
         h
         for q in quantities
         for h in ([q.replace("interval95", "low"), q.replace("interval95", "high")] if "interval95" in q else [q])
     ]
-    writer.writerow(["measure", "unit", "parameter", "parameter unit", "rank", *heads])
+    writer.writerow(["measure", "unit", "parameter", "parameter unit", "rank", *heads, *local])
     for c in result.columns:
         for rank, i in enumerate(result.order(c), start=1):
             name = result.parameters[i]
             numbers = [f"{v:.10g}" if np.isfinite(v) else "" for q in quantities for v in np.ravel(c.felt[q][i])]
-            writer.writerow([c.label, c.unit, name, describe(result.case.loop, name)["unit"], rank, *numbers])
+            writer.writerow(
+                [
+                    c.label,
+                    c.unit,
+                    name,
+                    describe(result.case.loop, name)["unit"],
+                    rank,
+                    *numbers,
+                    *(derivative_unit(result, c, name) for _ in local),
+                ]
+            )
     return out.getvalue()
 
 
