@@ -346,11 +346,11 @@ def cloud(ax, pairs, held, name, unit, limit=None):
     """One dot for each run: `name` [unit] before tuning across, after tuning up, on the same plant and noise; below the diagonal it fell.
 
     pairs: (runs, 2) before and after; held: (runs, 2) True where every limit holds; limit: [unit], drawn on both axes. Blue dots hold every
-    limit on both sides, orange squares broke one before, pink crosses break one after.
+    limit on both sides, orange squares broke one before and none after, pink crosses break one after, whatever they did before.
     """
     pairs, held = np.asarray(pairs, dtype=float), np.asarray(held)
     sorts = (
-        (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "broke a limit before"),
+        (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "broke a limit before, none after"),
         (held[:, 0] & held[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
         (~held[:, 1], "x", FORBIDDEN, 22, "breaks a limit after"),
     )
