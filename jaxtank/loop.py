@@ -154,6 +154,7 @@ def _report_broken(broken, loop, clock, key):
     """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
     if isinstance(broken, jax.core.Tracer) or np.ndim(broken) or not broken:
         return
+    loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same
     run = _simulate(loop, clock, key, 1)[0]
     bad = ~np.isfinite(np.asarray(run.x))
     if not bad.any():  # only the step after the last sample
