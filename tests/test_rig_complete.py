@@ -322,6 +322,19 @@ def test_names_of_tanks_and_pumps_are_kept():
     assert rig.loads(rig.dump(rig.loads(four))).names == {"tank": ("", "", "upper left", "")}
 
 
+def test_show_tells_what_tanks_and_pumps_are_called(tmp_path, capsys):
+    text = TANK.replace("[[tank]]", '[[tank]]\nname = "left"').replace("[[pump]]", '[[pump]]\nname = "P-101"')
+    (tmp_path / "rig.toml").write_text(text)
+    assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
+    said = capsys.readouterr().out
+    assert "controlled: h1 (left)" in said and "The names of its file: tank 1 is 'left', pump 1 is 'P-101'." in said
+    assert cli.main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["names"] == {"tank": ["left"], "pump": ["P-101"]}
+    assert cli.main(["show", "gouta2015/ngpc"]) == 0
+    said = capsys.readouterr().out
+    assert "controlled: h1, h2\n" in said and "names of its file" not in said
+
+
 @pytest.mark.parametrize("line", ["area = 20.0", "rim = 30.0", "drain = 1.0", "level = 3.0", "gain = 5.0", "high = 12.0"])
 def test_a_large_whole_number_of_a_tank_is_the_float_next_to_it(line):
     key, big, told = line.split(" = ")[0], 10**20, []

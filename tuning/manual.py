@@ -60,6 +60,7 @@ def json_of(case):
         "title": case.title,
         "citation": preset.citation if preset else None,
         "plant": type(case.loop.plant).__name__,
+        "names": {kind: list(names) for kind, names in case.names.items()},
         "equations": equations(case.loop.plant, case.loop.disturbance is not None),
         "law": _law(case.loop.controller),
         "observer": type(case.loop.observer).__name__,
@@ -78,12 +79,12 @@ def text(case):
     """The page of `jaxtank show`."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
-    outputs = ", ".join(f"h{i + 1}" for i in loop.plant.outputs)
+    outputs = ", ".join(f"h{i + 1}{manual_parts.own_name(case, 'tank', i)}" for i in loop.plant.outputs)
     parts += _chapter(f"The rig: {loop.plant.tanks} tanks, {loop.plant.pumps} pumps; controlled: {outputs}")
     parts += [
         line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
     ]
-    parts += ["", *_sentences(physics(loop.plant))]
+    parts += ["", *_sentences([*manual_parts.called(case), *physics(loop.plant)])]
     parts += _chapter("The loop")
     parts += _sentences(
         [*manual_parts.sensor(loop), *manual_parts.actuator(loop), *manual_parts.moved(loop), *manual_parts.sampled(case)]

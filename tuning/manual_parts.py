@@ -5,6 +5,18 @@ import numpy as np
 from jaxtank.signals import Constant, Pours, Ramps, Sine, Sum
 
 
+def own_name(case, kind, i):
+    """ " (left)" of the `kind`, "tank" or "pump", that its rig file calls left; nothing of one without a name."""
+    name = case.names.get(kind, {i: ""})[i]
+    return f" ({name})" if name else ""
+
+
+def called(case):
+    """What the rig file calls its tanks and pumps."""
+    found = [f"{kind} {i + 1} is {name!r}" for kind in ("tank", "pump") for i, name in enumerate(case.names.get(kind, ())) if name]
+    return [f"The names of its file: {', '.join(found)}."] if found else []
+
+
 def _list(values):
     found = [f"{float(v):g}" for v in np.ravel(values)]
     return found[0] if len(set(found)) == 1 else ", ".join(found)
