@@ -1,8 +1,10 @@
 """The complete rig file of `init`: it is the case, every suggestion in it can be used, and a rig is described without Python."""
 
 import json
+import pathlib
 import re
 import tomllib
+import types
 import warnings
 
 import jax
@@ -15,7 +17,7 @@ from jaxtank.errors import InputError
 from jaxtank.measures import MEASURES, TIMES
 from jaxtank.records import Clock
 from jaxtank.tree import walk
-from tuning import cli
+from tuning import cli, options
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 # one case of each law, reference, disturbance and fault
@@ -77,6 +79,19 @@ def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwis
     assert case.reachable and not again.reachable
     assert f"reachable = false  # {rig.unreachable(case)}" in text.splitlines()
     assert_same(again, case)
+
+
+@pytest.mark.parametrize(
+    ("name", "quiet", "told"), [("rig.toml", False, True), ("rig.toml", True, False), ("fit.csv", False, False)]
+)
+def test_a_written_rig_that_says_unreachable_is_told(name, quiet, told, capsys):
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]})
+    args = types.SimpleNamespace(out="found/", quiet=quiet)
+    options.tell_unreachable(case, [pathlib.Path("found") / name], args)
+    said = capsys.readouterr().err
+    assert said == told * f"jaxtank: found/rig.toml: note: {rig.unreachable(case)}; the file says reachable = false for it\n"
+    options.tell_unreachable(presets.find("gouta2015/backstepping"), [pathlib.Path("found") / name], args)
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("name", KINDS)
