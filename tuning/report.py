@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.objective import LOWER
+from tuning.objective import LOWER, TAIL
 from tuning.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
 
 SHOWN = (
@@ -88,7 +88,7 @@ def parts_of(result):
                     numbers(result.measures["after"][m], 5 if "level" in m else 4),
                 ]
             )
-    parts += [table(rows, ["measure", "unit", "before", "after"]), ""]
+    parts += [table(rows, ["measure", "unit", "before", "after"]), *_whose(result, len(rows) > 1), ""]
     if result.constraints:
         shown = worst_of_scenarios(result.constraints)
         rows = [
@@ -125,6 +125,22 @@ def parts_of(result):
         else "rims are limits: a level may rise past one"
     )
     return [*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s"]
+
+
+def _whose(result, others):
+    """Whose the rows of the table of measures are, where the objective is of other runs than the rest; others: whether there is a rest."""
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    what = "plants" if result.certificate is not None else "scenarios"
+    weighted = len({lane.weight for lane in problem.lanes}) > 1
+    of = {
+        "mean": "the weighted mean" if weighted else "the mean",
+        "cvar": f"the mean of the worst {100 * TAIL:g} %",
+        "worst": "the worst",
+    }
+    rest = "; the other rows: the case's own run, on its own plant" if others else ""
+    return [f"objective: {of[problem.risk]} of {len(problem.lanes)} {what}{rest}"]
 
 
 def worst_of_scenarios(constraints):

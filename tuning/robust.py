@@ -116,19 +116,27 @@ def tune_robust(
     support = _support(result)
     interval = clopper_pearson(broken, fresh)
     certificate = Certificate(samples, support, scenario_bound(samples, support), fresh, broken, interval)
+    words = _words(certificate, risk, back_off)
+    return result.replace(certificate=certificate, validation=found[0], cloud=found[1], message=f"{words}; {result.message}")
+
+
+def _words(known, risk, back_off):
+    """A Certificate in words, joined by semicolons."""
+    low, high = known.interval95
     words = (
-        f"on {fresh} fresh plants a limit was broken {broken} times (95 % interval {interval[0]:.2g} to {interval[1]:.2g}); the scenario "
-        f"theory bounds the probability by {certificate.bound:.2g} (N {samples}, support {support}, confidence 1 - 1e-6"
+        f"on {known.fresh} fresh plants a limit was broken {known.broken} times (95 % interval {low:.2g} to {high:.2g}); the scenario theory "
+        f"bounds the probability by {known.bound:.2g} (N {known.scenarios}, support {known.support}, confidence 1 - 1e-6"
         + (")" if risk == "worst" else f", an indication: plants at no limit move the {risk} too, and count for nothing in it)")
     )
     if back_off:
-        words += f"; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
-    elif broken and support:
-        words += (
-            f"; {support} of {samples} plants hold the answer in place, which leaves about {100 * support / (samples + 1):.2g} % of fresh "
-            "ones past a limit: more plants or a back-off (--back-off 0.03) bring that down"
-        )
-    return result.replace(certificate=certificate, validation=found[0], cloud=found[1], message=f"{words}; {result.message}")
+        return f"{words}; the search kept {100 * back_off:g} % off every limit, fresh plants are judged by the limits themselves"
+    if not (known.broken and known.support):
+        return words
+    many = f"{known.support} of {known.scenarios} plants hold{'s' if known.support == 1 else ''} the answer in place"
+    return (
+        f"{words}; {many}: before any fresh one was run up to about {100 * known.support / (known.scenarios + 1):.2g} % of them were to be "
+        "expected past a limit, what they then did is said above (more plants or a back-off, --back-off 0.03, bring both down)"
+    )
 
 
 def _kept_off(case, limits, share):
