@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxtank.errors import InputError
 from jaxtank.records import check_clock, check_key
+from jaxtank.shapes import check_shapes
 from jaxtank.tree import check_leaves
 
 
@@ -35,6 +36,7 @@ def check(loop, clock, key=None):
         raise InputError(
             f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of {clock.dt:g} s, at most {clock.duration:g} s"
         )
+    check_shapes(loop)
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in getattr(loop.controller, "gains", ())])
     _check_order(actuator, "low", "high")
     if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":

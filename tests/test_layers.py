@@ -15,6 +15,7 @@ LAYERS = [
     {"observers", "controllers"},
     {"measures"},
     {"stepping"},
+    {"shapes"},
     {"door", "derivatives"},
     {"loop"},
     {"presets"},

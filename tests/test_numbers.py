@@ -99,6 +99,45 @@ def test_a_run_has_the_precision_of_its_most_precise_leaf():
         run(dataclasses.replace(case.loop, x0=[2.0, 2.0, 2.0, 2.0]))
 
 
+SHAPES = {
+    "plant.orifice": (3,),
+    "plant.area": (1,),
+    "plant.drain": (5,),
+    "plant.rim": (3,),
+    "plant.pump_gain": (3,),
+    "actuator.high": (1,),
+    "actuator.initial": (2, 1),
+    "sensor.noise": (5,),
+    "observer.l": (1,),
+    "controller.model.orifice": (1,),
+    "x0": (3,),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_leaf_of_another_shape_is_no_other_rig(name):
+    """An index past the end is that of the last entry inside jax: such runs gave plausible numbers of another rig."""
+    case = presets.find("gouta2022/chadpc" if name.startswith("observer") else "gouta2015/backstepping")
+
+    def other(tree, path):
+        if not path:
+            return np.ones(SHAPES[name])
+        return dataclasses.replace(tree, **{path[0]: other(getattr(tree, path[0]), path[1:])})
+
+    loop = other(case.loop, name.split("."))
+    for run in (lambda: evaluate(loop, case.clock, ("iae",)), lambda: jax.jit(lambda b: evaluate(b, case.clock, ("iae",)))(loop)):
+        with pytest.raises(InputError, match=f"{name} has shape" if name != "plant.rim" else "has shape"):
+            run()
+
+
+def test_leaves_of_a_batch_have_its_axis_in_front():
+    case = presets.find("gouta2015/backstepping")
+    batch = jax.tree.map(lambda a: np.stack([a, a]), case.loop)
+    clock = Clock(dt=0.5, duration=50.0)
+    found = jax.vmap(lambda loop: evaluate(loop, clock, ("iae",))["iae"])(batch)
+    np.testing.assert_allclose(found[0], evaluate(case.loop, clock, ("iae",))["iae"], rtol=1e-12)
+
+
 def test_noise_that_no_key_draws_is_no_answer():
     """Outside a trace it is refused at the door; inside one the noise is not known there, and a run without it looked like an answer."""
     case, clock = presets.find("gouta2015/backstepping"), Clock(dt=0.5, duration=50.0)
