@@ -236,8 +236,8 @@ def test_a_folder_made_for_nothing_is_removed(tmp_path):
 @pytest.mark.slow
 def test_two_at_once(tmp_path):
     """Both may be right one after the other; neither is wrong."""
-    command = [*JAXTANK, *SPREAD, "--samples", "3000", "--out", str(tmp_path / "out")]
-    alone = [*JAXTANK, *SPREAD, "--samples", "3000", "--out", str(tmp_path / "alone")]
+    command = [*JAXTANK, "uncertainty", *SHORT, "--samples", "3000", "--quiet", "--out", str(tmp_path / "out")]
+    alone = [*JAXTANK, "uncertainty", *SHORT, "--samples", "3000", "--quiet", "--out", str(tmp_path / "alone")]
     subprocess.run(alone, check=True, capture_output=True)
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
     said = [(*p.communicate(), p.returncode) for p in both]
