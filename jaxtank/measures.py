@@ -53,6 +53,8 @@ class Measure(NamedTuple):
     rests: bool = False  # needs the inputs that hold the setpoint of each sample
     residual: str = ""  # the residual of RESIDUALS whose squares it sums, if it is such a sum
     scale: Callable | None = None  # run -> factor of that sum
+    low: float | None = 0.0  # least and largest value that it can have, None where there is none
+    high: float | None = None
 
 
 def _filled(run, count, value):
@@ -351,6 +353,7 @@ MEASURES = {
         ("outside",),
         _per_run("outside", lambda run: 1.0 / run.samples),
         "share of samples commanded outside the limits",
+        high=1.0,
     ),
     "saturation_excess": Measure(
         "-",
@@ -358,6 +361,7 @@ MEASURES = {
         ("saturation_excess",),
         lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
         "mean of x/(1+x), x = voltage commanded outside the limits over their span",
+        high=1.0,
     ),
     "max_level": Measure("cm", "tank", ("max_level",), _extremes("max_level"), "highest level"),
     "min_level": Measure("cm", "tank", ("min_level",), _extremes("min_level"), "lowest level"),
@@ -392,6 +396,7 @@ MEASURES = {
         "longest time from the end of a change to its last sample outside its band (+-5 % of it); "
         "negative: inside before the change ended; none: never settled",
         windows=True,
+        low=None,
     ),
     "recovery_time": Measure(
         "s",

@@ -4,8 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import tuning
+from jaxtank import measures as measured
 from jaxtank import presets, rig
 
 SHORT = {"clock.dt": 1.0, "clock.duration": 200.0}
@@ -40,6 +42,32 @@ def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
     assert words in page
     for tank in (1, 2):
         assert row(page, f"max_level of tank {tank}")[2:4] == ["-", "-"]
+
+
+def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
+    """Skew draws, whose mean and 1.96 standard errors reach past what the measure can be; the settling time alone may be negative."""
+    four = tuning.ensemble(case, samples=4, measures=("overflow_volume", "saturated_fraction", "settling_time", "iae"), **OPTIONS)
+    skew, share = np.array([0.0, 0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0, 0.2])
+    measures = {
+        "overflow_volume": np.stack([skew, skew + 10], axis=1),
+        "saturated_fraction": share[:, None],
+        "settling_time": skew[:, None],
+        "iae": skew[:, None],
+    }
+    found = dataclasses.replace(four, measures=measures, limits=[]).summary()
+
+    def plain(values):
+        half = stats.norm.ppf(0.975) * np.std(values, ddof=1) / np.sqrt(len(values))
+        return values.mean() - half, values.mean() + half
+
+    ends = {name: np.array(found[name]["mean_interval95"]) for name in measures}
+    assert plain(skew)[0] < 0.0 and plain(share)[1] > 1.0
+    np.testing.assert_allclose(ends["overflow_volume"][:, 0], [0.0, plain(skew)[1]], rtol=1e-7)
+    np.testing.assert_allclose(ends["overflow_volume"][:, 1], plain(skew + 10), rtol=1e-7)
+    np.testing.assert_allclose(ends["saturated_fraction"][:, 0], [plain(share)[0], 1.0], rtol=1e-7)
+    np.testing.assert_allclose(ends["settling_time"][:, 0], plain(skew), rtol=1e-7)
+    np.testing.assert_allclose(ends["iae"][:, 0], [0.0, plain(skew)[1]], rtol=1e-7)
+    assert {m for m, spec in measured.MEASURES.items() if spec.low is None} == {"settling_time"}
 
 
 def test_two_draws_have_a_spread(case):

@@ -83,8 +83,8 @@ class Ensemble:
 
     def summary(self):
         """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
-        or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's interval are
-        None for a single draw."""
+        or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's
+        interval, which is cut at what the measure cannot pass, are None for a single draw."""
         found = {}
         for name, values in self.measures.items():
             kept = values[~self.failed]
@@ -99,7 +99,7 @@ class Ensemble:
                 half = 1.959964 * sd / math.sqrt(len(kept))
                 found[name] = {
                     "mean": mean,
-                    "mean_interval95": [mean - half, mean + half],
+                    "mean_interval95": [_within(name, kept, end) for end in (mean - half, mean + half)],
                     "sd": sd,
                     "p05": p05,
                     "p50": p50,
@@ -154,6 +154,15 @@ def clopper_pearson(count, samples, level=0.95):
     low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, samples - count + 1))
     high = 1.0 if count == samples else float(stats.beta.ppf(1.0 - tail, count + 1, samples - count))
     return [low, high]
+
+
+def _within(name, values, end):
+    """`end` of an interval of measure `name`, moved to what the measure cannot pass (a share 0 and 1, say); values: (N, ...) that it had."""
+    low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
+    end = (
+        end if low is None else np.maximum(end, np.minimum(low, values.min(axis=0)))
+    )  # a value that did pass it is not argued with
+    return end if high is None else np.minimum(end, np.maximum(high, values.max(axis=0)))
 
 
 def probabilities(method, dimensions, samples, seed):
