@@ -55,8 +55,13 @@ def test_dots_of_numbers_texts_and_remarks_are_no_key(text):
 
 
 def test_more_words_than_any_rig_has_are_told():
-    check_keys("x = [" + "1.0, " * (MOST_WORDS - 2) + "]")
-    for text in ("x = [" + "1.0, " * MOST_WORDS + "]", "[[tank]]\n" * MOST_WORDS, "x = [" + "[]," * MOST_WORDS + "]"):
+    check_keys("x = [" + "1.0, " * (MOST_WORDS // 2 - 1) + "]")
+    for text in (
+        "".join(f"{AT_MOST[:-2]}.b{i} = 1\n" for i in range(MOST_WORDS // MOST)),
+        "x = [" + "1.0, " * MOST_WORDS + "]",
+        "[[tank]]\n" * MOST_WORDS,
+        "x = [" + "[]," * MOST_WORDS + "]",
+    ):
         with pytest.raises(InputError, match=f"^rig file: has more than {MOST_WORDS} keys and values$"):
             rig.loads(text)
 
