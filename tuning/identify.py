@@ -455,8 +455,9 @@ def identify(
     kept = [_kept(one, hold_back) for one in logs]
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
     begin = [one.part(0, n) for one, n in zip(logs, kept)]
-    if substeps is None and max(np.diff(one.t).max() for one in logs) > max(np.diff(one.t).max() for one in begin):
-        options["substeps"] = Estimation(case, logs, **options).substeps  # the longest step is in what is held back
+    longest, first = (max(np.diff(one.t).max() for one in side) for side in (logs, begin))
+    if substeps is None and longest > 1.01 * first:  # the longest step is in what is held back
+        options["substeps"] = Estimation(case, logs, **options).substeps
     partial = Estimation(case, begin, **options)
     for one in logs:
         if one.samples < FEWEST:
