@@ -6,6 +6,7 @@ import numpy as np
 from jaxtank.errors import InputError
 from jaxtank.records import check_clock, check_key
 from jaxtank.shapes import check_shapes
+from jaxtank.step_length import check_step
 from jaxtank.tree import check_leaves
 
 
@@ -38,6 +39,8 @@ def check(loop, clock, key=None):
         )
     check_shapes(loop)
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in getattr(loop.controller, "gains", ())])
+    if not _traced(plant):
+        check_step(loop, clock)
     _check_order(actuator, "low", "high")
     if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
         _check_order(actuator, "stop", "dead_zone", equal=True)

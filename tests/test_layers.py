@@ -15,7 +15,7 @@ LAYERS = [
     {"observers", "controllers"},
     {"measures"},
     {"stepping"},
-    {"shapes"},
+    {"shapes", "step_length"},
     {"door", "derivatives"},
     {"loop"},
     {"presets"},

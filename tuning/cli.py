@@ -7,6 +7,7 @@ be met, 5 bad data file, 130 interrupted (the best point so far is written and s
 import os
 import shlex
 import sys
+import warnings
 
 from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
 from tuning import batch_commands, case_commands, identify_command, streams, tune_command
@@ -38,6 +39,8 @@ def main(argv=None):
     if argv is None:  # a program of its own
         listen()
         streams.guard()
+        # a note says so, once, where the case is opened
+        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
     try:
         top = parser()
         try:

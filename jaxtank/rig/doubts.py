@@ -9,7 +9,7 @@ from jaxtank.signals import Pours
 
 def doubts(case):
     """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours after the end of the run, changes
-    that overlap, levels and setpoints above the rim, pumps that start outside their limits."""
+    that overlap, levels and setpoints above the rim, pumps that start outside their limits. (Steps that are too long: `step_length`.)"""
     loop, (length, drive) = case.loop, case.loop.units
     found, end, rim = clock_doubts(case.clock), case.clock.duration, np.asarray(loop.plant.rim)
     reference, bank = steps(loop.reference), loop.actuator

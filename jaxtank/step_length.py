@@ -1,0 +1,97 @@
+"""Integration steps too long for a tank that runs empty: there a level chatters, or water appears from nowhere.
+
+Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the rate
+
+    lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(knee))    [1/s]
+
+of the film of `numerics.root`, and a Runge-Kutta step h follows it while lambda h is below 2.785 (rk4) or 2 (midpoint), the ends of their
+stability regions on the negative axis (Hairer & Wanner 1996, sec. IV.2). Beyond, a level that should rest at 0 is thrown up again and again.
+How high depends on lambda h alone, counted in knees, and is found here by doing it: 9 knees at 6.6, 400 at 15, 120,000 at 100.
+"""
+
+import functools
+import math
+import warnings
+
+import numpy as np
+
+from jaxtank.errors import InputError
+
+LIMITS = {"rk4": 2.785, "midpoint": 2.0}
+SEEN = 0.01  # share of a tank's height up to which a level may be thrown without a word
+
+
+def film_rates(plant):
+    """(n,) lambda of each tank [1/s]; None of a plant of another kind, or one whose leaves are traced."""
+    try:
+        out, pipes = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
+        for k, (source, _) in enumerate(plant.links):
+            out[source] += np.asarray(plant.orifice)[k]
+        for k, ends in enumerate(plant.pipes):
+            for i in ends:
+                pipes[i] += np.asarray(plant.pipe)[k]
+        speed = math.sqrt(2.0 * float(plant.gravity) / plant.knee)
+        return speed * (1.5 * out + 2.0 * pipes) / np.asarray(plant.area, dtype=float)
+    except (AttributeError, TypeError):  # what jax raises for a traced number is a TypeError
+        return None
+
+
+@functools.lru_cache(maxsize=256)
+def thrown(product, integrator):
+    """How high above an empty tank, in knees, a level is thrown in the long run, at lambda h = `product` of any start."""
+
+    def rate(x):
+        return -product / 1.5 * np.where(x >= 1.0, np.sqrt(np.maximum(x, 1.0)), x * (1.5 - 0.5 * np.maximum(x, 0.0)))
+
+    x, highest = np.geomspace(1e-3, 4.0 * product**2 + 1.0, 200), 0.0
+    with np.errstate(all="ignore"):
+        for k in range(400):
+            a = rate(x)
+            b = rate(x + 0.5 * a)
+            if integrator == "midpoint":
+                x = x + b
+            else:
+                c = rate(x + 0.5 * b)
+                x = x + (a + 2.0 * b + 2.0 * c + rate(x + c)) / 6.0
+            highest = max(highest, float(np.max(np.abs(x)))) if k >= 200 else 0.0
+    return highest if math.isfinite(highest) else math.inf
+
+
+class StepWarning(UserWarning):
+    """Steps too long for a tank that runs empty. The command says so in a note of its own."""
+
+
+def check_step(loop, clock):
+    """Raise InputError where a step would empty a full tank, and warn (StepWarning) where levels near a bottom are wrong."""
+    plant, step = loop.plant, clock.dt / clock.substeps
+    for tank, _, remedy in _thrown(loop, clock):
+        # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of the film in place of its factors
+        empty = 3.0 * math.sqrt(plant.rim[tank] / plant.knee) / film_rates(plant)[tank]
+        if empty < step:
+            raise InputError(f"clock.dt = {clock.dt:g} s: tank {tank + 1} runs empty in {empty:.2g} s, within one step: {remedy}")
+    for line in doubts(loop, clock):
+        warnings.warn(line, StepWarning, stacklevel=4)
+
+
+def doubts(loop, clock):
+    """A line for every tank that would be thrown so high that it shows."""
+    length = loop.plant.units[0]
+    return [
+        f"tank {tank + 1} runs empty faster than the steps follow: once it is, its level is thrown up by {height:.2g} {length} ({remedy})"
+        for tank, height, remedy in _thrown(loop, clock)
+        if height > SEEN * loop.plant.rim[tank]
+    ]
+
+
+def _thrown(loop, clock):
+    """(tank, height [length of the rig], what helps) of every tank whose film is too fast."""
+    rates = film_rates(loop.plant)
+    if rates is None:
+        return
+    step, limit = clock.dt / clock.substeps, LIMITS[clock.integrator]
+    for tank, product in enumerate(rates * step):
+        if product > limit:
+            height = thrown(float(f"{product:.3g}"), clock.integrator) * loop.plant.knee
+            substeps = math.ceil(clock.substeps * product / limit)
+            remedy = f"clock.substeps = {substeps}" if substeps <= 10 else f"clock.dt of at most {step * limit / product:.2g} s"
+            yield tank, height, f"{remedy} is short enough"

@@ -1,0 +1,88 @@
+"""Steps too long for a tank that runs empty: told, against runs that do it; refused where nothing would be right."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig, step_length
+from jaxtank.errors import InputError
+from jaxtank.records import Clock
+from tuning import cli
+
+ONE = """
+[[tank]]
+area = 20.0
+rim = 20.0
+drain = {drain}
+level = 5.0
+[[pump]]
+gain = 8.0
+to = 1
+high = 12.0
+initial = 0.0
+[law]
+kind = "open-loop"
+"""
+
+
+def levels(drain, integrator, samples=500):
+    """Of a tank whose pump is off, sampled every second."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        case = rig.loads(ONE.format(drain=drain))
+        clock = Clock(dt=1.0, duration=float(samples), integrator=integrator)
+        return case, clock, np.asarray(jaxtank.simulate(case.loop, clock).x)[:, 0]
+
+
+@pytest.mark.parametrize("integrator", step_length.LIMITS)
+@pytest.mark.parametrize("share", [0.98, 1.05, 3.0, 10.0])
+def test_what_is_said_is_what_happens(integrator, share):
+    """share: of the longest stable step of the film. Below it a tank empties and stays so; above, its level is thrown as high as is said: by a
+    third of it (what is said holds of any start) to all of it (less what the product is rounded by)."""
+    drain = 0.1
+    for _ in range(3):  # a rate follows from the drain: the film's is proportional to it
+        case, clock, _ = levels(drain, integrator, samples=2)
+        drain *= share * step_length.LIMITS[integrator] / step_length.film_rates(case.loop.plant)[0]
+    case, clock, h = levels(drain, integrator)
+    late = np.abs(h[-100:]).max()
+    said = step_length.thrown(float(f"{step_length.film_rates(case.loop.plant)[0]:.3g}"), integrator) * 0.01
+    if share < 1.0:
+        assert list(step_length._thrown(case.loop, clock)) == [] and late < 1e-6
+    else:
+        assert 0.3 * said <= late <= 1.1 * said
+
+
+def test_steps_as_the_papers_have_them_are_short_enough():
+    for paper in presets.PAPERS:
+        for case in presets.load(paper).cases.values():
+            assert list(step_length._thrown(case.loop, case.clock)) == []
+
+
+def test_the_remedy_is_one():
+    case, clock, _ = levels(0.4, "rk4", samples=2)
+    ((_, _, remedy),) = step_length._thrown(case.loop, clock)
+    assert remedy.startswith("clock.substeps = 5 ")
+    assert list(step_length._thrown(case.loop, dataclasses.replace(clock, substeps=5))) == []
+    assert list(step_length._thrown(case.loop, dataclasses.replace(clock, substeps=4))) != []
+
+
+def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, capsys):
+    case = rig.loads(ONE.format(drain=0.1))
+    fast = jaxtank.with_values(case.loop, {"plant.drain": 2.0})
+    with pytest.warns(step_length.StepWarning, match="tank 1 runs empty .* thrown up by 2.9e.02 cm .*0.042 s"):
+        jaxtank.check(fast, case.clock)
+    with pytest.raises(InputError, match=r"clock.dt = 30 s: tank 1 runs empty in 2 s, within one step"):
+        jaxtank.check(fast, Clock(dt=30.0, duration=300.0))
+    file = tmp_path / "one.toml"
+    file.write_text(ONE.format(drain=0.1))
+    assert cli.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
+    assert "runs empty" not in capsys.readouterr().err
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        assert cli.main(["simulate", str(file), "--set", "clock.duration=20", "--set", "plant.drain=2"]) == 0
+        assert capsys.readouterr().err.count("note: tank 1 runs empty") == 1
+        assert cli.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
+    assert "tank 1 runs empty in 2 s, within one step" in capsys.readouterr().err
