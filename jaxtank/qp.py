@@ -153,7 +153,10 @@ def interior_point(H, f, G, l, u, iterations=MOST):
         centre = jnp.maximum((after / mu) ** 3 * mu, MU_MIN)
         step = towards(p.su * p.lu + guess.su * guess.lu - centre, p.sl * p.ll + guess.sl * guess.ll - centre)
         reach = _reach(p, step, BACK)
-        return k + 1, jax.tree.map(lambda a, b: a + reach * b, p, step)
+        new = jax.tree.map(lambda a, b: a + reach * b, p, step)
+        # where no point is feasible the multipliers grow until they are no numbers: the last that were are kept
+        good = jnp.sum(jnp.abs(new.x)) + jnp.sum(new.lu) + jnp.sum(new.ll) + jnp.sum(new.su) + jnp.sum(new.sl) < 1e300
+        return jnp.where(good, k + 1, iterations), jax.tree.map(lambda a, b: jnp.where(good, b, a), p, new)
 
     return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 

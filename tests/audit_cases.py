@@ -70,7 +70,10 @@ def points_of(loop, rng, kinds):
         here = jax.tree.map(lambda a: np.asarray(a, dtype=float) * (1.0 + 0.02 * rng.standard_normal(np.shape(a))), loop)
         here = dataclasses.replace(here, x0=start(kind, rng, loop))
         points.append(np.asarray(ravel_pytree(here)[0]))
-        scales.append(scales_of(dataclasses.replace(here, x0=np.maximum(here.x0, 0.01 * np.asarray(loop.plant.rim)))))
+        moved = scales_of(dataclasses.replace(here, x0=np.maximum(here.x0, 0.01 * np.asarray(loop.plant.rim))))
+        quiet = jax.tree.map(np.ones_like, here)  # no key, no noise: its leaf stays where it is
+        quiet = dataclasses.replace(quiet, sensor=dataclasses.replace(quiet.sensor, noise=np.zeros_like(here.sensor.noise)))
+        scales.append(moved * np.asarray(ravel_pytree(quiet)[0]))
     return points, scales
 
 

@@ -159,6 +159,14 @@ def test_limits_that_bind_over_the_whole_horizon(error, before, least_step):
     np.testing.assert_allclose(x, found.x, atol=1e-6)
 
 
+@pytest.mark.parametrize("gap", [1e-9, 1e-3, 1.0])
+def test_without_a_feasible_point_it_ends_with_numbers(gap):
+    """Two rows that exclude each other: a meaningless x, but a number, for the law that asks holds it within its limits."""
+    G, f = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, 0.5])
+    x = solve(np.eye(2), f, G, np.array([0.1 + gap, -1.0, -1.0]), np.array([1.0, 0.1, 1.0]), iterations=400)
+    assert np.all(np.isfinite(x))
+
+
 def test_it_ends_when_it_has_arrived():
     """More iterations change nothing, and no bit: they are not done."""
     for seed in range(4):
