@@ -30,8 +30,10 @@ def film_rates(plant):
         for k, ends in enumerate(plant.pipes):
             for i in ends:
                 pipes[i] += np.asarray(plant.pipe)[k]
-        speed = math.sqrt(2.0 * float(plant.gravity) / plant.knee)
-        return speed * (1.5 * out + 2.0 * pipes) / np.asarray(plant.area, dtype=float)
+        with np.errstate(all="ignore"):
+            speed = np.sqrt(2.0 * np.asarray(plant.gravity, dtype=float) / plant.knee)
+            rates = speed * (1.5 * out + 2.0 * pipes) / np.asarray(plant.area, dtype=float)
+        return np.minimum(rates, 1e200)
     except (AttributeError, TypeError):  # what jax raises for a traced number is a TypeError
         return None
 
@@ -43,6 +45,8 @@ def thrown(product, integrator):
     def rate(x):
         return -product / 1.5 * np.where(x >= 1.0, np.sqrt(np.maximum(x, 1.0)), x * (1.5 - 0.5 * np.maximum(x, 0.0)))
 
+    if product > 1e6:
+        return math.inf
     x, highest = np.geomspace(1e-3, 4.0 * product**2 + 1.0, 200), 0.0
     with np.errstate(all="ignore"):
         for k in range(400):

@@ -26,7 +26,20 @@ LAYERS = [
     {"export", "animation"},
 ]
 ABOVE = [
-    {"bounds", "inputs", "projected", "memo", "scenarios", "distributions", "indices", "effects", "parts", "logs", "coordinates", "one_line"},
+    {
+        "bounds",
+        "inputs",
+        "projected",
+        "memo",
+        "scenarios",
+        "distributions",
+        "indices",
+        "effects",
+        "parts",
+        "logs",
+        "coordinates",
+        "one_line",
+    },
     {"log_file", "playback"},
     {"experiments"},
     {"identifiability"},

@@ -238,8 +238,8 @@ TANK += '[law]\nkind = "pid"\nKc = 1.0\nTi = 9.0\n'
             + '[[pour]]\ntime = 1.0\nduration = 0.0\ntank = "left"\nvolume = 1.0\n',
             "pour 1 into tank 'left': duration = 0 s",
         ),
-        (TANK + "[plant]\nknee = 1e-300\n", "plant: knee = 1e-300 cm: must be at least 1e-09 cm"),
-        ('units = ["m", "V"]\n' + TANK + "[plant]\nknee = 1e-10\n", "plant: knee = 1e-10 m: must be at least 1e-09 m"),
+        (TANK + "[plant]\nknee = 1e-300\n", "plant: knee = 1e-300 cm: must be at least 1e-15 cm"),
+        ('units = ["m", "V"]\n' + TANK + "[plant]\nknee = 1e-16\n", "plant: knee = 1e-16 m: must be at least 1e-15 m"),
         (TANK.replace("high = 12.0", "high = 0.0"), "pump 1: high = 0 V: must be above its low, 0 V"),
         (TANK.replace("high = 12.0", "low = 13.0\nhigh = 12.0"), "pump 1: high = 12 V: must be above its low, 13 V"),
         (
@@ -370,8 +370,9 @@ def test_a_whole_number_that_no_float_holds_is_refused_in_one_line(option, capsy
 
 def test_numpy_says_nothing_beside_a_refusal():
     text = TANK.replace("area = 20.0", "area = 1e-300").replace("[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]")
-    with warnings.catch_warnings(), pytest.raises(InputError, match="no steady state"):
+    with warnings.catch_warnings(), pytest.raises(InputError, match=r"runs empty in|no steady state"):
         warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
         rig.loads(text + "[[pipe]]\nbetween = [1, 2]\narea = 0.5\n")
     with warnings.catch_warnings(), pytest.raises(InputError, match="no unique steady state"):
         warnings.simplefilter("error")
@@ -413,7 +414,8 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
     (sentence,) = rig.doubts(rig.load(tmp_path / "rig.toml"))
     assert words in sentence
     assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
-    assert capsys.readouterr().err.splitlines() == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+    told = [line for line in capsys.readouterr().err.splitlines() if "runs empty" not in line]  # of steps: test_step_length.py
+    assert told == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
 
 
 @pytest.mark.parametrize(

@@ -476,7 +476,13 @@ def test_pictures():
 
 @pytest.mark.parametrize(
     ("unit", "of", "words"),
-    [("cm", "cm^2", "cm per cm^2"), ("cm", "-", "cm"), ("-", "V", "1 per V"), ("-", "-", "-"), ("V^2 s", "cm^3/(s V)", "V^2 s per cm^3/(s V)")],
+    [
+        ("cm", "cm^2", "cm per cm^2"),
+        ("cm", "-", "cm"),
+        ("-", "V", "1 per V"),
+        ("-", "-", "-"),
+        ("V^2 s", "cm^3/(s V)", "V^2 s per cm^3/(s V)"),
+    ],
 )
 def test_the_unit_of_a_derivative(unit, of, words):
     assert sensitivity_report.per(unit, of) == words

@@ -47,7 +47,7 @@ class TankNetwork(Plant):
     )
     bottom: bool = static(doc="a level stops at zero whatever is drawn from it", choices=(False, True), default=False)
     # its least: a nanometre or less, the root is then exact for any level that means something, and knee^-3/2 still is a number
-    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-9, default=0.01)
+    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-15, default=0.01)
 
     @property
     def tanks(self):

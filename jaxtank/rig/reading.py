@@ -66,7 +66,9 @@ def loads(text, words="rig file"):
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{words} is not TOML: {' '.join(str(error).split())}") from None
     except ValueError:  # of Python, which reads no whole number of thousands of digits
-        raise InputError(f"{words}: a whole number in it has more digits than can be read: write it with an exponent, as 1e30") from None
+        raise InputError(
+            f"{words}: a whole number in it has more digits than can be read: write it with an exponent, as 1e30"
+        ) from None
     except RecursionError:
         raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
     try:
