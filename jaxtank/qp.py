@@ -26,7 +26,7 @@ MOST = 40
 ones, khalid spec C.1; 15 left a pump at 0.003 V that belonged at 0)."""
 
 CORRECTIONS = 4  # of a derivative
-UNROLLED = 20  # variables up to which the elimination is written out
+UNROLLED = 40  # variables up to which the elimination is written out
 BACK = 0.99  # share of the way to the nearest bound that a step may go
 
 
@@ -176,7 +176,7 @@ def _factor(A):
     """A factor of A (n, n) symmetric positive definite, for `_substitute`: [(column of L, pivot), ...] of A = L D L' where A is small.
 
     Written out column by column, for calls of LAPACK take longer than the work on so small a matrix: measured, a closed loop runs 3 to 5
-    times as fast with 4 or 10 variables, as fast with 20, half as fast with 30.
+    times as fast with 4 or 10 variables, as fast with 20, 0.4 times as fast with 30; but a batch of calls sometimes never returns (jax 0.10).
     """
     if A.shape[0] > UNROLLED:
         return jax.scipy.linalg.cho_factor(A, lower=True)
