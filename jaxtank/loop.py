@@ -17,6 +17,7 @@ from jaxtank.derivatives import _sensitivities
 from jaxtank.door import check
 from jaxtank.errors import InputError, NonFiniteError
 from jaxtank.invariants import scan
+from jaxtank.pieces import PIECE, is_pointwise
 from jaxtank.records import Clock, Trajectory
 from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, keyed, run_of, step, zero_of
 from jaxtank.tree import parameters, with_values
@@ -104,12 +105,16 @@ def _evaluate(loop, clock, names, key, checkpoint):
         return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), None
 
     carry = (initial(loop, clock), ms.start(run, names))
-    state, acc = (_checkpointed_scan if checkpoint else _plain_scan)(body, carry, inputs(loop, clock, names, key), clock.samples)
+    if checkpoint:
+        state, acc = _checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
+    elif clock.samples > PIECE and is_pointwise(loop):
+        whole, rest = divmod(clock.samples, PIECE)
+        piece = lambda c, number, samples=PIECE: (scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0], None)
+        carry = jax.lax.scan(piece, carry, jnp.arange(whole))[0]
+        state, acc = piece(carry, whole, rest)[0] if rest else carry
+    else:
+        state, acc = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
     return ms.read(run, acc, names), is_broken(state)
-
-
-def _plain_scan(body, carry, xs, length):
-    return scan(body, carry, xs, length=length)[0]
 
 
 def _checkpointed_scan(body, carry, xs, length):

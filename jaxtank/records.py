@@ -26,6 +26,8 @@ class Clock:
     substeps: int = 1
     integrator: str = "rk4"
 
+    first = 0  # index of the first sample
+
     @property
     def samples(self):
         """Number of samples of a run, both ends included [-]."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.numerics import clip, quantise
+from jaxtank.pieces import PIECE
 from jaxtank.tree import component, leaf, static
 
 
@@ -23,12 +24,23 @@ class LevelSensor:
     full_scale: np.ndarray = leaf("volt", "range of the ADC", low=0.0, strict=True)
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
-    def draw(self, key, samples):
-        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key."""
+    def draw(self, key, samples, piece=None):
+        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key. piece: the number of a long run's piece,
+        whose samples they are; each has a key of its own, and the run's deviates are those of its pieces, end to end."""
         if key is None:
             return None
-        deviates = jax.random.normal(key, (np.shape(self.noise)[-1], samples), dtype=jnp.result_type(float))
-        return tuple(deviates[i] for i in range(deviates.shape[0]))
+        tanks = np.shape(self.noise)[-1]
+        drawn = lambda key, count: jax.random.normal(key, (tanks, count), dtype=jnp.result_type(float))
+        if piece is not None:
+            deviates = drawn(jax.random.fold_in(key, piece), samples)
+        elif samples <= PIECE:
+            deviates = drawn(key, samples)
+        else:
+            whole, rest = divmod(samples, PIECE)
+            pieces = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), PIECE))(jnp.arange(whole))
+            last = drawn(jax.random.fold_in(key, whole), rest)
+            deviates = jnp.concatenate([jnp.moveaxis(pieces, 1, 0).reshape(tanks, -1), last], axis=1)
+        return tuple(deviates[i] for i in range(tanks))
 
     def read(self, x, xi):
         """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or None."""

@@ -11,14 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError
+from jaxtank.pieces import Piece, indices, pointwise, sample_times
 from jaxtank.tree import component, leaf, number, static
 
 SHAPES = ("linear", "quintic")
-
-
-def sample_times(clock):
-    """(samples,) times t_k = k dt [s], from the integer k: no drift over long runs."""
-    return jnp.arange(clock.samples) * clock.dt
 
 
 class Signal(abc.ABC):
@@ -31,7 +27,8 @@ class Signal(abc.ABC):
 
     @abc.abstractmethod
     def sample(self, clock):
-        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel."""
+        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for a Clock. A signal whose every sample
+        follows from `sample_times(clock)` alone may be marked `pieces.pointwise`: a long run then asks for it piece by piece."""
 
 
 @component
@@ -46,6 +43,7 @@ class Constant(Signal):
     def channels(self):
         return np.shape(self.level)[0]
 
+    @pointwise
     def sample(self, clock):
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
@@ -76,6 +74,7 @@ class Ramps(Signal):
     def channels(self):
         return np.shape(self.initial)[0]
 
+    @pointwise
     def sample(self, clock):
         pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]  # of each channel: (first sample, function of time)
         for j, (start, i) in enumerate(self.changes):
@@ -88,6 +87,7 @@ class Ramps(Signal):
         value, rate, second = zip(*(_join(channel, clock) for channel in pieces))
         return value, rate, second
 
+    @pointwise
     def windows(self, clock):
         """Per channel (target, step, time since the change ended, settling band), each (samples,): what overshoot and settling refer to.
 
@@ -144,6 +144,7 @@ class Sine(Signal):
     def channels(self):
         return self.width
 
+    @pointwise
     def sample(self, clock):
         t, omega = sample_times(clock), 2.0 * math.pi / self.period
         inside, angle = (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt), omega * (t - self.zero)
@@ -193,11 +194,13 @@ class Sum(Signal):
     def channels(self):
         return self.first.channels
 
+    @pointwise
     def sample(self, clock):
         return tuple(
             tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
         )
 
+    @pointwise
     def windows(self, clock):
         """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
         t = sample_times(clock)
@@ -223,6 +226,7 @@ class Pours(Signal):
     def channels(self):
         return self.width
 
+    @pointwise
     def sample(self, clock):
         t = sample_times(clock)
         flow = [jnp.zeros_like(t) for _ in range(self.width)]
@@ -232,6 +236,7 @@ class Pours(Signal):
         still = (jnp.zeros_like(t),) * self.width
         return tuple(flow), still, still
 
+    @pointwise
     def since(self, clock):
         """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
         t = sample_times(clock)
@@ -305,7 +310,14 @@ def _course(level, delta, start, duration, shape):
 
 
 def _join(pieces, clock):
-    """The pieces of one channel, each evaluated on its own samples only, end to end."""
+    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Piece`, which may lie anywhere, on all."""
+    if isinstance(clock, Piece):
+        k, t = indices(clock), sample_times(clock)
+        found = pieces[0][1](t)
+        for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):
+            if after > first:
+                found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(t), found))
+        return found
     starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
     parts = [f((a + jnp.arange(b - a)) * clock.dt) for (_, f), a, b in zip(pieces, starts, starts[1:]) if b > a]
     return tuple(jnp.concatenate(column) for column in zip(*parts))

@@ -17,6 +17,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.materialise import materialised
 from jaxtank.observers.base import Observer
+from jaxtank.pieces import PIECE, Piece
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.integration import change, integrate
@@ -73,8 +74,10 @@ class Inputs(NamedTuple):
     fault: tuple | None  # 1 while a fault lasts
 
 
-def inputs(loop, clock, names, key):
-    """The samples of references, disturbances, noise and windows."""
+def inputs(loop, clock, names, key, piece=None, samples=None):
+    """The samples of references, disturbances, noise and windows; of a long run's `piece`, a number, its `samples` alone."""
+    if piece is not None:
+        clock = Piece(first=piece * PIECE, samples=samples, dt=clock.dt)
     r, dr, ddr = loop.reference.sample(clock)
     d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
     window = None
@@ -93,7 +96,7 @@ def inputs(loop, clock, names, key):
         dr=dr,
         ddr=ddr,
         d=d,
-        xi=loop.sensor.draw(key, clock.samples),
+        xi=loop.sensor.draw(key, clock.samples, piece),
         window=window,
         since=since,
         rest=_rests(loop, r) if ms.wants_rests(names) else None,

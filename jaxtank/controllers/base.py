@@ -2,15 +2,19 @@
 
 import abc
 
+from jaxtank.pieces import pointwise
+
 
 class Controller(abc.ABC):
     """A sampled law. It holds its own model of the plant: what it believes and what is true are different leaves."""
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         """What the law can compute of the reference before the loop starts: any tree of arrays (samples,), given back at each sample
         as `tick.plan`. r, dr, ddr: tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2]."""
         return ()
 
+    @pointwise
     def inputs(self, clock):
         """Signals of the law's own, sampled on `clock` before the loop starts: any tree of arrays (samples,), given back at each
         sample as `tick.own`. For a law that plays something back (`OpenLoop`)."""

@@ -9,6 +9,7 @@ from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, s
 from jaxtank.controllers.state_feedback import feedback
 from jaxtank.errors import InputError
 from jaxtank.numerics import clip, magnitude
+from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
 from jaxtank.tree import component, leaf, static
 
@@ -47,6 +48,7 @@ class FuzzyBlend(Controller):
     switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
     form: str = static("-", "which sliding-mode law", choices=FORMS, default="corrected")
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         return steady_along(self.model, r)
 

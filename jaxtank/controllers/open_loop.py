@@ -1,6 +1,7 @@
 """No feedback: inputs played back."""
 
 from jaxtank.controllers.base import Controller
+from jaxtank.pieces import pointwise
 from jaxtank.signals import Signal
 from jaxtank.tree import component
 
@@ -14,6 +15,7 @@ class OpenLoop(Controller):
 
     signal: Signal
 
+    @pointwise
     def inputs(self, clock):
         return self.signal.sample(clock)[0]
 

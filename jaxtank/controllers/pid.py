@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
 from jaxtank.errors import InputError
+from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
 from jaxtank.tree import component, leaf, static
 
@@ -57,6 +58,7 @@ class PID(Controller):
     bias: np.ndarray = leaf("V", "(m,) voltage added where there is no feed-forward")
     feed_forward: bool = static("-", "add the model's voltage on the reference", choices=(False, True), default=False)
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         if not self.feed_forward:
             return ()

@@ -8,6 +8,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.schedulable import check_gains, check_knots, check_variable, refusal
 from jaxtank.errors import InputError
 from jaxtank.numerics import portion
+from jaxtank.pieces import pointwise
 from jaxtank.tree import check_value, component, describe, leaf, parameters, static, with_values
 
 
@@ -74,9 +75,11 @@ class Scheduled(Controller):
     def allocates(self):
         return self.law.allocates
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         return self._blind().prepare(r, dr, ddr)
 
+    @pointwise
     def inputs(self, clock):
         return self._blind().inputs(clock)
 

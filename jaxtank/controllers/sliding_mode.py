@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.numerics import clip, signed_root, signed_root_slope
+from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import QUADRUPLE_FEEDS, QUADRUPLE_LINKS, check_topology
 from jaxtank.tree import component, leaf, static
@@ -118,6 +119,7 @@ class SlidingMode(Controller):
     switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
     form: str = static("-", "which law", choices=FORMS, default="corrected")
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         return steady_along(self.model, r)[1]
 

@@ -7,6 +7,7 @@ from jaxtank.analysis import linearise, steady_along, steady_flows
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.linear import lqr
+from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
 from jaxtank.tree import component, leaf
 
@@ -38,6 +39,7 @@ class StateFeedback(Controller):
     model: Plant
     K: np.ndarray = leaf("V/cm", "(pumps, tanks) gain K")
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         return steady_along(self.model, r)
 
@@ -65,6 +67,7 @@ class LQI(Controller):
     R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each voltage", low=0.0, strict=True)
     operating_point: np.ndarray = leaf("cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True)
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         return steady_along(self.model, r)
 

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtank.controllers.base import Controller
 from jaxtank.errors import InputError
 from jaxtank.numerics import floored_root
+from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
 from jaxtank.tree import component, leaf
@@ -38,6 +39,7 @@ class TwoTankBackstepping(Controller):
         A1, A3 = self.model.area[0], self.model.area[1]
         return self.model.pipe[0] * w / A1, self.model.pipe[0] * w / A3, self.model.drain[1] * w / A3
 
+    @pointwise
     def prepare(self, r, dr, ddr):
         """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (spec A.2) [cm, cm^3/s]."""
         c1, c2 = self.model.pipe[0], self.model.drain[1]

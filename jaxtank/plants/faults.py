@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError
+from jaxtank.pieces import pointwise, sample_times
 from jaxtank.tree import component, get_value, leaf, number, split_index, static
 
 
@@ -21,9 +22,10 @@ class Faults:
     extra: np.ndarray = leaf("-", "(faults,) what is added to it, in its own unit")
     windows: tuple = static(doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault')
 
+    @pointwise
     def sample(self, clock):
         """Tuple of arrays (samples,), one per fault: 1 from its start until before its end, else 0."""
-        t = jnp.arange(clock.samples) * clock.dt
+        t = sample_times(clock)
         half = 1e-7 * clock.dt
         return tuple(jnp.where((t >= start - half) & (t < end - half), 1.0, 0.0) for _, start, end in self.windows)
 
