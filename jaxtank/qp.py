@@ -19,7 +19,10 @@ MU_MIN = 1e-12
 """Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a closed loop by percents, 1e-13 loses
 digits in the normal matrix (khalid spec C.3)."""
 
-LEFT = 4.0  # largest complementarity of a row, in MU_MIN, of a solution that is left alone
+OFF = 1e-4
+"""How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not their mean: the derivatives are those of
+the central path, and a row that ends elsewhere, as it will at a corner, bends the slope that differences see by percents."""
+NEAR = 100.0  # largest complementarity, in MU_MIN, from which on plain Newton steps go straight to the central path
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
 MOST = 40
 """Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to 20 (8 leave 3e-7 of the answer in easy
@@ -118,6 +121,7 @@ def interior_point(H, f, G, l, u, iterations=MOST):
     rows = G.shape[0]
     x = jnp.zeros_like(f)
     one = jnp.full(rows, 0.1, f.dtype)
+    rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))  # of a slack
     start = Point(x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), one, one)
 
     def residuals(p):
@@ -127,10 +131,8 @@ def interior_point(H, f, G, l, u, iterations=MOST):
     def under_way(state):
         k, p = state
         worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in residuals(p)]))
-        # every product, not their mean: a row that is left behind at 7e-11 bends the slopes by 1e-4. Further steps would only stir the
-        # last digits
-        left = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll))
-        return (k < iterations) & ~((left < LEFT * MU_MIN) & (worst < RESIDUAL))
+        off = [jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam) for s, lam in ((p.su, p.lu), (p.sl, p.ll))]
+        return (k < iterations) & ~((jnp.maximum(*off) < OFF * MU_MIN) & (worst < RESIDUAL))
 
     def advance(state):
         k, p = state
@@ -150,8 +152,10 @@ def interior_point(H, f, G, l, u, iterations=MOST):
         after = ((p.su + reach * guess.su) @ (p.lu + reach * guess.lu) + (p.sl + reach * guess.sl) @ (p.ll + reach * guess.ll)) / (
             2 * rows
         )
-        centre = jnp.maximum((after / mu) ** 3 * mu, MU_MIN)
-        step = towards(p.su * p.lu + guess.su * guess.lu - centre, p.sl * p.ll + guess.sl * guess.ll - centre)
+        near = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll)) < NEAR * MU_MIN
+        centre = jnp.where(near, MU_MIN, jnp.maximum((after / mu) ** 3 * mu, MU_MIN))
+        ahead = jnp.where(near, 0.0, 1.0)
+        step = towards(p.su * p.lu + ahead * guess.su * guess.lu - centre, p.sl * p.ll + ahead * guess.sl * guess.ll - centre)
         reach = _reach(p, step, BACK)
         new = jax.tree.map(lambda a, b: a + reach * b, p, step)
         # where no point is feasible the multipliers grow until they are no numbers: the last that were are kept

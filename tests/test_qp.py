@@ -202,3 +202,18 @@ def test_second_derivatives_against_differences_of_the_first(t):
     slope = float(jax.grad(f)(t + 1e-4) - jax.grad(f)(t - 1e-4)) / 2e-4
     assert float(jax.hessian(f)(t)) == pytest.approx(slope, rel=1e-7)
     assert float(jax.jacfwd(jax.jacfwd(f))(t)) == pytest.approx(slope, rel=1e-7)
+
+
+def test_slopes_on_a_corner_are_those_that_differences_see():
+    """Beside the point at which a row begins to bind the solver rounds the corner off, over 1e-6 of the data. The answer there must be the
+    central path's, or its slope is not the slope of what is computed: rows that end at a complementarity of their own are 0.006 off."""
+    G, one = np.eye(2), np.ones(2)
+    answer = lambda f: solve(np.array([[2.0, 0.3], [0.3, 1.0]]), f, G, -9.0 * one, one)
+    x = np.array([0.4, 1.0])  # free of its limits, the second exactly on one
+    corner, h = -np.array([[2.0, 0.3], [0.3, 1.0]]) @ x, 1e-8
+    points = corner + np.array([0.3, 1.0]) * np.linspace(-4e-6, 4e-6, 33)[:, None]
+    slopes = jax.vmap(jax.jacfwd(answer))(points)
+    for i, e in enumerate(h * np.eye(2)):
+        differences = (jax.vmap(answer)(points + e) - jax.vmap(answer)(points - e)) / (2 * h)
+        np.testing.assert_allclose(slopes[:, :, i], differences, atol=2e-4)
+    assert np.ptp(slopes[:, 1, 1]) > 0.8  # from bound to free
