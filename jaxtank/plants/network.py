@@ -86,6 +86,19 @@ class TankNetwork(Plant):
             rate[other] = rate[other] + (self.pipe[k] * w / self.area[other]) * s
         return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
 
+    def rates(self, x, u):
+        if type(self).derivative is not TankNetwork.derivative:
+            return super().rates(x, u)
+        x, u, w, orifice, pipe = jnp.asarray(x), jnp.asarray(u), jnp.sqrt(2.0 * self.gravity), *map(jnp.asarray, (self.orifice, self.pipe))
+        ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
+        (source, sink), (one, other) = ends(self.links), ends(self.pipes)
+        q = root(x, self.knee)
+        poured, piped = orifice * w * q[source], pipe * w * signed_root(x[one] - x[other], self.knee)
+        flow = -jnp.asarray(self.drain) * w * q
+        flow = flow.at[source].add(-poured).at[sink].add(poured).at[one].add(-piped).at[other].add(piped)
+        pump, tank, gain = (list(column) for column in zip(*self._shares()))
+        return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(self.area)
+
     def net_inflow(self, x, u, d):
         """Pumped and disturbing inflow less what leaves for the basin [cm^3/s]: the rate of change of the stored volume."""
         inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
