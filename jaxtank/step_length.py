@@ -16,6 +16,7 @@ import warnings
 import numpy as np
 
 from jaxtank.errors import InputError
+from jaxtank.tree import split_index
 
 LIMITS = {"rk4": 2.785, "midpoint": 2.0}
 SEEN = 0.01  # share of a tank's height up to which a level may be thrown without a word
@@ -78,13 +79,46 @@ def check_step(loop, clock):
 
 
 def doubts(loop, clock):
-    """A line for every tank that would be thrown so high that it shows."""
-    length = loop.plant.units[0]
-    return [
-        f"tank {tank + 1} runs empty faster than the steps follow: once it is, its level is thrown up by {height:.2g} {length} ({remedy})"
-        for tank, height, remedy in _thrown(loop, clock)
-        if height > SEEN * loop.plant.rim[tank]
-    ]
+    """A sentence on the tanks that would be thrown so high that it shows, or none; the worst is named."""
+    length, shown = loop.plant.units[0], _seen(loop, clock)
+    if not shown:
+        return []
+    tank, height, remedy = max(shown, key=lambda one: one[1] / loop.plant.rim[one[0]])
+    others = f" (and so do {len(shown) - 1} more)" if len(shown) > 1 else ""
+    up = f"thrown up by {height:.2g} {length}" if math.isfinite(height) else "thrown up without end"
+    return [f"tank {tank + 1} runs empty faster than the steps follow{others}: once it is, its level is {up} ({remedy})"]
+
+
+def check_run(loop, clock, run):
+    """Raise InputError if in `run`, the whole Trajectory of a loop that has `doubts`, a tank was thrown up: the volume in a rig cannot rise by
+    more than what is pumped and poured into it."""
+    shown = _seen(loop, clock)
+    if not shown:
+        return
+    area, gain, dt = np.asarray(loop.plant.area), np.array(loop.plant.pump_gain, dtype=float), clock.dt
+    for k, (name, _, _) in enumerate(loop.faults.windows if loop.faults else ()):
+        field, (entry,) = split_index(name)
+        if field == "pump_gain":
+            gain[entry] = max(gain[entry], gain[entry] * loop.faults.factor[k] + loop.faults.extra[k])
+        if field == "area":
+            return  # what is stored changes with it
+    x, u = np.asarray(run.x), np.asarray(run.u)
+    inflow = np.maximum(u, 0.0) @ gain
+    if loop.disturbance is not None:
+        inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in loop.disturbance.sample(clock)[0])
+    gained = np.diff(x @ area) - dt * inflow[:-1]  # from nowhere
+    for tank, _, remedy in shown:
+        bad = (gained > SEEN * area[tank] * loop.plant.rim[tank]) & (np.diff(x[:, tank]) > SEEN * loop.plant.rim[tank])
+        if bad.any():
+            raise InputError(
+                f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tank + 1}, which runs empty, threw its level up after "
+                f"t = {np.argmax(bad) * dt:g} s: {remedy}"
+            )
+
+
+def _seen(loop, clock):
+    """Those of `_thrown` whose height shows."""
+    return [one for one in _thrown(loop, clock) if one[1] > SEEN * loop.plant.rim[one[0]]]
 
 
 def _thrown(loop, clock):

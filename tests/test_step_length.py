@@ -9,7 +9,9 @@ import pytest
 import jaxtank
 from jaxtank import presets, rig, step_length
 from jaxtank.errors import InputError
+from jaxtank.plants.faults import faults
 from jaxtank.records import Clock
+from jaxtank.signals import pours
 from tuning import cli
 
 ONE = """
@@ -82,7 +84,37 @@ def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, ca
     assert "runs empty" not in capsys.readouterr().err
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_length.StepWarning)
-        assert cli.main(["simulate", str(file), "--set", "clock.duration=20", "--set", "plant.drain=2"]) == 0
-        assert capsys.readouterr().err.count("note: tank 1 runs empty") == 1
+        out = tmp_path / "out"
+        assert cli.main(["simulate", str(file), "--set", "clock.duration=20", "--set", "plant.drain=2", "--out", str(out)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("note: tank 1 runs empty") == 1 and "threw its level up after t = 0 s: clock.dt of at most" in said
+        assert not out.exists()
         assert cli.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
     assert "tank 1 runs empty in 2 s, within one step" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("case", ["fed", "empty", "fault", "pour"])
+def test_a_run_that_is_right_is_not_refused(case):
+    """The film is too fast for the steps, and yet nothing was thrown up: the tank is fed all the time, or starts empty and fills, or more comes
+    in than its pump brings."""
+    text = ONE.format(drain=0.4).replace("initial = 0.0", "initial = 6.0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        loop = rig.loads(text).loop
+        if case == "empty":
+            loop = dataclasses.replace(loop, x0=np.zeros(1))
+        elif case == "fault":
+            loop = dataclasses.replace(loop, faults=faults(loop.plant, [("pump_gain[0]", 3.0, 30.0, 1.5, 0.0)]))
+        elif case == "pour":
+            loop = dataclasses.replace(loop, disturbance=pours(1, [(3.0, 1.0, 0, 150.0)]))
+        clock = Clock(dt=1.0, duration=40.0)
+        run = jaxtank.simulate(loop, clock)
+    assert step_length.doubts(loop, clock)
+    step_length.check_run(loop, clock, run)
+
+
+def test_many_tanks_are_one_sentence():
+    text = "".join(ONE.split("[[pump]]")[0].format(drain=d) for d in (0.1, 0.5, 2.0)) + "[[pump]]" + ONE.split("[[pump]]")[1]
+    with pytest.warns(step_length.StepWarning, match=r"^tank 3 .* \(and so do 1 more\)") as said:
+        rig.loads(text)
+    assert len([w for w in said if w.category is step_length.StepWarning]) == 1

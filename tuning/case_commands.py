@@ -71,11 +71,13 @@ def simulate(args):
     seed, case = seed_of(args), open_case(args)
     import jax
 
-    from jaxtank import loop
+    from jaxtank import loop, step_length
     from jaxtank import measures as ms
     from tuning import manual, saving, search, tables
 
     key = jax.random.key(seed) if manual.noisy(case) else None
+    if step_length.doubts(case.loop, case.clock):
+        step_length.check_run(case.loop, case.clock, loop.simulate(case.loop, case.clock, key))
     values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
     payload = {
         "case": case.name,

@@ -89,7 +89,12 @@ class TankNetwork(Plant):
     def rates(self, x, u):
         if type(self).derivative is not TankNetwork.derivative:
             return super().rates(x, u)
-        x, u, w, orifice, pipe = jnp.asarray(x), jnp.asarray(u), jnp.sqrt(2.0 * self.gravity), *map(jnp.asarray, (self.orifice, self.pipe))
+        x, u, w, orifice, pipe = (
+            jnp.asarray(x),
+            jnp.asarray(u),
+            jnp.sqrt(2.0 * self.gravity),
+            *map(jnp.asarray, (self.orifice, self.pipe)),
+        )
         ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
         (source, sink), (one, other) = ends(self.links), ends(self.pipes)
         q = root(x, self.knee)
