@@ -58,6 +58,12 @@ def test_two_samples_are_too_few(refused):
     assert "l.csv: has 2 samples, an identification needs at least 3" in refused(text(*made(2)))
 
 
+def test_two_samples_are_too_few_beside_others(case):
+    logs = [tuning.log(t=t, u=u, y=y) for t, u, y in (made(20), made(2))]
+    with pytest.raises(DataError, match="has 2 samples, an identification needs at least 3"):
+        tuning.identify_many(case, logs, FREE, start="case", noise=0.1)
+
+
 def test_a_step_too_long_to_be_simulated(refused, case):
     """Held back or not, and where the readings after it would have been the answer's undoing."""
     words = "line 32, column 't [s]': 1e+09 s after the sample before: too long"

@@ -20,7 +20,7 @@ _HOMES = {
     "Correlated": "tuning.distributions",
     "Discrete": "tuning.distributions",
     "Ensemble": "tuning.ensemble",
-    "Estimation": "tuning.identify",
+    "Estimation": "tuning.estimation",
     "Identification": "tuning.identify",
     "Log": "tuning.logs",
     "LogUniform": "tuning.distributions",

@@ -13,8 +13,8 @@ from jaxtank.errors import InputError
 from jaxtank.tree import with_values
 from tuning import logs as lg
 from tuning import playback as pb
+from tuning.estimation import Estimation, check_length
 from tuning.identifiability import ROUND_OFF, VAGUE
-from tuning.identify import Estimation
 
 ROOM = 256 * 2**20
 """Bytes of slopes held at once: the logs go through in shares that fit."""
@@ -68,6 +68,7 @@ def identify_many(case, logs, free=None, *, start="free", noise=None, substeps=N
     for one in logs:
         lg.check_gaps(one, gap)
         lg.check_fits(one, case.loop)
+    check_length(logs)
     first = Estimation(case, logs[:1], free, start, noise, substeps)
     problem = Estimation(case, logs, free, start, first.noise if noise is None else noise, first.substeps)
     lanes = _Lanes(problem)

@@ -1,0 +1,59 @@
+"""The Case before an identification, where there is but a plant, and the one after it."""
+
+import numpy as np
+
+from jaxtank import rig as rigs
+from jaxtank.tree import with_values
+
+
+def bare(plant):
+    """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
+    from jaxtank.actuators import PumpBank
+    from jaxtank.controllers import OpenLoop
+    from jaxtank.loop import ClosedLoop
+    from jaxtank.observers import Direct
+    from jaxtank.presets.base import Case
+    from jaxtank.records import Clock
+    from jaxtank.sensors import LevelSensor
+    from jaxtank.signals import Constant
+    from jaxtank.tree import number
+
+    n, m = plant.tanks, plant.pumps
+    still = number(np.zeros(m))
+    loop = ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))),
+        observer=Direct(),
+        controller=OpenLoop(signal=Constant(level=still)),
+        actuator=PumpBank(low=still, high=number(np.full(m, np.inf)), stop=still, pulse=number(np.ones(m)), initial=still),
+        reference=Constant(level=number(np.zeros(len(plant.outputs)))),
+        x0=number(np.zeros(n)),
+    )
+    return Case(name="plant", title="a plant without a law", loop=loop, clock=Clock(), limits={}, free={}, objective={})
+
+
+def identified(result):
+    """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of law and observer; what its uncertainty
+    is made of; noise of the residuals where they are white, else of the record from sample to sample."""
+    case = result.case
+    values = {n: p["value"] for n, p in result.parameters.items()}
+    loop = case.loop
+    for name, value in values.items():
+        loop = with_values(loop, {name: value})
+        for holder in ("controller", "observer"):
+            model = getattr(getattr(loop, holder), "model", None)
+            inner = f"{holder}.model.{name.removeprefix('plant.')}"
+            if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
+                loop = with_values(loop, {inner: value})
+    noise = np.array(loop.sensor.noise, dtype=float)
+    for (tank, volts), rmse, seen in zip(result.estimation.record.channels, result.quality["rmse"], result.quality["noise"]):
+        white = result.quality["widened"] <= 1.05
+        noise[tank] = (rmse if white else min(rmse, seen)) * (float(loop.sensor.gain[tank]) if volts else 1.0)
+    loop = with_values(loop, {"sensor.noise": noise})
+    names, matrix = result.covariance
+    covered = set(names)
+    uncertain = {}
+    for name, share in case.uncertain.items():
+        uncertain |= rigs.uncovered(loop, name, share, covered)
+    covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
+    return case.replace(name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance)
