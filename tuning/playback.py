@@ -100,7 +100,10 @@ def readings(rig, dt, u, channels, substeps):
             return rig.plant.spill(integrate(rig.plant, "rk4", 0.0, x, driven, d, h))[0], None
 
         # a loop of its own, for a program of many unrolled steps takes minutes to compile with its derivatives
-        x = advance(x, None)[0] if substeps == 1 else jax.lax.scan(advance, x, None, length=substeps)[0]
+        if isinstance(substeps, int):
+            x = advance(x, None)[0] if substeps == 1 else jax.lax.scan(advance, x, None, length=substeps)[0]
+        else:
+            x = jax.lax.fori_loop(0, substeps, lambda _, x: advance(x, None)[0], x)
         return (x, state), out
 
     xs = (dt, tuple(u[:, j] for j in range(rig.plant.pumps)))
@@ -147,12 +150,18 @@ def play(rig, dt, u, own, *, channels, substeps):
 MOST_SUBSTEPS = 64
 
 
+@functools.partial(jax.jit, static_argnames=("channels",))
+def _tried(rig, dt, u, own, substeps, *, channels):
+    """`play` with any number of steps: one program for all."""
+    return jax.vmap(lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps))(dt, u, own)
+
+
 def substeps_for(rig, rec, own, error):
     """(how many steps each sample needs: twice as many move no reading by more than `error` (channels,), in the channels' units, at most 64;
     (channels,) by how much they do: NaN or infinite where the levels leave the numbers)."""
     own, before, count = np.asarray(own), None, 1
     while count <= MOST_SUBSTEPS:
-        y = np.asarray(play(rig, rec.dt, rec.u, own, channels=rec.channels, substeps=count))
+        y = np.asarray(_tried(rig, rec.dt, rec.u, own, count, channels=rec.channels))
         if before is not None:
             with np.errstate(invalid="ignore", over="ignore"):
                 moved = np.max(np.abs(y - before), axis=(0, 1))
