@@ -10,8 +10,9 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 import tuning
-from jaxtank import parameters, presets, rig
+from jaxtank import equations, parameters, presets, rig
 from jaxtank.errors import InputError
+from jaxtank.plants.network import network
 from tuning import cli
 
 RIGS = Path(__file__).parent / "rigs"
@@ -191,3 +192,62 @@ def test_a_law_of_a_paper_on_a_rig_of_ones_own():
     )
     ours, theirs = (np.asarray(jaxtank.simulate(c.loop, c.clock).x) for c in (built, same))
     np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_rig_is_the_same_in_any_unit_of_length():
+    """Two tanks and a pipe, from empty and to empty, counted in cm, m, mm and dm, nothing said of the film or of a law's floors."""
+
+    def levels(unit, c, law):  # c: how many of the unit are one cm
+        text = f"""
+            units = ["{unit}", "{unit}^3/s"]
+            [[tank]]
+            area = {100 * c**2}
+            rim = {10 * c}
+            level = {2 * c}
+            [[tank]]
+            area = {100 * c**2}
+            rim = {10 * c}
+            drain = {0.5 * c**2}
+            [[pipe]]
+            between = [1, 2]
+            area = {0.3 * c**2}
+            [[pump]]
+            gain = 1.0
+            to = 1
+            high = {100 * c**3}
+            initial = 0.0
+            [plant]
+            gravity = {981 * c}
+            bottom = true
+            [law]
+            {law(c)}
+            [reference]
+            initial = [{2 * c}]
+            changes = [[30.0, 1, {0.005 * c}]]
+            ramp = 30.0
+            [values]
+            "clock.dt" = 0.1
+            "clock.duration" = 200.0
+        """
+        case = rig.loads(text)
+        return case.loop, np.asarray(jaxtank.simulate(case.loop, case.clock).x) / c
+
+    pid = lambda c: f'kind = "pid"\nKc = {5 * c**2}\nTi = 20.0'
+    floored = lambda c: 'kind = "two-tank-backstepping"\nK_phi = 0.02\nK_y = 0.1'  # what its gains are depends on the unit
+    loop, cm = levels("cm", 1.0, pid)
+    assert loop.plant.knee == 0.01 and cm[-1].max() < 0.1
+    for unit, c, knee in (("m", 1e-2, 1e-4), ("mm", 10.0, 0.1), ("dm", 0.1, 1e-3)):
+        loop, found = levels(unit, c, pid)
+        np.testing.assert_allclose(found, cm, atol=1e-9)
+        assert f"below {knee:g} {unit}," in " ".join(equations.physics(loop.plant))
+        law = levels(unit, c, floored)[0].controller
+        assert float(law.level_floor) == float(law.difference_floor) == knee
+
+
+def test_gravity_and_film_of_a_network_are_those_of_its_unit():
+    one = {"area": 1.0, "drain": 1.0, "pump_gain": 1.0, "feeds": [(0, None)], "rim": 1.0}
+    for unit, gravity, knee in (("cm", 981.0, 0.01), ("m", 9.81, 1e-4), ("V", 981.0, 0.01)):
+        plant = network(**one, units=(unit, "V"))
+        assert float(plant.gravity) == gravity and plant.knee == knee
+    with pytest.raises(InputError, match="at least 1e-15 m"):
+        network(**one, units=("m", "V"), knee=0.0)

@@ -4,10 +4,24 @@ import math
 
 import jax.numpy as jnp
 
-from jaxtank.numerics import root
+from jaxtank.numerics import ROOT_KNEE, root
 
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
+
+PER_CENTIMETRE = {"mm": 10.0, "cm": 1.0, "dm": 0.1, "m": 0.01, "in": 1 / 2.54, "inch": 1 / 2.54, "ft": 1 / 30.48}
+"""Units of length: how many are one centimetre."""
+
+
+def in_unit(centimetres, length):
+    """A number of `centimetres` [cm], or of one of them per s^2, in the unit `length` of a rig; as it is where that is no length: levels in
+    the volts of a sensor have no other scale."""
+    return centimetres * PER_CENTIMETRE.get(length, 1.0)
+
+
+def usual_knee(length):
+    """Level below which flow turns laminar unless a rig says otherwise: 0.01 cm, in the unit `length` of the rig."""
+    return in_unit(ROOT_KNEE, length)
 
 
 def disc(diameter):

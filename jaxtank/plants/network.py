@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank.errors import InputError
 from jaxtank.numerics import at_least, clip, root, signed_root
 from jaxtank.plants.base import Plant
-from jaxtank.plants.hydraulics import GRAVITY, efflux
+from jaxtank.plants.hydraulics import GRAVITY, efflux, in_unit, usual_knee
 from jaxtank.tree import check_value, component, leaf, number, static
 from jaxtank.units import DEFAULT
 
@@ -47,7 +47,7 @@ class TankNetwork(Plant):
     )
     bottom: bool = static(doc="a level stops at zero whatever is drawn from it", choices=(False, True), default=False)
     # its least: a nanometre or less, the root is then exact for any level that means something, and knee^-3/2 still is a number
-    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-15, default=0.01)
+    knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-15)
 
     @property
     def tanks(self):
@@ -158,18 +158,21 @@ def network(
     spills=(),
     caught=(),
     split=None,
-    gravity=GRAVITY,
+    gravity=None,
     outputs=(0,),
     overflow=False,
     bottom=False,
     units=DEFAULT,
-    knee=0.01,
+    knee=None,
 ):
     """A `TankNetwork` from plain numbers; scalars fill. Raises InputError where shapes and topology do not agree.
 
     area, drain, rim: (n,) or a number; pump_gain, split: (m,) or a number; feeds: m pairs (first tank, second tank or None);
     links, pipes, spills: pairs (from, to), with one orifice, pipe, caught each. Units as in TankNetwork, or those of `units`.
+    gravity, knee: 981 cm/s^2 and 0.01 cm where they are None, in the length of `units` (see `hydraulics.in_unit`).
     """
+    gravity = in_unit(GRAVITY, units[0]) if gravity is None else gravity
+    knee = usual_knee(units[0]) if knee is None else knee
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
     links, pipes, spills = (tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills))
     joined = (*links, *pipes, *spills, *feeds)

@@ -8,6 +8,7 @@ from jaxtank import controllers
 from jaxtank.analysis import equilibrium
 from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
+from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
 from jaxtank.rig.words import static_value
 from jaxtank.signals import Ramps, ramps
@@ -29,7 +30,8 @@ LAWS = {
 }
 OBSERVERS = {"direct": Direct, "disturbance": DisturbanceObserver, "kalman": Kalman, "extended-kalman": ExtendedKalman}
 # what a law or an observer needs and a file may leave out: by field
-USUAL = {"level_floor": 0.01, "difference_floor": 0.01, "Tt": 30.0, "spread": 0.0}
+USUAL = {"Tt": 30.0, "spread": 0.0}
+FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}  # [cm]
 SIZES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
 
 
@@ -70,6 +72,8 @@ def component(kind, table, known, plant, offered):
             value = offered[name]
         elif name in USUAL:
             value = USUAL[name]
+        elif name in FLOORS:
+            value = in_unit(FLOORS[name], plant.units[0])
         elif field.default is not dataclasses.MISSING:
             continue
         else:

@@ -154,7 +154,7 @@ def build(table):
         overflow=bool(more["overflow"]),
         bottom=bool(more["bottom"]),
         units=(length, drive),
-        **({} if more["knee"] is None else {"knee": more["knee"]}),
+        knee=more["knee"],
     )
     levels = number([t["level"] for t in tanks])
     initial = number([p["initial"] for p in pumps])
