@@ -63,7 +63,10 @@ class LQI(Controller):
     """
 
     model: Plant
-    Q: np.ndarray = leaf("-", "(tanks + outputs,) weight of each level [1/cm^2], then of each integral [1/(cm s)^2]", low=0.0)
+    # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig counts in
+    Q: np.ndarray = leaf(
+        "-", "(tanks + outputs,) weight of each level, over its unit squared, then of each integral, over that times s^2", low=0.0
+    )
     R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each voltage", low=0.0, strict=True)
     operating_point: np.ndarray = leaf("cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True)
 

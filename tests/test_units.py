@@ -1,0 +1,59 @@
+"""Units as they are printed: those of the rig, with its powers."""
+
+import json
+
+import pytest
+
+from jaxtank.measures import unit as measure_unit
+from jaxtank.units import local
+from tuning import cli
+
+FLOW = ("m", "m^3/s")
+
+
+@pytest.mark.parametrize(
+    ("unit", "units", "printed"),
+    [
+        ("V", FLOW, "m^3/s"),
+        ("V^2", FLOW, "(m^3/s)^2"),
+        ("V^2 s", FLOW, "(m^3/s)^2 s"),
+        ("cm^2/V^2", FLOW, "m^2/(m^3/s)^2"),
+        ("1/V^2", FLOW, "1/(m^3/s)^2"),
+        ("V/cm", FLOW, "(m^3/s)/m"),
+        ("cm^3/(s V)", FLOW, "-"),
+        ("cm^2 s", FLOW, "m^2 s"),
+        ("V^2 s", ("m", "U0"), "U0^2 s"),
+        ("V^2 s", ("cm", "V"), "V^2 s"),
+        ("cm/volt", ("m", "V"), "m/V"),
+        # a pump input that holds the name of a length, and one that looks like a group of an expression
+        ("V", ("m", "cm^3/s"), "cm^3/s"),
+        ("cm/V", ("mm", "cm^3/s"), "mm/(cm^3/s)"),
+        ("V", ("m", r"a\1"), r"a\1"),
+    ],
+)
+def test_a_unit_in_those_of_a_rig(unit, units, printed):
+    assert local(unit, units) == printed
+
+
+def test_squares_of_a_flow_are_printed_as_such(capsys):
+    assert cli.main(["simulate", "calofir/backstepping", "--dt", "2", "--json"]) == 0
+    units = json.loads(capsys.readouterr().out)["units"]
+    assert units["mean_square_travel"] == "(m^3/s)^2" and units["input_travel"] == "m^3/s"
+    assert cli.main(["show", "calofir/backstepping"]) == 0
+    shown = capsys.readouterr().out
+    assert "(m^3/s)^2" in shown and "m^3/s^2" not in shown
+    assert measure_unit("input_deviation", FLOW) == "(m^3/s)^2 s"
+
+
+def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys):
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        'name = "r"\nunits = ["m", "m^3/s"]\n'
+        "[[tank]]\narea = 0.01\nrim = 0.5\ndrain = 1e-4\nlevel = 0.1\n"
+        "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1e-3\n"
+        '[law]\nkind = "lqi"\nR = [1.0]\n'
+        "[reference]\ninitial = [0.2]\n"
+    )
+    assert cli.main(["simulate", str(file)]) == 2
+    told = capsys.readouterr().err
+    assert "needs Q" in told and "cm" not in told and told.count("\n") == 1
