@@ -1,13 +1,17 @@
 """Checks at the door: a loop and a clock that cannot be run are told so before anything is compiled."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
 from jaxtank.errors import InputError
+from jaxtank.plants.base import Plant
+from jaxtank.plants.network import check_caught
 from jaxtank.records import check_clock, check_key
 from jaxtank.shapes import check_shapes
 from jaxtank.step_length import check_step
-from jaxtank.tree import check_leaves
+from jaxtank.tree import check_leaves, is_component
 
 
 def check(loop, clock, key=None):
@@ -39,6 +43,8 @@ def check(loop, clock, key=None):
         )
     check_shapes(loop)
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in getattr(loop.controller, "gains", ())])
+    for name, own in _plants(loop):
+        check_caught(own, name)
     if not _traced(plant):
         check_step(loop, clock)
     _check_order(actuator, "low", "high")
@@ -49,9 +55,19 @@ def check(loop, clock, key=None):
         _check_order(actuator, "pulse", "high", equal=True)
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
+        if not _traced(actuator):
+            loop.controller.check_pumps(actuator)
     loop.observer.check(plant)
     if key is None and not _traced(loop.sensor.noise) and np.any(np.asarray(loop.sensor.noise) > 0):
         raise InputError(f"sensor.noise = {np.asarray(loop.sensor.noise)} {plant.units[0]}: give a key (or --seed), or set it to 0")
+
+
+def _plants(tree, prefix=""):
+    """(dotted name, plant) of every plant below `tree`: that of the loop, and the models of law and observer."""
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if is_component(value):
+            yield from [(f"{prefix}{field.name}", value)] if isinstance(value, Plant) else _plants(value, f"{prefix}{field.name}.")
 
 
 def _traced(*trees):

@@ -1,5 +1,6 @@
 """Rigs described tank by tank in a rig file."""
 
+import dataclasses
 import tomllib
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 import tuning
-from jaxtank import equations, parameters, presets, rig
+from jaxtank import controllers, equations, parameters, presets, rig, with_values
 from jaxtank.errors import InputError
 from jaxtank.plants.network import network
 from tuning import cli
@@ -251,3 +252,85 @@ def test_gravity_and_film_of_a_network_are_those_of_its_unit():
         assert float(plant.gravity) == gravity and plant.knee == knee
     with pytest.raises(InputError, match="at least 1e-15 m"):
         network(**one, units=("m", "V"), knee=0.0)
+
+
+SPILLING = """
+[plant]
+overflow = true
+[[tank]]
+area = 10.0
+rim = 5.0
+drain = 0.01
+level = 5.0
+[[tank]]
+area = 10.0
+rim = 500.0
+drain = 0.01
+[[tank]]
+area = 10.0
+rim = 500.0
+drain = 0.01
+[[spill]]
+from = 1
+to = 2
+{}
+[[spill]]
+from = 1
+to = 3
+{}
+[[pump]]
+gain = 5.0
+to = 1
+high = 10.0
+initial = 10.0
+[law]
+kind = "open-loop"
+[values]
+"clock.dt" = 0.1
+"clock.duration" = 20.0
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "words"),
+    [
+        (
+            "",
+            "",
+            "spill 1 and 2, from tank 1: caught is 2 in sum, 1 where it is left out: give each its share .*, from 0 to 1 in sum",
+        ),
+        ("caught = 0.4", "", "spill 1 and 2, from tank 1: caught is 1.4 in sum, 1 where"),
+        (
+            "caught = 0.6",
+            "caught = 0.5",
+            r"plant.caught: the 2 spills of tank 1 catch 0.6 \+ 0.5 = 1.1 of .*: must be from 0 to 1 in sum",
+        ),
+    ],
+)
+def test_spills_that_catch_more_than_there_is_are_refused(first, second, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(SPILLING.format(first, second))
+
+
+def test_spills_are_weighed_wherever_their_shares_are_given(tmp_path, capsys):
+    """In a file all that is caught is there again; by the command's --set, in Python and in a law's model more is refused."""
+    text = SPILLING.format("caught = 0.7", "caught = 0.3")
+    case = rig.loads(text)
+    run = jaxtank.simulate(case.loop, case.clock)
+    gained = (run.x[-1] - run.x[0]) @ case.loop.plant.area
+    out = 0.01 * 0.1 * np.sqrt(2 * 981 * np.asarray(run.x[:-1])).sum()
+    np.testing.assert_allclose([gained + out, np.abs(run.spilled).max()], [5.0 * 10.0 * 20.0, 0.0], atol=0.5)
+    (tmp_path / "rig.toml").write_text(text)
+    assert cli.main(["simulate", str(tmp_path / "rig.toml"), "--set", "plant.caught=0.8,0.3"]) == 2
+    assert "plant.caught: the 2 spills of tank 1 catch 0.8 + 0.3 = 1.1 of" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"catch 0.7 \+ 0.9 = 1.6"):
+        jaxtank.simulate(with_values(case.loop, {"plant.caught[1]": 0.9}), case.clock)
+    believed = controllers.NGPC(model=dataclasses.replace(case.loop.plant, caught=np.array([1.0, 1.0])), Tp=1.0, level_floor=0.01)
+    with pytest.raises(InputError, match=r"controller.model.caught: the 2 spills of tank 1 catch 1 \+ 1 = 2"):
+        jaxtank.check(dataclasses.replace(case.loop, controller=believed), case.clock)
+    with pytest.raises(InputError, match=r"catch 1 \+ 1 = 2"):
+        network(area=[1.0] * 3, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, spills=[(0, 1), (0, 2)], caught=1.0)
+    third = np.float32(1 / 3)
+    network(
+        area=[1.0] * 4, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, spills=[(0, 1), (0, 2), (0, 3)], caught=[third] * 3
+    )

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -131,6 +132,25 @@ class TankNetwork(Plant):
         return tuple(x), tuple(lost)
 
 
+SURPLUS = 1e-6
+"""By how much the shares `caught` of one tank may be above 1 in sum: the rounding of single floats."""
+
+
+def check_caught(plant, name="plant"):
+    """Raise InputError where the spills of one tank catch more than passes its rim: volume would come from nowhere. `plant` is called
+    `name`; one whose shares are traced or of a batch, or that has none, is passed over."""
+    shares = getattr(plant, "caught", None)
+    if isinstance(shares, jax.core.Tracer) or np.ndim(shares) != 1:
+        return
+    for tank in dict.fromkeys(source for source, _ in plant.spills):
+        own = [float(share) for share, (source, _) in zip(shares, plant.spills) if source == tank]
+        if sum(own) > 1.0 + SURPLUS:
+            raise InputError(
+                f"{name}.caught: the {len(own)} spills of tank {tank + 1} catch {' + '.join(f'{v:g}' for v in own)} = {sum(own):g} of what "
+                "passes its rim: must be from 0 to 1 in sum"
+            )
+
+
 def _downwards(spills, tanks):
     """(every tank, after those that shed into it; the tanks of rings, where there is no such order): what a tank is given by one above
     must be there when it is its turn to shed."""
@@ -196,7 +216,7 @@ def network(
             raise InputError(f"plant.outputs names tank {i}: there are {n}, counted from 0")
     of_knee = next(field.metadata for field in dataclasses.fields(TankNetwork) if field.name == "knee")
     check_value("plant.knee", float(knee), {**of_knee, "unit": units[0]})
-    return TankNetwork(
+    plant = TankNetwork(
         area=fit("plant.area", area, n),
         drain=fit("plant.drain", drain, n),
         orifice=fit("plant.orifice", orifice, len(links)),
@@ -216,3 +236,5 @@ def network(
         units=tuple(units),
         knee=float(knee),
     )
+    check_caught(plant)
+    return plant

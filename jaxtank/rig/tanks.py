@@ -9,7 +9,7 @@ from jaxtank.errors import InputError, unknown
 from jaxtank.loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.hydraulics import GRAVITY
-from jaxtank.plants.network import TankNetwork, network
+from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.presets.base import Case
 from jaxtank.records import Clock
 from jaxtank.rig.parts import law_of, observer_of
@@ -136,6 +136,8 @@ def build(table):
     outputs = more["outputs"] if more["outputs"] is not None else [first + 1 for first, _ in feeds]
     if not isinstance(outputs, list) or not outputs:
         raise InputError(f"plant.outputs = {_short(outputs)}: must be a list of tanks")
+    overflows = [pair([e["from"], e["to"]], f"spill {i + 1}") for i, e in enumerate(spills)]
+    _check_shares(overflows, table.get("spill", []), spills)
     plant = network(
         area=[t["area"] for t in tanks],
         rim=[t["rim"] for t in tanks],
@@ -144,7 +146,7 @@ def build(table):
         orifice=[e["area"] for e in links],
         pipes=[pair(e["between"], f"pipe {i + 1}: between") for i, e in enumerate(pipes)],
         pipe=[e["area"] for e in pipes],
-        spills=[pair([e["from"], e["to"]], f"spill {i + 1}") for i, e in enumerate(spills)],
+        spills=overflows,
         caught=[e["caught"] for e in spills],
         pump_gain=[p["gain"] for p in pumps],
         split=[p["split"] if feeds[j][1] is not None else 1.0 for j, p in enumerate(pumps)],
@@ -200,6 +202,19 @@ def _gravity(length):
     if length not in ("cm", "m"):
         raise InputError(f'plant.gravity: must be given for a rig whose length is "{length}" (981 for cm, 9.81 for m)')
     return GRAVITY if length == "cm" else GRAVITY / 100
+
+
+def _check_shares(overflows, written, spills):
+    """Raise InputError where several spills of a tank leave out a share and come to more than 1: which falls where cannot be known."""
+    for source in dict.fromkeys(source for source, _ in overflows):
+        own = [k for k, (tank, _) in enumerate(overflows) if tank == source]
+        without = [k for k in own if "caught" not in written[k]]
+        total = sum(spills[k]["caught"] for k in own)
+        if without and len(own) > 1 and total > 1.0 + SURPLUS:
+            raise InputError(
+                f"spill {' and '.join(str(k + 1) for k in own)}, from tank {source + 1}: caught is {total:g} in sum, 1 where it is left out: "
+                "give each its share of what passes the rim, from 0 to 1 in sum"
+            )
 
 
 def _list(table, key, at_least=0):
