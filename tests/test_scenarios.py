@@ -1,5 +1,7 @@
 """Several runs behind one cost, and what is said of an answer: against runs made one by one, closed forms and other solvers."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -228,10 +230,33 @@ def test_curvature_and_the_flattest_direction():
     first = np.array([found["directions"][0][n] for n in ("k", "l")])
     assert abs(first @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
     step = np.log(1.1) / np.log(1e4) / vectors[1, 0] * vectors[:, 0]
-    assert found["flattest"]["changes_percent"] == pytest.approx(50 * step @ problem.H @ step, rel=1e-4)
-    assert found["flattest"]["factors"]["l"] == pytest.approx(1.1)
+    said = np.log([found["flattest"]["factors"][n] for n in ("k", "l")]) / np.log(1e4)  # rounded, and run as they are said
+    assert found["flattest"]["changes_percent"] == pytest.approx(50 * said @ problem.H @ said, rel=1e-9)
+    assert 50 * said @ problem.H @ said == pytest.approx(50 * step @ problem.H @ step, rel=0.05)  # what rounding may cost
+    assert found["flattest"]["factors"]["l"] == 1.1
     words = evidence.flat_words(problem, found)
     assert "k x 1.0" in words and "l x 1.1" in words
+
+
+def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
+    """Beside a steep valley, a thousandth of the other parameter is what keeps the objective where it is."""
+    turn = np.array([[0.0178, 0.9998], [0.9998, -0.0178]])
+    problem = Quadratic(turn.T @ np.diag([2000.0, 0.01]) @ turn, [0.5, 0.5], names=("controller.k", "controller.k1"))
+    problem.bounds = [
+        tuning.Bound("controller.k", 0.001, 50.0, "log", "1/s"),
+        tuning.Bound("controller.k1", 0.0, 5.0, "linear", "-"),
+    ]
+    best = problem.point(np.array([0.5, 0.5]))
+    words = evidence.flat_words(problem, evidence.curvature(problem, Search(problem, best, lambda s: None), best))
+    said = re.fullmatch(
+        r"flattest direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective by (\S+) %", words
+    )
+    assert said, words
+    ratio, change, percent = map(float, said.groups())
+    by_hand = [b.to_unit(v) for b, v in zip(problem.bounds, (ratio * np.sqrt(0.001 * 50.0), 2.5 + change))]
+    assert 100 * (problem.point(np.array(by_hand)).cost / best.cost - 1) == pytest.approx(percent, rel=0.05)  # said to two digits
+    alone = np.array([by_hand[0], 0.5])
+    assert 100 * (problem.point(alone).cost / best.cost - 1) > 10 * percent
 
 
 def test_directions_that_limits_hold_are_left_out():

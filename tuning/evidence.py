@@ -1,6 +1,7 @@
 """What is said of an answer besides the answer: what it feels, where it is flat, what it is the mirror of, how it does on rigs unseen."""
 
 import dataclasses
+import math
 
 import jax
 import numpy as np
@@ -41,8 +42,8 @@ def curvature(problem, search, point):
 
     By differences of the exact gradient. Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
     [{name: component}, ...] in the unit cube, "flattest": {...}}, where "flattest" is a step along the first direction that moves its
-    largest component by 10 % (of the range, where the parameter is linear): {"factors": {name: ratio or change}, "changes_percent": of
-    the objective, run}.
+    largest component by 10 % (of the range, where the parameter is linear): {"factors": {name: ratio or change, as it is printed},
+    "changes_percent": of the objective, run with these very numbers}.
     """
     z, count = point.z, len(point.z)
     if count < 2 or count > LARGEST_CURVATURE or point.cost == 0.0:  # nothing is a share of an objective of 0
@@ -63,8 +64,8 @@ def curvature(problem, search, point):
         basis = rows[np.sum(sizes > 1e-9 * max(sizes[0], 1e-300)) :].T
     if not basis.shape[1]:
         return None
-    matrix = basis.T @ (0.5 * (np.array(columns) + np.array(columns).T)) @ basis
-    values, vectors = np.linalg.eigh(matrix)
+    matrix = 0.5 * (np.array(columns) + np.array(columns).T)
+    values, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
     directions = (basis @ vectors).T
     flat = directions[0] * np.sign(directions[0][np.argmax(np.abs(directions[0]))])
     largest = int(np.argmax(np.abs(flat)))
@@ -73,27 +74,59 @@ def curvature(problem, search, point):
     step = step / flat[largest]
     if not 0 <= z[largest] + step * flat[largest] <= 1:
         step = -step
-    there = np.clip(z + step * flat, 0.0, 1.0)
+    factors, there = _told(problem.bounds, z, np.clip(z + step * flat, 0.0, 1.0), point.gradient / search.scale, matrix)
     costs, _ = problem.screen(np.array([z, there]))
-    factors = {}
-    for b, old, new in zip(problem.bounds, z, there):
-        before, after = float(b.from_unit(old)), float(b.from_unit(new))
-        factors[b.name] = after / before if b.scale == "log" else after - before
     return {
         "eigenvalues": values.tolist(),
         "directions": [dict(zip(problem.names, map(float, d))) for d in directions],
-        "flattest": {"factors": factors, "changes_percent": float(100 * abs(costs[1] / costs[0] - 1))},
+        "flattest": {
+            "factors": dict(zip((b.name for b in problem.bounds), factors)),
+            "changes_percent": float(100 * abs(costs[1] / costs[0] - 1)),
+        },
     }
+
+
+def _told(bounds, z, there, gradient, matrix):
+    """(factors, z of them) of the step from z to `there`, with as few decimals as leave what it changes, by the quadratic model, within
+    5 %: along a flat direction a component of 1e-4 can be what makes it flat, for the objective rises steeply beside it."""
+    model = lambda to: gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
+    for decimals in range(2, 9):
+        factors = [_rounded(b, float(old), float(new), decimals) for b, old, new in zip(bounds, z, there)]
+        rounded = np.array([_moved(b, float(old), factor) for b, old, factor in zip(bounds, z, factors)])
+        if abs(model(rounded) - model(there)) <= 0.05 * abs(model(there)):
+            break
+    return factors, rounded
+
+
+def _rounded(b, old, new, decimals):
+    """The ratio (a change, where the parameter is linear) that takes z = old to new, to so many decimals (of the range) within it."""
+    before, after = float(b.from_unit(old)), float(b.from_unit(new))
+    exact = after / before if b.scale == "log" else after - before
+    size = min(exact, 1.0) if b.scale == "log" else b.high - b.low
+    places = decimals - math.floor(math.log10(size))
+    factor, one = round(exact, places), 10.0**-places
+    for other in (round(factor - one, places), round(factor + one, places)):
+        if not 0 <= _moved(b, old, factor) <= 1 and 0 <= _moved(b, old, other) <= 1:
+            return other
+    return factor
+
+
+def _moved(b, old, factor):
+    """z after a ratio or a change; old itself where there is none."""
+    if factor == (1 if b.scale == "log" else 0):
+        return old
+    before = float(b.from_unit(old))
+    return float(b.to_unit(before * factor if b.scale == "log" else before + factor))
 
 
 def flat_words(problem, found):
     """The flattest direction as a sentence."""
     parts = []
     for b, factor in zip(problem.bounds, found["flattest"]["factors"].values()):
-        if b.scale == "log" and abs(factor - 1) > 5e-3:
-            parts.append(f"{b.name} x {factor:.3g}")
-        elif b.scale != "log" and abs(factor) > 5e-3 * (b.high - b.low):
-            parts.append(f"{b.name} {factor:+.2g} {b.unit}")
+        if b.scale == "log" and factor != 1:
+            parts.append(f"{b.name} x {factor:.10g}")
+        elif b.scale != "log" and factor != 0:
+            parts.append(f"{b.name} {factor:+.10g}{'' if b.unit == '-' else f' {b.unit}'}")
     if not parts:
         return ""
     together = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} with {parts[-1]}"
