@@ -16,10 +16,10 @@ import warnings
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.tree import split_index
+from jaxtank.tree import split_index, walk
 
 LIMITS = {"rk4": 2.785, "midpoint": 2.0}
-SEEN = 0.01  # share of a tank's height up to which a level may be thrown without a word
+SEEN = 0.01  # share of the levels that a run is about up to which one may be thrown without a word
 
 
 def film_rates(plant):
@@ -95,6 +95,7 @@ def check_run(loop, clock, run):
     shown = _seen(loop, clock)
     if not shown:
         return
+    least = _least_seen(loop, np.asarray(run.x))
     area, gain, dt = np.asarray(loop.plant.area), np.array(loop.plant.pump_gain, dtype=float), clock.dt
     for k, (name, _, _) in enumerate(loop.faults.windows if loop.faults else ()):
         field, (entry,) = split_index(name)
@@ -108,7 +109,7 @@ def check_run(loop, clock, run):
         inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in loop.disturbance.sample(clock)[0])
     gained = np.diff(x @ area) - dt * inflow[:-1]  # from nowhere
     for tank, _, remedy in shown:
-        bad = (gained > SEEN * area[tank] * loop.plant.rim[tank]) & (np.diff(x[:, tank]) > SEEN * loop.plant.rim[tank])
+        bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tank + 1}, which runs empty, threw its level up after "
@@ -117,8 +118,26 @@ def check_run(loop, clock, run):
 
 
 def _seen(loop, clock):
-    """Those of `_thrown` whose height shows."""
-    return [one for one in _thrown(loop, clock) if one[1] > SEEN * loop.plant.rim[one[0]]]
+    """Those of `_thrown` whose height shows; none where the levels that tell are traced."""
+    found = list(_thrown(loop, clock))
+    least = _least_seen(loop) if found else None
+    return [] if least is None else [one for one in found if one[1] > least[one[0]]]
+
+
+def _least_seen(loop, x=0.0):
+    """(n,) heights from which a throw shows: a share of the rim, or of the highest level of start, setpoint and the run's levels `x` where that
+    is lower, for a rim may be a limit far above all that happens. Of a run from empty tanks to nowhere, of the rim. None of traced levels."""
+    plant = loop.plant
+    highest = lambda v: float(np.max(v, initial=0.0, where=np.isfinite(v)))
+    try:
+        levels = [
+            v for _, v, meta in walk(loop.reference, units=plant.units) if meta["unit"] in (plant.units[0], "-")
+        ]  # "-": as of a Table
+        about = max(highest(np.abs(np.asarray(v, dtype=float))) for v in (loop.x0, *levels) if v is not None)
+        rim = np.asarray(plant.rim, dtype=float)
+        return SEEN * (rim if about <= plant.knee else np.minimum(rim, max(about, highest(x))))
+    except TypeError:  # what jax raises for a traced number
+        return None
 
 
 def _thrown(loop, clock):

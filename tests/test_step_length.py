@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 
+import jax
 import numpy as np
 import pytest
 
@@ -93,11 +94,68 @@ def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, ca
     assert "tank 1 runs empty in 2 s, within one step" in capsys.readouterr().err
 
 
+DEEP = """
+[[tank]]
+area = 1.0
+rim = {rim}
+drain = 0.5
+level = 20.0
+[[pump]]
+gain = 1.0
+to = 1
+high = 10.0
+initial = 1.0
+[law]
+kind = "open-loop"
+[reference]
+initial = [{setpoint}]
+[values]
+"clock.dt" = {dt}
+"clock.duration" = 20.0
+"""
+
+
+@pytest.mark.parametrize(("rim", "dt"), [(1e4, 0.1), (1e3, 0.06), (1e3, 0.07), (1e3, 0.08), (40.0, 0.06)])
+def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
+    """The tank empties from 20 cm and is thrown up by centimetres, whether its rim is at 40 cm or, as a mere limit, at 100 m."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        case = rig.loads(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
+        run = jaxtank.simulate(case.loop, case.clock)
+        assert np.diff(np.asarray(run.x)[:, 0]).max() > 3.0
+        (sentence,) = step_length.doubts(case.loop, case.clock)
+        assert "tank 1 runs empty faster than the steps follow" in sentence
+        with pytest.raises(InputError, match=r"threw its level up after t = 0\.3"):
+            step_length.check_run(case.loop, case.clock, run)
+        (tmp_path / "deep.toml").write_text(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
+        assert cli.main(["simulate", str(tmp_path / "deep.toml")]) == 2
+        assert "threw its level up" in capsys.readouterr().err
+
+
+def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
+    """The setpoint counts where the tank starts empty; with neither, the rim alone is left. Traced levels tell nothing, and stop nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        high, low = (rig.loads(DEEP.format(rim=1e4, dt=0.1, setpoint=r)) for r in (1e4, 1.0))
+        empty = dataclasses.replace(low.loop, x0=np.zeros(1))
+        nowhere = jaxtank.with_values(empty, {"reference.initial": 0.0})
+        assert [bool(step_length.doubts(loop, low.clock)) for loop in (high.loop, low.loop, empty, nowhere)] == [
+            False,
+            True,
+            True,
+            False,
+        ]
+        error = lambda x0: jaxtank.evaluate(dataclasses.replace(low.loop, x0=x0), low.clock, ["rms_error_total"])["rms_error_total"]
+        slope = jax.jit(jax.grad(error))
+        assert slope(low.loop.x0).shape == (1,)
+
+
+@pytest.mark.parametrize("rim", [20.0, 1e4])
 @pytest.mark.parametrize("case", ["fed", "empty", "fault", "pour"])
-def test_a_run_that_is_right_is_not_refused(case):
+def test_a_run_that_is_right_is_not_refused(case, rim):
     """The film is too fast for the steps, and yet nothing was thrown up: the tank is fed all the time, or starts empty and fills, or more comes
     in than its pump brings."""
-    text = ONE.format(drain=0.4).replace("initial = 0.0", "initial = 6.0")
+    text = ONE.format(drain=0.4).replace("initial = 0.0", "initial = 6.0").replace("rim = 20.0", f"rim = {rim}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_length.StepWarning)
         loop = rig.loads(text).loop
