@@ -11,9 +11,16 @@ from jaxtank.errors import InputError
 
 LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 
+LOCK = ".jaxtank.lock"
+"""What a run leaves in its folder while it lasts, and after a kill."""
 
 ASIDE = ".jaxtank"
 """How the names of files end that are not yet whole."""
+
+
+def untouched(folder):
+    """True of a folder in which nothing was written but that a run had begun."""
+    return os.path.isdir(folder) and set(os.listdir(folder)) <= {LOCK}
 
 
 def write_atomic(path, data):

@@ -51,20 +51,30 @@ def solve(H, f, G, l, u, iterations=MOST):
     be collinear, and x is unique all the same. A problem without a feasible point gives a meaningless x: nothing is raised inside a trace.
     Differentiable in all five.
     """
-    return interior_point(*_scaled(H, f), G, l, u, iterations).x
+    unit, inside = _scaled(H, f, G, l, u)
+    return unit * interior_point(*inside, iterations).x
 
 
-def _scaled(H, f):
-    scale = jnp.trace(H) / H.shape[0]
-    return H / scale, f / scale
+def _scaled(H, f, G, l, u):
+    """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length 1, and a z of the order of 1, for what the
+    iterates begin and end with are plain numbers. The unit of x is the largest of the narrowest row, of the slope at 0, and of how far from there
+    the limits are."""
+    each = jax.lax.rsqrt(jnp.diagonal(H))
+    length = jnp.sqrt(jnp.sum((G * each) ** 2, axis=1))
+    length = jnp.where(length > 0.0, length, 1.0)
+    away = jnp.max(jnp.maximum(jnp.maximum(l, -u), 0.0) / length)
+    size = jnp.maximum(jnp.maximum(jnp.max(jnp.abs(f * each)), away), jnp.min((u - l) / length))
+    # held as they are: the answer does not depend on them but for what the corners are rounded by
+    each, length, size = jax.lax.stop_gradient((each, length, size))
+    row = 1.0 / (length * size)
+    return size * each, (H * jnp.outer(each, each), f * each / size, G * (each / length[:, None]), l * row, u * row)
 
 
 @solve.defjvp
 def _slope(iterations, primals, tangents):
-    (H, f), (dH, df) = jax.jvp(_scaled, primals[:2], tangents[:2])
-    data, moved = (H, f, *primals[2:]), (dH, df, *tangents[2:])
+    (unit, data), (_, moved) = jax.jvp(_scaled, primals, tangents)
     found = _held(interior_point(*jax.lax.stop_gradient(data), iterations), *data)
-    return found.x, _implicit(found, data, moved)
+    return unit * found.x, unit * _implicit(found, data, moved)
 
 
 @jax.custom_jvp

@@ -738,7 +738,7 @@ def test_robust_tuning_from_the_command_line():
         (("uncertainty", CASE, "--shard", "3/2", "--out", "o"), "they are 1/2 to 2/2"),
         (("uncertainty", CASE, "--shard", "0/4", "--out", "o"), "they are 1/4 to 4/4"),
         (("uncertainty", CASE, "--shard", "1-4", "--out", "o"), "must be I/N"),
-        (("uncertainty", CASE, "--resume", "nothing"), "no ensemble to go on with"),
+        (("uncertainty", CASE, "--resume", "nothing"), "there is no such folder"),
         (("uncertainty", CASE, "--devices", "0"), "--devices '0'"),
         (("merge", CASE), "--out DIR"),
         (("merge", "."), "cannot be read"),

@@ -204,12 +204,12 @@ def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, c
         code, out, err = say([*SIMULATE, "--out", folder], capsys)
         assert code == 2 and out == "" and len(err) == 1
         assert f"process {process.pid}" in err[0] and "give another folder" in err[0]
-        assert time.monotonic() - began < 20 and [p.name for p in folder.iterdir()] == [holds.NAME]
+        assert time.monotonic() - began < 20 and [p.name for p in folder.iterdir()] == [files.LOCK]
         (folder / f".result.json.k3x{files.ASIDE}").write_text("half")
         (folder / ".mine").write_text("whole")
     with holds.hold(folder):  # its process was killed
-        assert {p.name for p in folder.iterdir()} == {holds.NAME, ".mine"}
-        assert int((folder / holds.NAME).read_text()) == os.getpid()
+        assert {p.name for p in folder.iterdir()} == {files.LOCK, ".mine"}
+        assert int((folder / files.LOCK).read_text()) == os.getpid()
     assert [p.name for p in folder.iterdir()] == [".mine"]
 
 
@@ -217,7 +217,7 @@ def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
     with another(tmp_path, "shared"):
         with holds.hold(tmp_path, shared=True):
             (tmp_path / f".part{files.ASIDE}").write_text("of the other")
-        assert (tmp_path / holds.NAME).exists() and (tmp_path / f".part{files.ASIDE}").exists()
+        assert (tmp_path / files.LOCK).exists() and (tmp_path / f".part{files.ASIDE}").exists()
         with pytest.raises(InputError, match="another run"), holds.hold(tmp_path):
             pass
 
@@ -273,7 +273,7 @@ def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
     assert found["status"] == "interrupted" and "best point so far" in found["message"]
     evaluated = (tmp_path / "out" / memo.NAME).read_bytes().count(b"\n") - 1
     assert 0 < evaluated < 200 and found["evaluations"]["simulations"] > 0
-    assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / holds.NAME).exists()
+    assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / files.LOCK).exists()
 
 
 @pytest.mark.slow
@@ -281,7 +281,7 @@ def test_ctrl_c_before_anything_was_found(tmp_path):
     said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", 0)
     assert code == 130 and "interrupted" in said and "Traceback" not in said, said
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
-    assert holds.NAME not in left
+    assert files.LOCK not in left
 
 
 def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):

@@ -761,6 +761,11 @@ def test_every_case_passes_the_door():
         ({"controller.r_w": 0.0}, "must be above 0"),
         ({"controller.a": 1.0}, "must be at most"),
         ({"controller.rows": 50}, "at most controller.Np"),
+        ({"controller.u_high": 1.0, "actuator.initial": 3.0}, r"actuator.initial\[0\] = 3 U0: must lie within"),
+        (
+            {"controller.u_low": 3.5, "controller.u_high": 5.0, "actuator.initial": 3.6, "actuator.high": 2.0},
+            r"actuator.low\[0\] = 0 U0 to 2 U0: must meet",
+        ),
     ],
 )
 def test_errors_at_the_door(values, message):

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import tuning
+from jaxtank import files
 from jaxtank.errors import InputError
+from tuning import memo, parts
 from tuning.memo import NAME, Log, Memo
 
 FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
@@ -158,3 +160,23 @@ def test_the_command_killed_and_resumed(tmp_path, wait):
         assert {k: page[k] for k in SAME} == {k: alone[k] for k in SAME}
     assert json.loads((tmp_path / "run" / "result.json").read_text())["parameters"] == alone["parameters"]
     assert not (tmp_path / "run" / NAME).exists()
+
+
+@pytest.mark.parametrize("command", ["tune", "uncertainty"])
+def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
+    """All that it left is its lock: there is nothing to lose, and a script that runs or else resumes need not know. A folder that is not
+    there, or has anything else in it, is refused as before."""
+    (tmp_path / files.LOCK).write_text("123456\n")
+    assert files.untouched(tmp_path)
+    (tmp_path / "note.txt").write_text("mine")
+    assert not files.untouched(tmp_path)
+    with pytest.raises(InputError, match=r"evaluations\.jsonl|no ensemble"):
+        began(command, tmp_path)
+    (tmp_path / "note.txt").unlink()
+    began(command, tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} > {files.LOCK}  # and what it writes now
+
+
+def began(command, folder):
+    """Open the log, or the store of batches, of a run that goes on in `folder`."""
+    memo.Log(folder, {}, resume=True) if command == "tune" else parts.Store(folder, {}, resume=True)

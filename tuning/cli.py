@@ -62,7 +62,10 @@ def main(argv=None):
         if args.command is None:
             raise InputError("no command: try jaxtank --help")
         args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
-        with hold(folder_of(args), shared=getattr(args, "shard", None) is not None):
+        folder = folder_of(args)
+        if getattr(args, "resume", None) and not os.path.isdir(folder):
+            raise InputError(f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder")
+        with hold(folder, shared=getattr(args, "shard", None) is not None):
             code = COMMANDS[args.command](args)
         sys.stdout.flush()
         return code

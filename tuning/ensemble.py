@@ -243,7 +243,7 @@ def ensemble(
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
         manifest["told"] = shards.told(case, case.limits if limits is None else limits)
-        store = parts.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1)
+        store = parts.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1, anew=not merge)
     mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
     mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
     todo = [k for k in mine if store is None or not store.has(k)]

@@ -6,14 +6,13 @@ import time
 from pathlib import Path
 
 from jaxtank.errors import InputError
-from jaxtank.files import check_folder, sweep
+from jaxtank.files import LOCK, check_folder, sweep
 
 try:
     import fcntl
 except ImportError:  # no such locks on this system: two runs in one folder are then the user's own care
     fcntl = None
 
-NAME = ".jaxtank.lock"
 PATIENCE = 0.2
 """How long a lock may be in the way before it is a refusal [s]: one that lets go removes its file in less."""
 
@@ -40,7 +39,7 @@ def hold(folder, shared=False):
                 sweep(folder)
             yield
         finally:
-            _let_go(folder / NAME, file)
+            _let_go(folder / LOCK, file)
     finally:
         for path in made:  # the innermost first
             with contextlib.suppress(OSError):  # not empty
@@ -49,7 +48,7 @@ def hold(folder, shared=False):
 
 def _locked(folder, shared):
     """The open lock file of a folder, None where there are no locks."""
-    path, kind, until = folder / NAME, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
+    path, kind, until = folder / LOCK, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.files import refusal
+from jaxtank.files import refusal, untouched
 
 NAME = "evaluations.jsonl"
 LARGEST = 1 << 30
@@ -69,6 +69,8 @@ class Log(Memo):
                 raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} {why}, so it is no log of this program")
             data = self.path.read_bytes()
         except FileNotFoundError:
+            if untouched(self.path.parent):  # a kill came before the first line
+                return b""
             done = (self.path.parent / "result.json").exists()
             why = "that run had ended, and its answer is in result.json" if done else f"there is no {NAME}"
             raise InputError(f"--resume: {str(self.path.parent)!r} cannot be read as a search to go on with: {why}") from None

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.files import check_folder, refusal, write_atomic
+from jaxtank.files import check_folder, refusal, untouched, write_atomic
 
 MANIFEST = "manifest.json"
 LARGEST = 1 << 28
@@ -35,7 +35,7 @@ class Store:
     ensemble, and for one that holds batches where neither resume nor shared is True.
     """
 
-    def __init__(self, folder, manifest, resume=False, shared=False):
+    def __init__(self, folder, manifest, resume=False, shared=False, anew=True):
         check_folder(folder)
         self.folder = Path(folder)
         self.manifest = json.loads(json.dumps(manifest))
@@ -44,7 +44,7 @@ class Store:
             check_same(self.manifest, read_manifest(self.folder), self.folder)
             if not (resume or shared) and any(self.folder.glob("part-*.npz")):
                 raise InputError(f"{str(folder)!r} holds finished batches of this ensemble: --resume goes on with them")
-        elif resume and not path.exists():
+        elif resume and not path.exists() and not (anew and untouched(self.folder)):  # a kill came before the first file
             raise InputError(f"--resume {str(folder)!r}: there is no ensemble to go on with")
         if not path.exists():
             self._write(path, json.dumps(self.manifest, indent=1) + "\n")

@@ -45,5 +45,8 @@ class Controller(abc.ABC):
         """True if the law has an `input_metric`, so that its inputs can be allocated by box QP."""
         return type(self).input_metric is not Controller.input_metric
 
+    def check_pumps(self, actuator):  # noqa: B027
+        """Raise InputError for pumps whose limits, or whose input before t = 0, the law cannot work with."""
+
     def check(self, reference):  # noqa: B027  (a law with nothing to check need not say so)
         """Raise InputError if the law cannot serve this reference, or its model is not of the kind it inverts."""

@@ -130,6 +130,23 @@ class LinearPredictive(Controller):
     def track(self, state, tick, command, applied):
         return state._replace(u=applied)
 
+    def check_pumps(self, actuator):
+        """A quadratic programme that begins outside its range may have no answer."""
+        if self.mode != "constrained":
+            return
+        unit = self.model.units[1]
+        pumps = zip(*(np.asarray(v, dtype=float) for v in (self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high)))
+        for i, (low, high, before, bottom, top) in enumerate(pumps):
+            own = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
+            if not low <= before <= high:
+                raise InputError(
+                    f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a constrained law, {own}"
+                )
+            if bottom > high or top < low:
+                raise InputError(
+                    f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits of a constrained law, {own}"
+                )
+
     def check(self, reference):
         point, n, m = np.asarray(self.operating_point), self.model.tanks, self.model.pumps
         length = self.model.units[0]
