@@ -39,6 +39,7 @@ ABOVE = [
         "logs",
         "coordinates",
         "one_line",
+        "long_steps",
     },
     {"log_file", "playback"},
     {"experiments", "estimation", "identified"},

@@ -1,6 +1,7 @@
 """Steps too long for a tank that runs empty: told, against runs that do it; refused where nothing would be right."""
 
 import dataclasses
+import tomllib
 import warnings
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxtank
+import tuning
 from jaxtank import presets, rig, step_length
 from jaxtank.errors import InputError
 from jaxtank.plants.faults import faults
@@ -176,3 +178,70 @@ def test_many_tanks_are_one_sentence():
     with pytest.warns(step_length.StepWarning, match=r"^tank 3 .* \(and so do 1 more\)") as said:
         rig.loads(text)
     assert len([w for w in said if w.category is step_length.StepWarning]) == 1
+
+
+COLANDER = """
+[[tank]]
+area = 2.0
+rim = 20.0
+drain = 1.0
+level = 4.0
+[[pump]]
+gain = 60.0
+to = 1
+high = 12.0
+[law]
+kind = "pid"
+Kc = 0.5
+Ti = 0.2
+[reference]
+initial = [4.0]
+changes = [[2.0, 1, 12.0], [8.0, 1, {last}]]
+[values]
+"clock.dt" = 0.05
+"clock.duration" = 15.0
+"clock.substeps" = {substeps}
+[free]
+"controller.Kc" = [0.01, 10.0]
+[uncertain]
+"plant.pump_gain" = 0.05
+"""
+WRONG = "this answer's run is wrong, and so are its numbers: clock.dt = 0.05 s: steps too long to follow tank 1"
+DOUBT = "tank 1 runs empty faster than the steps follow"
+
+
+@pytest.mark.parametrize(("last", "substeps", "words"), [(0.2, 1, WRONG), (10.0, 1, DOUBT), (0.2, 6, None)])
+def test_an_answer_says_that_its_run_is_of_steps_too_long(last, substeps, words, tmp_path):
+    """Tuned to follow setpoints down to the bottom, not so far down, and with steps short enough; the first throws its tank up."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        case = rig.loads(COLANDER.format(last=last, substeps=substeps))
+        result = tuning.tune(case, starts=1, screening=2, iterations=2, validation=0)
+        result.save(tmp_path)
+    told = [repr(result), *((tmp_path / name).read_text() for name in ("result.json", "report.html"))]
+    if words is None:
+        assert not any("steps too long" in text or "runs empty" in text for text in told)
+    else:
+        assert result.message.startswith(words) and f"\n- {words}" in told[0]
+        assert all(words in text.replace("&#x27;", "'") for text in told)
+
+
+def test_an_answer_says_it_of_a_scenario_too():
+    """The case's own setpoints stay above the bottom; those of its second scenario do not."""
+    text = COLANDER.format(last=10.0, substeps=1)
+    low = {"name": "low", "values": {"reference.targets": [12.0, 0.2]}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        case = rig.from_table({**tomllib.loads(text), "scenario": [{"name": "high"}, low]})
+        result = tuning.tune(case, starts=1, screening=2, iterations=2, validation=0)
+    assert result.message.startswith(f"scenario low: {WRONG}")
+
+
+@pytest.mark.parametrize("substeps", [1, 6])
+def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        found = tuning.ensemble(rig.loads(COLANDER.format(last=0.2, substeps=substeps)), samples=8)
+        found.save(tmp_path)
+    told = [repr(found), *((tmp_path / name).read_text() for name in ("result.json", "report.html"))]
+    assert [DOUBT in text for text in told] == [substeps == 1] * 3

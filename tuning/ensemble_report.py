@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank import step_length
 from jaxtank.files import check_folder
 from tuning import page, parts, saving, search, tables
 from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
@@ -36,11 +37,20 @@ def json_of(ensemble):
     }
     if ensemble.method != "random":
         found["intervals"] = INTERVALS
+    if remarks := remarks_of(ensemble):
+        found["remarks"] = remarks
     if ensemble.infeasible is None:
         found["infeasible_reason"] = "the steady states of this rig have no closed form"
     if any(None in np.ravel(np.array(list(m.values()), dtype=object)) for m in found["measures"].values()):
         found["reason"] = "null: no finite number, as of a settling time where some draw never settles, or of a spread of one draw"
     return found
+
+
+def remarks_of(ensemble):
+    """Sentences on what to doubt of the draws: that steps are too long for the rig as it is, before anything is drawn."""
+    return [
+        f"of the rig as it is, and of draws like it: {line}" for line in step_length.doubts(ensemble.case.loop, ensemble.case.clock)
+    ]
 
 
 def text(ensemble):
@@ -91,6 +101,7 @@ def parts_of(ensemble):
     words.append(
         f"{int(ensemble.failed.sum())} runs left the numbers; they count as breaking every limit and are in no other figure"
     )
+    words += remarks_of(ensemble)
     if ensemble.infeasible is not None:
         words.append(
             f"{int(ensemble.infeasible.sum())} draws have a plateau without a steady state within rims and pumps; they are in all figures"
@@ -160,7 +171,7 @@ def page_of(ensemble, drawn, command=None):
     """The page report.html of an ensemble, with `drawn`, the figures of `figures`; command: the line that made it."""
     failed, broken = int(ensemble.failed.sum()), ensemble.violations() if ensemble.limits else []
     facts = [("draws", str(ensemble.samples)), ("runs that left the numbers", str(failed)), ("time", f"{ensemble.wall_s:.1f} s")]
-    said = []
+    said = remarks_of(ensemble)
     if broken:
         worst = max(broken, key=lambda v: v["probability"])
         low, high = worst["interval95"]

@@ -106,9 +106,9 @@ def constraint_rows(problem, table):
     return rows
 
 
-def message(result, z, felt, redone):
-    """One paragraph for people, parts joined by "; ": what was found, what is tight, what to doubt."""
-    words, problem, checked = [], result.problem, result.constraints
+def message(result, z, felt, redone, steps=()):
+    """One paragraph for people, parts joined by "; ": what was found, what is tight, what to doubt. steps: sentences on steps too long."""
+    words, problem, checked = list(steps), result.problem, result.constraints
     broken = [c for c in checked if c["margin"] < 0]
     if result.status == "not_converged" and broken:
         words.append(

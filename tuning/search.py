@@ -17,6 +17,7 @@ from jaxtank.errors import InputError
 from jaxtank.tree import get_value, with_values
 from tuning import evidence, scenarios
 from tuning.evidence import REPORTED
+from tuning.long_steps import of_answer
 from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
@@ -197,7 +198,7 @@ def tune(
         provenance=provenance(case, seed),
         problem=problem,
     )
-    result = result.replace(message=message(result, z, felt, redone))
+    result = result.replace(message=message(result, z, felt, redone, of_answer(problem, tuned, values, key)))
     if log is not None:
         problem.memo = problem.memo.memo()
     return result
