@@ -20,8 +20,9 @@ from test_physics import in_metres
 from jaxtank.analysis import steady_levels
 from jaxtank.invariants import scan
 from jaxtank.plants import Plant
-from jaxtank.plants.network import network
+from jaxtank.plants.network import TankNetwork, network
 from jaxtank.stepping import integrate
+from jaxtank.tree import component
 
 STILL = np.zeros(SIZE)
 LONGEST = 2560
@@ -158,6 +159,32 @@ def test_no_level_and_no_input_lowers_another_tanks_rate(seed, tanks, kind):
 @jax.jit
 def slopes(plant, x, u):
     return jax.jacfwd(lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None)), argnums=(0, 1))(x, u)
+
+
+@jax.jit
+def both_ways(plant, x, u):
+    return plant.rates(x, u), jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None))
+
+
+@of_every_rig()
+def test_rates_by_vectors_are_those_tank_by_tank(seed, tanks, kind):
+    """What steady states are looked for with, below the knee and at equal levels too."""
+    plant, rng, pumps = random_rig(seed, tanks, kind)
+    for x in (levels(rng, tanks), levels(rng, tanks, -0.01, 0.02), np.full(SIZE, rng.uniform(0, RIM))):
+        vectors, scalars = both_ways(plant, x, voltages(rng, pumps))
+        np.testing.assert_allclose(vectors, scalars, rtol=1e-12, atol=1e-12)
+
+
+def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
+    @component
+    class Leaky(TankNetwork):
+        def derivative(self, t, x, u, d):
+            return tuple(rate - 1.0 for rate in super(Leaky, self).derivative(t, x, u, d))
+
+    plant = random_rig(0, 3, "series")[0]
+    leaky = Leaky(**{f.name: getattr(plant, f.name) for f in dataclasses.fields(plant)})
+    x, u = np.full(SIZE, 5.0), np.ones(plant.pumps)
+    np.testing.assert_allclose(leaky.rates(x, u), plant.rates(x, u) - 1.0, rtol=1e-12)
 
 
 def test_a_pump_that_draws_from_a_tank_is_told_apart():
