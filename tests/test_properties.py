@@ -179,7 +179,7 @@ def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
     @component
     class Leaky(TankNetwork):
         def derivative(self, t, x, u, d):
-            return tuple(rate - 1.0 for rate in super(Leaky, self).derivative(t, x, u, d))
+            return tuple(rate - 1.0 for rate in super().derivative(t, x, u, d))
 
     plant = random_rig(0, 3, "series")[0]
     leaky = Leaky(**{f.name: getattr(plant, f.name) for f in dataclasses.fields(plant)})
