@@ -1,6 +1,7 @@
 """What the page of an ensemble says, beside numbers worked out from its draws."""
 
 import dataclasses
+import importlib
 
 import numpy as np
 import pytest
@@ -72,3 +73,16 @@ def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
 
 def test_two_draws_have_a_spread(case):
     assert "spread:" not in repr(tuning.ensemble(case, samples=2, **OPTIONS))
+
+
+def test_a_fan_of_some_draws_says_of_which(case, monkeypatch):
+    from tuning import ensemble_report
+
+    monkeypatch.setattr(importlib.import_module("tuning.ensemble"), "FAN_DRAWS", 3)
+    for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):
+        found = tuning.ensemble(case, samples=samples, key=0)
+        drawn = ensemble_report.figures(found)
+        title = drawn["fan"].get_suptitle() or drawn["fan"].axes[0].get_title()
+        assert title == f"{case.name}: {words}"
+        for figure in drawn.values():
+            figure.clf()

@@ -849,3 +849,25 @@ def test_the_cascaded_tanks(cascaded):
     told = cascaded.estimation.predicted(cascaded.estimation.unknowns(cascaded.fit))[0, :, 0]
     y = cascaded.estimation.record.y[0, :, 0]
     assert np.sqrt(np.mean((told - y) ** 2)) == pytest.approx(cascaded.quality["rmse"][0], rel=1e-9)
+
+
+def test_one_parameter_that_no_reading_feels_is_named_and_what_to_do_is_said(tmp_path):
+    """Below the rims nothing is caught of an overflow."""
+    case = presets.find("cascaded/pi")
+    run = jaxtank.simulate(case.loop, case.clock, save_every=1)
+    low = np.asarray(run.x)[150:, 0].max()
+    assert low < 9.5  # [V], of 10
+    rows = zip(np.asarray(run.t)[150::4], np.asarray(run.u)[150::4, 0], np.asarray(run.x)[150::4, 1])
+    path = tmp_path / "low.csv"
+    path.write_text("t [s],pump1 [V],h2 [V]\n" + "".join(f"{t:g},{u:.6f},{h:.5f}\n" for t, u, h in rows))
+    words = ["identify", "cascaded/pi", "--data", str(path), "--starts", "1", "--quiet"]
+    words += ["--column", "t=t [s]", "--column", "pump1=pump1 [V]", "--column", "h2=h2 [V]"]
+    for free, advice in (
+        ([], "with --free NAME=LOW:HIGH what to estimate (all but plant.caught[0])"),
+        (["--free", "plant.pump_gain[0]=0.01:0.1", "--free", "plant.caught[0]=0:1"], "leave plant.caught[0] out of --free"),
+    ):
+        code, said, told = command(*words, *free)
+        assert code == 5 and told.count("\n") == 1 and advice in told
+        assert "cannot tell plant.caught[0]: no rig is written" in told
+        assert "the data cannot tell plant.caught[0]: " in " ".join(said.split()) and "What would tell it:" in said
+        assert "apart" not in told + said

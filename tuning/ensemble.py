@@ -183,7 +183,10 @@ def spread_of(case, share=None):
     """{name: distribution}: what the case calls uncertain, uniform, each entry on its own, and what was identified together by its
     covariance; share: one uniform spread for all of it, instead."""
     if not case.uncertain and case.covariance is None:
-        raise InputError(f"{case.name} names nothing uncertain: say what varies")
+        raise InputError(
+            f"{case.name} names nothing uncertain: say what varies with --vary NAME=DISTRIBUTION (as plant.drain=uniform:10%), with a table "
+            '[uncertain] in the rig file (as "plant.drain" = 0.1), or in Python with distributions'
+        )
     found = {name: Uniform(relative=own if share is None else share) for name, own in case.uncertain.items()}
     if case.covariance is not None:
         names, matrix = case.covariance
@@ -383,7 +386,8 @@ def _no_rest(loop, values, plateaus):
 
 
 def _fan(case, values, seed):
-    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws"}: quantiles 5, 25, 50, 75, 95 % at fixed times."""
+    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that are finite, "of" how many}: quantiles
+    5, 25, 50, 75, 95 % at fixed times."""
     every, lanes = max(1, (case.clock.samples - 1) // FAN_ROWS), 64
     size, found = len(next(iter(values.values()))), []
     for start in range(0, size, lanes):
@@ -403,6 +407,7 @@ def _fan(case, values, seed):
         "x": np.quantile(x[good], cuts, axis=0),
         "u": np.quantile(u[good], cuts, axis=0),
         "draws": int(good.sum()),
+        "of": size,
     }
 
 

@@ -154,10 +154,18 @@ def figures(ensemble):
 
     drawn = {}
     if ensemble.fan is not None:
-        drawn["fan"] = plotting.fan(ensemble.case.loop, ensemble.fan, f"{ensemble.case.name}: {ensemble.fan['draws']} draws")
+        drawn["fan"] = plotting.fan(ensemble.case.loop, ensemble.fan, f"{ensemble.case.name}: {drawn_of(ensemble)}")
     if ensemble.limits:
         drawn["violations"] = plotting.violations(ensemble.violations(), ensemble.samples)
     return drawn | pictures.rig(ensemble.case.loop, None, ensemble.case.name)
+
+
+def drawn_of(ensemble):
+    """Which draws the fan is of, in words: the first are kept whole, and of these the ones that stayed finite."""
+    first, kept = ensemble.fan["of"], ensemble.fan["draws"]
+    whole = f"{first} draw{'' if first == 1 else 's'}"
+    of = f"the first {first} of {ensemble.samples} draws" if first < ensemble.samples else whole
+    return of if kept == first else f"{kept} of {of}, the rest left the numbers"
 
 
 CAPTIONS = {

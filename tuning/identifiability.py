@@ -352,7 +352,8 @@ def remedies(estimation, fit, spread):
             found.append(f"{words} (largest standard deviation of a direction {100 * sd:.2g} %)")
     names = [n for n in estimation.coordinates.names for d in spread.directions() if n in d["parameters"]]
     if names:
-        found.append(f"measure one of them by itself, as {names[0]}, and leave it out of --free")
+        which = names[0] if len(set(names)) == 1 else f"one of them by itself, as {names[0]},"
+        found.append(f"measure {which} and leave it out of --free")
     return found
 
 

@@ -70,7 +70,7 @@ def run(args):
             raise InputError(f"{option} {given!r}: is of an experiment that is planned, with --plan")
     if not args.data:
         raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
-    from tuning import tables
+    from tuning import identify_report, tables
     from tuning.identify import identify
     from tuning.log_file import read_log
     from tuning.memo import discard
@@ -123,11 +123,20 @@ def run(args):
         print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in written), file=sys.stderr)
         tell_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
-        words = "; ".join(d["words"] for d in found.directions)
-        print(f"jaxtank: {printable(', '.join(args.data))}: cannot tell apart {words}: no rig is written", file=sys.stderr)
+        words = "; ".join(f"cannot tell {identify_report.untold(d)}" for d in found.directions)
+        print(f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written; {_advice(found, free)}", file=sys.stderr)
     elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
         print(f"go on with: jaxtank tune {printable(args.out.rstrip('/'))}/rig.toml --robust cvar", file=sys.stderr)
     return STATUS[found.status]
+
+
+def _advice(found, free):
+    """What to do about parameters that the data cannot tell."""
+    alone = [n for d in found.directions if len(d["parameters"]) == 1 for n in d["parameters"] if n in found.parameters]
+    if free is None:
+        which = f"all but {', '.join(alone)}" if alone else "fewer than the usual"
+        return f"say with --free NAME=LOW:HIGH what to estimate ({which}), or take a log that moves {'it' if len(alone) == 1 else 'them'}"
+    return f"leave {', '.join(alone)} out of --free" if alone else "free fewer, or take a log that moves them"
 
 
 def run_interruptibly(args):

@@ -21,6 +21,12 @@ def channel_names(found):
     return [(f"h{tank + 1}", "V" if volts else length) for tank, volts in found.estimation.record.channels]
 
 
+def untold(direction):
+    """What the data leave open: one parameter (its name), or several that stand in for each other ("apart", by how much)."""
+    names = list(direction["parameters"])
+    return names[0] if len(names) == 1 else f"apart {direction['words']}"
+
+
 def message(found):
     """How it ended, in words."""
     words, names = [], channel_names(found)
@@ -35,7 +41,8 @@ def message(found):
     if found.status == "not_converged" and found.fit.status <= 0:
         words.append("the best search had not converged when its iterations ended: more of them with --iterations")
     for d in found.directions:
-        words.append(f"the data cannot tell apart: {d['words']} changes no reading that could be seen")
+        whom = next(iter(d["parameters"])) if len(d["parameters"]) == 1 else "apart"
+        words.append(f"the data cannot tell {whom}: {d['words']} changes no reading that could be seen")
     if found.status == "not_identifiable":
         words.append("of the values that fit alike some near to the case's own are printed")
     agree = sum(s["agrees"] for s in found.starts)
@@ -102,7 +109,10 @@ def parts_of(found):
     if found.validation:
         lines += ["", *_validation(found)]
     if found.remedies:
-        lines += ["", "What would tell them apart:"] + [f"- {w}" for w in found.remedies]
+        alone = all(len(d["parameters"]) == 1 for d in found.directions)
+        whom = "it" if alone and len(found.directions) == 1 else "them" if alone else "them apart"
+        lines += ["", f"What would tell {whom}:"]
+        lines += [f"- {w}" for w in found.remedies]
     if found.profile:
         p = found.profile
         unit = "" if p["unit"] == "-" else f" {p['unit']}"

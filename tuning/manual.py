@@ -75,12 +75,16 @@ def json_of(case):
     }
 
 
+def _count(number, thing):
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
 def text(case):
     """The page of `jaxtank show`."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
     outputs = ", ".join(f"h{i + 1}{manual_parts.own_name(case, 'tank', i)}" for i in loop.plant.outputs)
-    parts += _chapter(f"The rig: {loop.plant.tanks} tanks, {loop.plant.pumps} pumps; controlled: {outputs}")
+    parts += _chapter(f"The rig: {_count(loop.plant.tanks, 'tank')}, {_count(loop.plant.pumps, 'pump')}; controlled: {outputs}")
     parts += [
         line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
     ]

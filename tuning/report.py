@@ -119,11 +119,12 @@ def parts_of(result):
     parts += _scenario_table(result) + _validation_table(result) + _choice_table(result) + _tradeoff_table(result)
     if result.bound is not None:
         parts += [result.bound.text(), ""]
-    rims = (
-        "rims are physics: liquid past them is lost"
-        if result.tuned.loop.plant.overflow
-        else "rims are limits: a level may rise past one"
-    )
+    if result.tuned.loop.plant.overflow:
+        rims = "rims are physics: liquid past them is lost"
+    elif any(limit.measure == "max_level" for limit in result.problem.limits):
+        rims = "rims are limits: a level may rise past one"
+    else:
+        rims = "rims are neither physics nor limits here: a level may rise past one, and nothing holds it"
     return [*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s"]
 
 
@@ -185,13 +186,14 @@ def _scenario_table(result):
             s["name"],
             number(s["weight"], 3),
             *(number(s["objective"][k]) if s["objective"][k] is not None else "-" for k in ("before", "after")),
-            "yes" if s["limits_held"]["after"] else "no",
+            ("yes" if s["limits_held"]["after"] else "no") if result.problem.limits else "-",
         ]
         for s in (worst[:COSTLIEST] if many else scenarios)
     ]
     head = ["scenario", "weight", "objective before", "after", "limits held after"]
     held = sum(s["limits_held"]["after"] for s in scenarios)
-    more = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios; limits held after in {held}"] if many else []
+    kept = f"; limits held after in {held}" if result.problem.limits else ""
+    more = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{kept}"] if many else []
     return [table(rows, head), *more, ""] if rows else []
 
 
@@ -213,6 +215,8 @@ def _validation_table(result):
     if not rows:
         return [f"held-out runs: all {found['samples']} failed", ""]
     head = [f"on {found['samples']} held-out runs", "mean objective", "5 %", "median", "95 %", "all limits held in"]
+    if not result.problem.limits:  # nothing to hold
+        head, rows = head[:-1], [row[:-1] for row in rows]
     failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
     share = f"{_better(found)}; perturbed: {spread}{noise}{failed}"
     return [table(rows, head), share, ""]

@@ -49,7 +49,8 @@ def pngs(drawn):
 
 
 def save_run(case, run, payload, folder, gif=False):
-    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`."""
+    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`, from which the run.gif of an
+    earlier one is removed."""
     from jaxtank import plotting
 
     check_folder(folder)
@@ -64,7 +65,13 @@ def save_run(case, run, payload, folder, gif=False):
 
         with tempfile.TemporaryDirectory() as aside:
             files["run.gif"] = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
-    return write_files(Path(folder), files)
+    # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
+    old = Path(folder) / "run.gif"
+    stale = not gif and (Path(folder) / "trajectory.csv").exists() and old.is_file()
+    written = write_files(Path(folder), files)
+    if stale:
+        old.unlink()
+    return written
 
 
 def write_files(folder, files):
