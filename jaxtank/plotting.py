@@ -18,6 +18,7 @@ BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
 WATER, GLASS = "#9CCEEB", "0.35"
 """What is in a tank and what it is made of, in drawings of a rig."""
 
+COLUMNS, SHOWN = 4, 16  # panels side by side; tanks between pumps and outputs that are drawn
 PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
 """One colour for each pump and its pipework, of the same colour-blind safe set."""
 
@@ -112,6 +113,10 @@ def responses(loop, trajectories, title="", limits=None):
     drawn = {name: (run, *style) for (name, run), style in zip(trajectories.items(), styles)}
     outputs = list(loop.plant.outputs)
     others = [i for i in range(loop.plant.tanks) if i not in outputs]
+    if len(others) > SHOWN:
+        near = {i: max(float(np.max(run.x[:, i])) for run in trajectories.values()) / _at(loop.plant.rim, i) for i in others}
+        title += f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
+        others = sorted(sorted(others, key=near.get)[-SHOWN:])
     length, drive = loop.units
     rows = [
         [
@@ -125,7 +130,7 @@ def responses(loop, trajectories, title="", limits=None):
             for j in range(loop.plant.pumps)
         ],
     ]
-    rows = [row for row in rows if row]
+    rows = [row[i : i + COLUMNS] for row in rows for i in range(0, len(row), COLUMNS)]
     columns = max(len(row) for row in rows)
     width = max(4.6 * columns, 6.4)
     with styled():

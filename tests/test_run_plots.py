@@ -1,5 +1,7 @@
 """Pictures of what lies behind a run: the numbers in them are those of the run, and what matters is said."""
 
+from types import SimpleNamespace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -152,4 +154,18 @@ def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
     assert {
         i for i, ax in enumerate(panels) if any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
     } == labelled
+    plt.close(figure)
+
+
+def test_a_rig_of_many_tanks_is_drawn_on_one_page():
+    """Four panels side by side, and of thirty tanks between the sixteen that come nearest to their rims."""
+    n, t = 32, np.linspace(0.0, 10.0, 5)
+    plant = SimpleNamespace(tanks=n, pumps=2, outputs=(0, 31), rim=np.full(n, 10.0))
+    loop = SimpleNamespace(plant=plant, units=("cm", "V"), actuator=SimpleNamespace(low=np.zeros(2), high=np.full(2, 9.0)))
+    x = np.ones((5, 1)) * np.linspace(1.0, 9.0, n)
+    run = SimpleNamespace(t=t, x=x, r=x[:, [0, 31]], e=0.0 * x[:, [0, 31]], u=np.ones((5, 2)))
+    figure = plotting.responses(loop, {"run": run}, title="battery")
+    titles = [ax.get_title() for ax in figure.axes if ax.get_visible()]
+    assert [word for word in titles if word.startswith("tank ")] == ["tank 1", "tank 32", *[f"tank {i}" for i in range(16, 32)]]
+    assert figure.get_size_inches()[0] < 20 and "of the 30 tanks between, the 16" in figure.get_suptitle()
     plt.close(figure)
