@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tuning import cli
+from tuning import cli, identify_command, tune_command
 
 README = Path(__file__).parent.parent / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="the README is not beside the tests")
@@ -51,3 +51,10 @@ def test_commands_run(words, tmp_path_factory, monkeypatch, capsys):
 def test_the_picture_is_there_and_small():
     for name in re.findall(r"!\[.*?\]\((.*?)\)", README.read_text()):
         assert (README.parent / name).stat().st_size < 300_000
+
+
+def test_every_exit_code_is_told():
+    """Those of a search, of an identification, of refused input and of refused data."""
+    told = re.search(r"Exit codes: (.*?)\. Results", README.read_text(), re.DOTALL)[1]
+    codes = {int(code) for code in re.findall(r"(?:^|, )(\d+) ", told.replace("\n", " "))}
+    assert codes == {*tune_command.EXIT.values(), *identify_command.STATUS.values(), 2}
