@@ -57,3 +57,6 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
     assert cli.main(["simulate", str(file)]) == 2
     told = capsys.readouterr().err
     assert "needs Q" in told and "cm" not in told and told.count("\n") == 1
+    file.write_text(file.read_text().replace("R = [1.0]", "Q = [1.0, 1.0]"))
+    assert cli.main(["simulate", str(file)]) == 2
+    assert "needs R [1/(m^3/s)^2]" in capsys.readouterr().err

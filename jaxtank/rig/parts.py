@@ -13,6 +13,7 @@ from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
 from jaxtank.rig.words import static_value
 from jaxtank.signals import Ramps, ramps
 from jaxtank.tree import _short, number
+from jaxtank.units import local
 
 LAWS = {
     "pid": controllers.PID,
@@ -77,7 +78,7 @@ def component(kind, table, known, plant, offered):
         elif field.default is not dataclasses.MISSING:
             continue
         else:
-            unit = "" if meta.get("unit", "-") == "-" else f" [{meta['unit']}]"
+            unit = "" if meta.get("unit", "-") == "-" else f" [{local(meta['unit'], plant.units)}]"
             raise InputError(f"[{kind}] {table['kind']} needs {name}{unit}: {meta.get('doc', '')}")
         values[name] = _value(f"{kind}.{name}", value, field, plant)
     return cls(**values)
