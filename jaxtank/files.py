@@ -20,7 +20,7 @@ ASIDE = ".jaxtank"
 
 def untouched(folder):
     """True of a folder in which nothing was written but that a run had begun."""
-    return os.path.isdir(folder) and set(os.listdir(folder)) <= {LOCK}
+    return os.path.isdir(folder) and os.listdir(folder) == [LOCK]
 
 
 def write_atomic(path, data):
