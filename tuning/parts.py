@@ -31,8 +31,9 @@ def digest(arrays):
 class Store:
     """The finished batches of an ensemble in a folder, with a manifest that says what they are of.
 
-    Shards of one ensemble may share a folder: the manifest is the same for all. Raises InputError for a folder that holds another
-    ensemble, and for one that holds batches where neither resume nor shared is True.
+    Shards of one ensemble may share a folder: the manifest is the same for all. anew: resume may begin one of which a kill left nothing but
+    its lock. Raises InputError for a folder that holds another ensemble, for one that holds batches where neither resume nor shared is
+    True, and for one with nothing to resume.
     """
 
     def __init__(self, folder, manifest, resume=False, shared=False, anew=True):
