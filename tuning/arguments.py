@@ -14,22 +14,40 @@ def open_case(args):
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig, step_length
 
-    case = rig.open_case(args.case)
+    case, told = rig.open_case(args.case), []
     if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
-        for sentence in rig.doubts(case):
+        told = rig.doubts(case)
+        for sentence in told:
             print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
-    values = once("--set", [pair("--set", text, parse_value) for text in args.values]) or {}
-    if args.dt is not None:
-        if "clock.dt" in values:
-            raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
-        values["clock.dt"] = number("--dt", args.dt)
+    values = settings(args)
     clock, case = case.clock, rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
+    case, replaced = rig.overridden(case, values)
+    for name, scenarios in replaced.items() if args.command == "tune" and not args.scenario and not args.quiet else ():
+        print(f"jaxtank: note: --set {name} takes the place of the value of {_counted(scenarios)}", file=sys.stderr)
+    for sentence in () if args.quiet else rig.model_doubts(case):
+        if sentence not in told:
+            print(f"jaxtank: note: {sentence}", file=sys.stderr)
     if case.clock != clock and not args.quiet:
         for sentence in rig.clock_doubts(case.clock):
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
     for sentence in () if args.quiet else step_length.doubts(case.loop, case.clock):
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
     return case
+
+
+def settings(args):
+    """{name: value} of --set and --dt."""
+    values = once("--set", [pair("--set", text, parse_value) for text in args.values]) or {}
+    if args.dt is not None:
+        if "clock.dt" in values:
+            raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
+        values["clock.dt"] = number("--dt", args.dt)
+    return values
+
+
+def _counted(scenarios):
+    named = ", ".join(repr(printable(name)) for name in scenarios[:3]) + (", ..." if len(scenarios) > 3 else "")
+    return f"{len(scenarios)} scenario{'s' if len(scenarios) > 1 else ''} ({named})"
 
 
 def schedule(texts):

@@ -3,7 +3,7 @@
 import sys
 
 from jaxtank.errors import InputError
-from tuning.arguments import number, once, pair, parse_value, plain_number, whole
+from tuning.arguments import number, once, pair, parse_value, plain_number, settings, whole
 from tuning.one_line import printable
 
 
@@ -28,6 +28,7 @@ def limits_of(args, case):
 
 
 def scenarios_of(args):
+    from jaxtank import rig
     from jaxtank.presets import Scenario
 
     if not args.scenario:
@@ -37,6 +38,11 @@ def scenarios_of(args):
     found = []
     for i, text in enumerate(args.scenario):
         values = once("--scenario", [pair("--scenario", part, parse_value) for part in text.split(";") if part.strip()]) or {}
+        for name, value in values.items():
+            if any(rig.overlap(name, given) for given in settings(args)) and not rig.is_change(value):
+                raise InputError(
+                    f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of them, or a factor, as {name}=x1.1"
+                )
         seed = values.pop("seed", i)
         weight = values.pop("weight", 1.0)
         found.append(Scenario(values.pop("name", text), values, seed, weight))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtank import _xla, rig
 from jaxtank import loop as lp
 from jaxtank.derivatives import _sensitivities
-from jaxtank.errors import InputError
+from jaxtank.errors import EquilibriumError, InputError
 from jaxtank.presets.base import Scenario
 from jaxtank.tree import split_index, with_values
 
@@ -90,8 +90,11 @@ def lanes_of(case, scenarios, seed):
     total, found = sum(s.weight for s in scenarios), []
     for s in scenarios:
         try:
-            here = rig.set_values(case, s.values)
+            here = rig.set_scenario(case, s.values)
             lp.check(here.loop, here.clock, jax.random.key(0))
+        except EquilibriumError as error:
+            remedy = "give numbers in its place, or leave the scenario out"
+            raise InputError(f"scenario {s.name!r}: {error}; {remedy}") from None
         except InputError as error:
             raise InputError(f"scenario {s.name!r}: {error}") from None
         key = jax.random.fold_in(jax.random.key(seed), s.seed) if noisy(here) else None

@@ -2,7 +2,7 @@
 
 case = "gouta2015/backstepping"
 
-[values]                     # any parameter by its dotted name
+[values]                     # any parameter by its dotted name; controller.model.* and observer.model.* follow plant.* unless they are set
 "controller.k1" = 0.01
 "plant.area" = [21.2, 21.2, 21.2, 21.2]
 "clock.dt" = 0.01
@@ -63,14 +63,15 @@ h1 = "level 1 [mm]"
 name = "noisy"
 seed = 1
 weight = 2.0
-values = { "sensor.noise" = 0.02, "plant.pump_gain" = 7.5 }
+values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [5, 4, 3, 2] }  # relative to the case, or numbers;
+                             # also "by -0.5" (less), and "steady" for x0, actuator.initial and reference.initial
 """
 
 from jaxtank.presets.base import Case
 from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered, unreachable
-from jaxtank.rig.doubts import clock_doubts, doubts
+from jaxtank.rig.doubts import clock_doubts, doubts, model_doubts
 from jaxtank.rig.reading import from_table, load, loads, open_case
-from jaxtank.rig.values import has, set_and_schedule, set_values
+from jaxtank.rig.values import has, is_change, overlap, overridden, set_and_schedule, set_scenario, set_values
 from jaxtank.rig.words import toml
 from jaxtank.rig.writing import complete, dump, save, short
 
@@ -87,11 +88,16 @@ __all__ = [
     "dump",
     "from_table",
     "has",
+    "is_change",
     "load",
     "loads",
+    "model_doubts",
     "open_case",
+    "overlap",
+    "overridden",
     "save",
     "set_and_schedule",
+    "set_scenario",
     "set_values",
     "short",
     "toml",

@@ -12,6 +12,11 @@ from jaxtank.rig.keys import Key, Section, keys_of
 from jaxtank.signals import Constant, Ramps
 from jaxtank.tree import describe, get_value, is_component, parameters, walk
 
+RELATIVE = (
+    'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" (less), "0.02 if zero", and "steady" for '
+    "x0, actuator.initial and reference.initial"
+)
+
 
 def absent(loop, name, meta):
     """A value for an optional leaf that is not in use: the least one that is allowed, in the shape of the leaf that it goes with."""
@@ -190,7 +195,7 @@ def sections(case, have):
         ("name", {"unit": "-", "doc": "what reports call it"}, "noisy"),
         ("seed", {"unit": "-", "doc": "of its sensor noise"}, 1),
         ("weight", {"unit": "-", "doc": "in the mean over scenarios", "low": 0.0, "strict": True}, 1.0),
-        ("values", {"unit": "-", "doc": "what is different in it, by name"}, {"sensor.noise": 0.0}),
+        ("values", {"unit": "-", "doc": RELATIVE}, {"sensor.noise": 0.0}),
     ]
     add("[[scenario]]", rows, "A run that `tune` judges by, in the place of the case's own; as many as you like.")
     if not case.log:

@@ -10,7 +10,7 @@ from jaxtank.errors import InputError, unknown
 from jaxtank.files import read_text
 from jaxtank.rig import checks, parts, signals, tanks
 from jaxtank.rig.lexing import check_keys
-from jaxtank.rig.values import by_dotted_name, has, set_and_schedule
+from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
 from jaxtank.rig.words import name_of
 from jaxtank.tree import _short
 
@@ -83,7 +83,7 @@ def from_table(table):
     """The Case described by a table of the form of a rig file."""
     case = start_of(table)
     table = {**table, **{key: by_dotted_name(table[key], key) for key in ("values", "free", "uncertain") if key in table}}
-    case = set_and_schedule(case, table.get("values", {}), table.get("schedule", {}))
+    case = set_and_schedule(case, with_models(case.loop, table.get("values", {})), table.get("schedule", {}))
     if "limits" in table:
         case = case.replace(limits=checks.check_limits(case.loop, table["limits"]))
     if "objective" in table:

@@ -13,6 +13,7 @@ from jaxtank.rig.checks import unreachable
 from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of
 from jaxtank.rig.origin import origin_of, structures
 from jaxtank.rig.reading import start_of
+from jaxtank.rig.values import MODELS
 from jaxtank.rig.words import toml
 from jaxtank.signals import Ramps, Sum
 from jaxtank.tree import walk
@@ -144,6 +145,7 @@ def _values(case, base, tankwise, same):
         for name, value, _ in fields
         if not isinstance(value, tuple)
     }
+    plants = {n: toml(np.asarray(v).tolist()) for k in ("leaf", "static") for n, v, _ in walk(loop.plant, kind=k) if v is not None}
     described = ("reference.", "disturbance.", "faults.") if signals.steps(loop.reference) else ("disturbance.", "faults.")
     for name, value, meta in [*walk(loop), *walk(loop, kind="static")]:
         if (
@@ -154,23 +156,32 @@ def _values(case, base, tankwise, same):
             continue
         if value is not None and np.size(value) == 0:
             continue  # of a rig without pipes, say: there is nothing to set
-        part, _, rest = name.partition(".")
+        part = name.partition(".")[0]
         built = {"controller": "law" not in same, "observer": "observer" not in same, "plant": tankwise}.get(part, False)
         built = built or (tankwise and name in TANKWISE)
         value = None if value is None else np.asarray(value).tolist()
+        follows = _followed(name, plants)
         if value is None:
             if not (scheduled and part == "controller"):
                 groups.setdefault(part, []).append(Key(toml(name), examples.absent(loop, name, meta), meta, False))
+        elif follows is not None:  # the file's plant.* decides, and is written wherever it is not built
+            groups.setdefault(part, []).append(Key(toml(name), value, meta, follows != toml(value)))
         elif not built or known.get(name) != toml(value):
             groups.setdefault(part, []).append(Key(toml(name), value, meta))
-        elif rest.startswith("model."):
-            groups.setdefault(part, []).append(Key(toml(name), value, meta, False))
     clock = [Key(toml(f"clock.{k}"), getattr(case.clock, k), meta) for k, meta in CLOCK.items()]
     return [
         Section("[values]", []),
         *(Section("", keys, (PARTS[part],)) for part, keys in groups.items()),
         Section("", clock, (PARTS["clock"],)),
     ]
+
+
+def _followed(name, plants):
+    """The value in a file of the plant's parameter that `name`, of a model of controller or observer, follows; None of another name."""
+    for model in MODELS:
+        if name.startswith(model):
+            return plants.get(name.removeprefix(model))
+    return None
 
 
 def _tuning(case):
@@ -213,8 +224,8 @@ REACHABLE = {**BARE, "doc": "whether every plateau of the reference must have a 
 PARTS = {
     "plant": "plant: the rig as it is",
     "sensor": "sensor: what the computer sees of the levels",
-    "observer": "observer: what the law believes the levels are; observer.model is its own copy of the plant",
-    "controller": "controller: the law; controller.model is its own copy of the plant, and what it believes need not be what is",
+    "observer": "observer: estimates of the levels; observer.model.* follows plant.*, and a line below sets it apart",
+    "controller": "controller: the controller; controller.model.* follows plant.*, and a line below sets it apart, for a wrong model",
     "actuator": "actuator: the pumps",
     "reference": "reference",
     "x0": "start",

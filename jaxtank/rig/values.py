@@ -1,12 +1,25 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock."""
+"""Setting what a case has by dotted name: leaves, static fields, the clock; values of scenarios, relative to the case."""
 
 import dataclasses
+import re
+
+import numpy as np
 
 from jaxtank import scheduling
-from jaxtank.errors import InputError, unknown
+from jaxtank.analysis import equilibrium
+from jaxtank.errors import EquilibriumError, InputError, unknown
 from jaxtank.records import CLOCK_UNITS, check_clock
 from jaxtank.rig.words import is_numeric, plain, static_value, unit
-from jaxtank.tree import _short, check_value, describe, get_value, with_values
+from jaxtank.tree import _short, check_value, describe, get_value, split_index, walk, with_values
+
+MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
+"""Where controller and observer hold the plant's parameters, by the same names."""
+
+STEADY = ("x0", "actuator.initial", "reference.initial")
+"""What a scenario may have as "steady"."""
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_RELATIVE = re.compile(rf"(?:x\s*(?P<factor>{_NUMBER})|by\s+(?P<offset>{_NUMBER})|(?P<default>{_NUMBER})\s+if zero)")
 
 
 def by_dotted_name(table, where):
@@ -48,6 +61,117 @@ def set_values(case, values):
         check_value(name, get_value(loop, name), meta)
         case = case.replace(loop=loop)
     return case
+
+
+def with_models(loop, values):
+    """`values`, the plant's parameters among them set in the models of controller and observer too.
+
+    loop: ClosedLoop; values: {dotted name: value}. A model's parameter that is in `values` itself is left as it is given there.
+    """
+    names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
+    found = {}
+    for name, value in values.items():
+        inner = name.removeprefix("plant.")
+        if inner == name:
+            continue
+        for model in MODELS:
+            base = (model + inner).split("[")[0]
+            if base in names and base not in values:
+                found[model + inner] = value
+    plants = {name: value for name, value in values.items() if name.startswith("plant.")}
+    return {**plants, **{n: v for n, v in found.items() if n not in values}, **values}
+
+
+def set_scenario(case, values):
+    """A copy of `case` with the values of a Scenario, which may be relative to the case as it stands.
+
+    values: as in `set_values`, or a text for a number: "x1.3" (times 1.3), "by -0.5" (0.5 less, in the unit of the parameter), "0.02 if
+    zero" (0.02 where the case has 0 in every entry, else the case's own), and for x0, actuator.initial and reference.initial "steady"
+    (the steady state of the case's plant at the setpoints of t = 0). Raises InputError as `set_values` does and for another text,
+    EquilibriumError where there is no steady state.
+    """
+    found = {name: _absolute(case, name, value) for name, value in values.items()}
+    steady = [name for name in found if _is_steady(name, found[name])]
+    if steady:
+        here = set_values(case, {name: value for name, value in found.items() if name not in steady})
+        short = dataclasses.replace(here.clock, duration=here.clock.dt)
+        setpoints = [float(np.asarray(v)[0]) for v in here.loop.reference.sample(short)[0]]
+        try:
+            levels, inputs = equilibrium(case.loop.plant, setpoints)
+        except EquilibriumError as error:
+            raise EquilibriumError(f'{steady[0]} = "steady": {error}') from None
+        known = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
+        found |= {name: known[name] for name in steady}
+    return set_values(case, found)
+
+
+def overridden(case, values):
+    """(`case` whose scenarios have `values` in the place of their own, {name in `values`: names of the scenarios that had their own}).
+
+    values: {dotted name: value} that were set in the case afterwards. A factor ("x1.3") or an offset ("by -0.5") is applied to them and
+    stays.
+    """
+    scenarios, told = [], {}
+    for s in case.scenarios:
+        kept = {}
+        for name, value in s.values.items():
+            over = [n for n in values if overlap(n, name)] if not is_change(value) else []
+            for n in over:
+                told.setdefault(n, []).append(s.name)
+            if not any(n in (name, split_index(name)[0]) for n in over):
+                kept |= {name: value, **{n: values[n] for n in over}}  # an entry of an array, set after the array
+        scenarios.append(s._replace(values=kept))
+    return case.replace(scenarios=tuple(scenarios)), told
+
+
+def overlap(one, other):
+    """Whether two dotted names have an entry in common."""
+    return one == other or split_index(one)[0] == other or one == split_index(other)[0]
+
+
+def is_change(value):
+    """Whether the value of a scenario is a factor or an offset on the case's own."""
+    found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
+    return found is not None and found["default"] is None
+
+
+def _is_steady(name, value):
+    return name in STEADY and isinstance(value, str) and value.strip() == "steady"
+
+
+def _absolute(case, name, value):
+    """The value of a Scenario as a number where it is one relative to the case; any other, and "steady", as it is."""
+    own = _number_of(case, name) if isinstance(value, str) else None
+    if own is None or _is_steady(name, value):
+        return value
+    found = _RELATIVE.fullmatch(value.strip())
+    if found is None:
+        more = ', or "steady"' if name in STEADY else ""
+        raise InputError(
+            f"{name} = {_short(value)}: must be a number or a list of numbers{unit(_meta(case, name))}, or relative to the case's own: "
+            f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
+        )
+    own = np.asarray(own, dtype=float)
+    if found["factor"] is not None:
+        return (float(found["factor"]) * own).tolist()
+    if found["offset"] is not None:
+        return (own + float(found["offset"])).tolist()
+    return own.tolist() if np.any(own) else float(found["default"])
+
+
+def _number_of(case, name):
+    """The number or array that `name` is in a case, None where it is no number."""
+    if name.startswith("clock."):
+        value = getattr(case.clock, name.removeprefix("clock."), None)
+    elif _meta(case, name)["kind"] == "leaf":
+        return get_value(case.loop, name)
+    else:
+        value = next(v for n, v, _ in walk(case.loop, kind="static") if n == name.split("[")[0])
+    return value if is_numeric(value) and np.ndim(value) == 0 else None
+
+
+def _meta(case, name):
+    return {"unit": CLOCK_UNITS.get(name.removeprefix("clock."), "-")} if name.startswith("clock.") else describe(case.loop, name)
 
 
 def set_and_schedule(case, values, table):
