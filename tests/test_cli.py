@@ -416,6 +416,71 @@ def test_scenarios_choices_trade_off_and_bound_from_the_command_line(here):
     assert json.loads((here / "out" / "result.json").read_text(encoding="utf-8")) == found
 
 
+FIRST = ("--starts", "1", "--screening", "1", "--iterations", "1", "--validation", "0")
+NOISY = ("tune", "gouta2022/chadpc", "--set", "clock.duration=40", "--dt", "0.1", *FIRST, "--set", "sensor.noise=0.5")
+
+
+def test_what_is_set_holds_in_the_scenarios_of_the_case(here):
+    said = say(*NOISY, "--json", "--out", "out")
+    case = rig.set_values(presets.find("gouta2022/chadpc"), {"clock.duration": 40.0, "clock.dt": 0.1, "sensor.noise": 0.5})
+    key = jax.random.fold_in(jax.random.key(0), 1)
+    values = jaxtank.evaluate(case.loop, case.clock, list(case.objective), key)
+    cost = sum(w * float(np.sum(values[m])) for m, w in case.objective.items())
+    assert said.json["scenarios"][0]["objective"]["before"] == pytest.approx(cost, rel=1e-9)
+    assert "note: --set sensor.noise takes the place of the value of 1 scenario ('noise')" in said.err
+    assert all(not s.values for s in rig.load(here / "out" / "rig.toml").scenarios)
+
+
+def test_a_scenario_and_an_option_that_set_the_same_are_refused(here):
+    said = say(*NOISY, "--scenario", "sensor.noise=0.1", "--out", "out")
+    assert said.code == 2 and not said.out and not (here / "out").exists()
+    assert said.err == (
+        "jaxtank: --scenario 'sensor.noise=0.1' sets sensor.noise, which --set or --dt sets too: give one of them, or a factor, as "
+        "sensor.noise=x1.1\n"
+    )
+
+
+def test_numbers_of_a_file_are_kept_and_what_is_set_takes_their_place(here):
+    """Numbers of a [[scenario]] are its author's, --set those of whoever runs it; an entry is set after its array, a factor on what is set."""
+    text = f'case = "{CASE}"\n[[scenario]]\nname = "a"\n'
+    text += 'values = { "sensor.noise" = 0.1, "x0" = [1, 2, 3, 4], "plant.drain" = "x1.1" }\n'
+    (here / "rig.toml").write_text(text, encoding="utf-8")
+    assert rig.load("rig.toml").scenarios[0].values["sensor.noise"] == 0.1
+    said = done("init", "rig.toml", *setting("sensor.noise=0.3", "x0[1]=5", "plant.drain=0.4"), "--quiet")
+    (here / "set.toml").write_text(said.out, encoding="utf-8")
+    again = rig.load("set.toml")
+    lane = rig.set_scenario(again, again.scenarios[0].values).loop
+    assert lane.sensor.noise.tolist() == [0.3] * 4 and lane.x0.tolist() == [1.0, 5.0, 3.0, 4.0]
+    assert lane.plant.drain.tolist() == [1.1 * 0.4] * 4
+
+
+def test_the_model_of_a_file_follows_its_plant(here):
+    """Whoever edits plant.* of the file that `init` prints simulates and tunes with a right model; a wrong one is reported."""
+    text = done("init", "mirakhorli/sfc").out
+    edited = text.replace('"plant.pump_gain" = [27.43, 19.55]', '"plant.pump_gain" = [35.0, 25.0]')
+    wrong = edited.replace('#"controller.model.pump_gain"', '"controller.model.pump_gain"')
+    assert len({text, edited, wrong}) == 3
+    (here / "rig.toml").write_text(edited, encoding="utf-8")
+    (here / "wrong.toml").write_text(wrong, encoding="utf-8")
+    both = setting("plant.pump_gain=[35,25]", "controller.model.pump_gain=[35,25]")
+    right = say("simulate", "mirakhorli/sfc", *both, *SHORT, "--json")
+    said = say("simulate", "rig.toml", *SHORT, "--json")
+    assert said.json["measures"] == right.json["measures"]
+    assert "controller.model" not in right.err and "controller.model" not in said.err
+    other = say("simulate", "wrong.toml", *SHORT, "--json")
+    assert other.json["measures"]["rms_error_total"] > 1.2 * said.json["measures"]["rms_error_total"]
+    assert other.err.count("note: controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]") == 1
+    assert "more than [uncertain] has (5 %)" in other.err
+
+
+def test_a_plant_that_is_set_leaves_the_model_and_says_so():
+    said = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[35,25]"))
+    assert said.err.count("controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]") == 1
+    near = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[28,20]"))  # within 5 %
+    quiet = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[35,25]"), "--quiet")
+    assert "controller.model" not in near.err + quiet.err and not quiet.err
+
+
 def test_a_limit_that_cannot_be_met_ends_with_4_and_the_best_of_it(here):
     # the whole run asks for 8 cm and more from 20 s on; the short one starts above 2 cm
     for clock, limit in ((("--dt", "0.1"), 5.0), ((*SHORT, "--out", "out"), 2.0)):

@@ -698,6 +698,17 @@ def test_json_as_in_the_contract(identified):
     np.testing.assert_allclose(np.sqrt(np.diag(matrix)), sd)
 
 
+def test_what_is_identified_is_what_is_tuned_for(identified):
+    """Scenarios of the case are changes of the plant that was found, with the noise that was found, in model and plant."""
+    case = rig.load(identified[0] / "out" / "rig.toml")
+    gain, levels = case.loop.plant.pump_gain, jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[0]
+    assert gain[0] != 27.43 and np.array_equal(case.loop.controller.model.pump_gain, gain)
+    lanes = {lane.name: lane.case.loop for lane in tuning.Problem(case).lanes}
+    assert lanes["pump 1 +30 %"].plant.pump_gain.tolist() == [1.3 * gain[0], gain[1]]
+    np.testing.assert_array_equal(lanes["pump 1 -20 %"].x0, levels)
+    assert all(np.array_equal(loop.sensor.noise, case.loop.sensor.noise) for loop in lanes.values())
+
+
 def test_every_picture_says_of_which_rig_it_is(identified):
     page = (identified[0] / "out" / "report.html").read_text()
     for words in ("correlation of the estimates", "profile likelihood", "measured less simulated"):

@@ -138,8 +138,57 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
     assert case.loop.reference.changes == ((50.0, 1),) and case.loop.reference.ramp == 30.0
     np.testing.assert_array_equal(case.loop.reference.targets, [4.5])
     changed = {n for n, v in parameters(case.loop).items() if not np.array_equal(v, parameters(old.loop)[n])}
-    assert changed == {"plant.area", "reference.targets"}
+    assert changed == {"plant.area", "controller.model.area", "reference.targets"}  # the model is the plant's
     assert (case.clock, case.limits, case.free) == (old.clock, old.limits, old.free)
+
+
+@pytest.mark.parametrize("name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"])
+def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
+    """Controller and observer; entries too. A file written of a case with a wrong model has the model, and reads back as it was."""
+    case = presets.find(name)
+    text = f'case = "{name}"\n[values]\n"plant.pump_gain" = 1.5\n"plant.drain[0]" = 0.25\n'
+    loop = rig.loads(text).loop
+    models = [m for m in (loop.controller.model, getattr(loop.observer, "model", None)) if m is not None]
+    for model in models:
+        assert np.all(model.pump_gain == 1.5) and model.drain[0] == 0.25
+        np.testing.assert_array_equal(model.drain, loop.plant.drain)
+    apart = rig.loads(text + '"controller.model.drain[0]" = 0.125\n').loop
+    assert apart.controller.model.drain[0] == 0.125 and apart.plant.drain[0] == 0.25
+    assert "model." not in rig.dump(case)
+    wrong = rig.set_values(case, {"plant.pump_gain": 1.5})
+    assert_same(rig.loads(rig.dump(wrong)), wrong)
+    assert len([s for s in rig.doubts(wrong) if "model.pump_gain" in s]) == len(models)
+
+
+def test_a_model_of_a_rig_of_ones_own_follows_what_is_set(tmp_path):
+    text = """
+[[tank]]
+area = 10.0
+rim = 20.0
+drain = 0.2
+[[pump]]
+gain = 3.0
+to = 1
+high = 10.0
+[law]
+kind = "ngpc"
+Tp = 10.0
+[values]
+"plant.drain" = 0.3
+"""
+    case = rig.loads(text)
+    assert case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3 and rig.doubts(case) == []
+    wrong = rig.set_values(case, {"controller.model.drain": 0.2})
+    assert_same(rig.loads(rig.dump(wrong)), wrong)
+    assert len(rig.doubts(wrong)) == 1
+
+
+def test_values_relative_to_the_case_are_written_as_they_are():
+    changes = {"plant.pump_gain[0]": "x1.3", "x0": "steady", "sensor.noise": "0.05 if zero", "plant.drain": "by -0.01"}
+    case = presets.find("mirakhorli/sfc")
+    case = case.replace(scenarios=(case.scenarios[1]._replace(values=changes),))
+    assert rig.loads(rig.dump(case)).scenarios == case.scenarios
+    assert rig.loads(rig.complete(case)).scenarios == case.scenarios
 
 
 def values(line):
@@ -423,7 +472,10 @@ def test_names_without_quotation_marks_are_dotted_names(gouta):
     case = rig.loads(text)
     assert_same(
         case.replace(free={}),
-        gouta("backstepping", {"clock.dt": 0.5, "controller.k": 0.5, "plant.area[1]": 20.0}).replace(free={}),
+        gouta(
+            "backstepping",
+            {"clock.dt": 0.5, "controller.k": 0.5, "plant.area[1]": 20.0, "controller.model.area[1]": 20.0},
+        ).replace(free={}),
     )
     assert set(case.free) == {"controller.k"} and case.uncertain == {"plant.drain": 0.1}
     assert dict(case.scenarios[0].values) == {"sensor.noise": 0.1}

@@ -132,7 +132,9 @@ def test_every_name_stands_in_the_file_with_its_unit_and_range():
 
 
 def test_the_short_file_has_what_differs_and_what_is_tuned():
-    case = rig.set_values(presets.find("gouta2015/backstepping"), {"plant.area[1]": 20.0, "plant.overflow": True})
+    own = {"plant.area[1]": 20.0, "plant.overflow": True}
+    model = {"controller.model.area[1]": 20.0, "controller.model.overflow": True}
+    case = rig.set_values(presets.find("gouta2015/backstepping"), own | model)
     text = rig.short(case)
     table = tomllib.loads(text)
     assert set(table["values"]) == {"plant.area", "plant.overflow"} and set(table) == {

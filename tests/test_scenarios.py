@@ -154,6 +154,111 @@ def test_minibatches_come_near_the_whole(case):
         tuning.tune(case, "slsqp", batch=2, **options)
 
 
+def lanes(case):
+    """{scenario: loop} of what `tune` judges a case by."""
+    return {lane.name: lane.case for lane in Problem(case).lanes}
+
+
+def test_scenarios_of_a_preset_are_changes_of_the_case_as_it_stands():
+    """A stronger pump is stronger than the pump of this rig, and a start from rest is at rest on it."""
+    own = {"plant.pump_gain": [35.0, 25.0], "plant.drain[0]": 0.6, "sensor.noise": 0.2, "reference.targets": 10.0}
+    case = rig.set_values(presets.find("mirakhorli/sfc"), {**own, "clock.duration": 200.0})
+    found = lanes(case)
+    gains = {name: found[name].loop.plant.pump_gain.tolist() for name in found if name.startswith("pump")}
+    assert gains == {
+        "pump 1 +30 %": [1.3 * 35.0, 25.0],
+        "pump 1 -20 %": [0.8 * 35.0, 25.0],
+        "pump 2 +30 %": [35.0, 1.3 * 25.0],
+    }
+    assert found["outlet 1 -10 %"].loop.plant.drain[0] == 0.9 * 0.6
+    levels, inputs = jaxtank.analysis.equilibrium(case.loop.plant, (10.0, 10.0))
+    for name, lane in found.items():
+        assert np.all(lane.loop.sensor.noise == 0.2)
+        assert lane.clock.duration == (200.0 if name == "own start" else 150.0)
+        np.testing.assert_array_equal(lane.loop.x0, np.zeros(4) if name == "own start" else levels)
+        np.testing.assert_array_equal(lane.loop.actuator.initial, np.zeros(2) if name == "own start" else inputs)
+
+
+def test_scenarios_of_a_preset_as_shipped_have_the_numbers_of_its_paper():
+    """To the last bit: 12 cm, 27.43 and 19.55 cm^3/(s V), 0.50265 cm^2, a split of 0.42; noise where the case has none."""
+    case = presets.find("mirakhorli/sfc")
+    found, (levels, inputs) = lanes(case), jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))
+    assert found["own start"].clock == case.clock and not np.any(found["own start"].loop.x0)
+    rest = [lane for name, lane in found.items() if name != "own start"]
+    for lane in rest:
+        assert lane.clock.duration == 300.0 and np.all(lane.loop.reference.initial == 12.0)
+        np.testing.assert_array_equal(lane.loop.x0, levels)
+        np.testing.assert_array_equal(lane.loop.actuator.initial, inputs)
+        assert lane.loop.controller.model.pump_gain.tolist() == [27.43, 19.55]  # the model stays
+    plants = [(*lane.loop.plant.pump_gain.tolist(), lane.loop.plant.drain[0], lane.loop.plant.split[0]) for lane in rest]
+    assert plants == [
+        (1.3 * 27.43, 19.55, 0.50265, 0.42),
+        (0.8 * 27.43, 19.55, 0.50265, 0.42),
+        (27.43, 1.3 * 19.55, 0.50265, 0.42),
+        (27.43, 19.55, 1.1 * 0.50265, 0.42),
+        (27.43, 19.55, 0.9 * 0.50265, 0.42),
+        (27.43, 19.55, 0.50265, 0.9 * 0.42),
+    ]
+    for name, noise in (("mirakhorli/sfc", 0.05), ("gouta2022/chadpc", 0.02), ("calofir/backstepping", 1e-3)):
+        assert all(np.all(lane.loop.sensor.noise == noise) for lane in lanes(presets.find(name)).values())
+
+
+def test_a_warm_case_is_tuned_from_its_warm_start():
+    case = presets.find("mirakhorli/sfc-warm")
+    start = lanes(case)["own start"].loop
+    np.testing.assert_array_equal(start.x0, jaxtank.analysis.equilibrium(case.loop.plant, (6.0, 6.0))[0])
+    assert np.all(start.reference.initial == 6.0) and np.all(start.actuator.initial > 0.0)
+
+
+@pytest.mark.parametrize(
+    "name, value, found",
+    [
+        ("plant.drain[0]", "x1.5", lambda own: 1.5 * own),
+        ("plant.drain", "x 0.5", lambda own: 0.5 * own),
+        ("x0", "by +0.25", lambda own: own + 0.25),
+        ("x0[1]", "by -0.5", lambda own: own - 0.5),
+        ("sensor.noise", "1e-2 if zero", lambda own: 0.01 + own),
+        ("plant.area", "1 if zero", lambda own: own),
+        ("reference.ramp", "x0.5", lambda own: 0.5 * own),
+        ("clock.duration", "x0.5", lambda own: 0.5 * own),
+    ],
+)
+def test_a_value_relative_to_the_case(case, name, value, found):
+    def of(one):
+        if name.startswith("clock."):
+            return one.clock.duration
+        return one.loop.reference.ramp if name == "reference.ramp" else jaxtank.tree.get_value(one.loop, name)
+
+    np.testing.assert_array_equal(of(rig.set_scenario(case, {name: value})), found(of(case)))
+
+
+@pytest.mark.parametrize(
+    "name, value, words",
+    [
+        ("plant.drain", "1.3x", r'plant.drain = .1.3x.: must be a number .*\[cm\^2\].*"x1.3" \(times\)'),
+        ("plant.drain", "xnan", "must be a number"),
+        ("plant.drain", "x-1", r"plant.drain\[0\] = -0.32.*at least 0 cm"),
+        ("plant.drain", "steady", "must be a number"),
+        ("plant.drian", "x1.1", "nearest: plant.drain"),
+        ("sensor.offset", "x1.1", "sensor.offset is not in use"),
+        ("clock.dt", "fast", r"clock.dt = 'fast': must be a number .*\[s\]"),
+        ("x0", "at rest", 'or "steady"'),
+    ],
+)
+def test_a_text_that_is_no_change_is_refused(case, name, value, words):
+    with pytest.raises(InputError, match=words):
+        rig.set_scenario(case, {name: value})
+
+
+def test_a_start_from_rest_where_there_is_none_is_refused():
+    """18 cm in one tank of the quadruple tank and 6 cm in the other ask for a pump that draws."""
+    case = rig.set_values(presets.find("mirakhorli/sfc"), {"reference.targets": [28.0, 2.0]}).replace(reachable=False)
+    again = rig.loads(rig.dump(case))  # the file can be read
+    assert again.scenarios == case.scenarios and not again.reachable
+    with pytest.raises(InputError, match=r"scenario 'pump 1 \+30 %': x0 = \"steady\": .*leave the scenario out"):
+        tuning.tune(again)
+
+
 @pytest.mark.parametrize(
     "scenarios, words",
     [
