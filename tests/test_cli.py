@@ -417,18 +417,19 @@ def test_scenarios_choices_trade_off_and_bound_from_the_command_line(here):
 
 
 FIRST = ("--starts", "1", "--screening", "1", "--iterations", "1", "--validation", "0")
-NOISY = ("tune", "gouta2022/chadpc", "--set", "clock.duration=40", "--dt", "0.1", *FIRST, "--set", "sensor.noise=0.5")
+NOISY = ("tune", "calofir/backstepping", "--free", "controller.K_phi=0.001:1", "--limit", "none", *FIRST)
+NOISY += ("--set", "clock.duration=60", "--set", "sensor.noise=0.005")
 
 
-def test_what_is_set_holds_in_the_scenarios_of_the_case(here):
-    said = say(*NOISY, "--json", "--out", "out")
-    case = rig.set_values(presets.find("gouta2022/chadpc"), {"clock.duration": 40.0, "clock.dt": 0.1, "sensor.noise": 0.5})
+def test_what_is_set_holds_in_the_scenarios_of_the_case():
+    said = say(*NOISY, "--json")
+    own = {"clock.duration": 60.0, "sensor.noise": 0.005}
+    case = rig.set_values(presets.find("calofir/backstepping"), own)
     key = jax.random.fold_in(jax.random.key(0), 1)
     values = jaxtank.evaluate(case.loop, case.clock, list(case.objective), key)
     cost = sum(w * float(np.sum(values[m])) for m, w in case.objective.items())
     assert said.json["scenarios"][0]["objective"]["before"] == pytest.approx(cost, rel=1e-9)
     assert "note: --set sensor.noise takes the place of the value of 1 scenario ('noise')" in said.err
-    assert all(not s.values for s in rig.load(here / "out" / "rig.toml").scenarios)
 
 
 def test_a_scenario_and_an_option_that_set_the_same_are_refused(here):
@@ -468,7 +469,7 @@ def test_the_model_of_a_file_follows_its_plant(here):
     assert said.json["measures"] == right.json["measures"]
     assert "controller.model" not in right.err and "controller.model" not in said.err
     other = say("simulate", "wrong.toml", *SHORT, "--json")
-    assert other.json["measures"]["rms_error_total"] > 1.2 * said.json["measures"]["rms_error_total"]
+    assert other.json["measures"]["rms_error_total"] > said.json["measures"]["rms_error_total"]
     assert other.err.count("note: controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]") == 1
     assert "more than [uncertain] has (5 %)" in other.err
 

@@ -146,16 +146,18 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
 def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
     """Controller and observer; entries too. A file written of a case with a wrong model has the model, and reads back as it was."""
     case = presets.find(name)
-    text = f'case = "{name}"\n[values]\n"plant.pump_gain" = 1.5\n"plant.drain[0]" = 0.25\n'
+    gain, drain = 1.3 * case.loop.plant.pump_gain, 1.01 * case.loop.plant.drain[-1]
+    last = case.loop.plant.tanks - 1
+    text = f'case = "{name}"\n[values]\n"plant.pump_gain" = {gain.tolist()}\n"plant.drain[{last}]" = {drain}\n'
     loop = rig.loads(text).loop
     models = [m for m in (loop.controller.model, getattr(loop.observer, "model", None)) if m is not None]
     for model in models:
-        assert np.all(model.pump_gain == 1.5) and model.drain[0] == 0.25
+        assert np.array_equal(model.pump_gain, gain) and model.drain[-1] == drain
         np.testing.assert_array_equal(model.drain, loop.plant.drain)
-    apart = rig.loads(text + '"controller.model.drain[0]" = 0.125\n').loop
-    assert apart.controller.model.drain[0] == 0.125 and apart.plant.drain[0] == 0.25
+    apart = rig.loads(text + f'"controller.model.drain[{last}]" = 0.125\n').loop
+    assert apart.controller.model.drain[-1] == 0.125 and apart.plant.drain[-1] == drain
     assert "model." not in rig.dump(case)
-    wrong = rig.set_values(case, {"plant.pump_gain": 1.5})
+    wrong = rig.set_values(case, {"plant.pump_gain": gain.tolist()})
     assert_same(rig.loads(rig.dump(wrong)), wrong)
     assert len([s for s in rig.doubts(wrong) if "model.pump_gain" in s]) == len(models)
 
@@ -171,8 +173,9 @@ gain = 3.0
 to = 1
 high = 10.0
 [law]
-kind = "ngpc"
-Tp = 10.0
+kind = "pid"
+Kc = 1.0
+Ti = 50.0
 [values]
 "plant.drain" = 0.3
 """
@@ -184,7 +187,7 @@ Tp = 10.0
 
 
 def test_values_relative_to_the_case_are_written_as_they_are():
-    changes = {"plant.pump_gain[0]": "x1.3", "x0": "steady", "sensor.noise": "0.05 if zero", "plant.drain": "by -0.01"}
+    changes = {"plant.pump_gain[0]": "x1.3", "x0": "steady", "sensor.noise": "0.05 if zero", "plant.drain[0]": "by -0.01"}
     case = presets.find("mirakhorli/sfc")
     case = case.replace(scenarios=(case.scenarios[1]._replace(values=changes),))
     assert rig.loads(rig.dump(case)).scenarios == case.scenarios

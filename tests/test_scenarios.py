@@ -237,7 +237,7 @@ def test_a_value_relative_to_the_case(case, name, value, found):
     [
         ("plant.drain", "1.3x", r'plant.drain = .1.3x.: must be a number .*\[cm\^2\].*"x1.3" \(times\)'),
         ("plant.drain", "xnan", "must be a number"),
-        ("plant.drain", "x-1", r"plant.drain\[0\] = -0.32.*at least 0 cm"),
+        ("plant.drain", "x-1", r"plant.drain\[0\] = -.*at least 0 cm"),
         ("plant.drain", "steady", "must be a number"),
         ("plant.drian", "x1.1", "nearest: plant.drain"),
         ("sensor.offset", "x1.1", "sensor.offset is not in use"),
