@@ -436,13 +436,14 @@ def test_a_scenario_and_an_option_that_set_the_same_are_refused(here):
     said = say(*NOISY, "--scenario", "sensor.noise=0.1", "--out", "out")
     assert said.code == 2 and not said.out and not (here / "out").exists()
     assert said.err == (
-        "jaxtank: --scenario 'sensor.noise=0.1' sets sensor.noise, which --set or --dt sets too: give one of them, or a factor, as "
-        "sensor.noise=x1.1\n"
+        "jaxtank: --scenario 'sensor.noise=0.1' sets sensor.noise, which --set or --dt sets too: give one of "
+        "them, or a factor, as sensor.noise=x1.1\n"
     )
 
 
 def test_numbers_of_a_file_are_kept_and_what_is_set_takes_their_place(here):
-    """Numbers of a [[scenario]] are its author's, --set those of whoever runs it; an entry is set after its array, a factor on what is set."""
+    """Numbers of a [[scenario]] are its author's, --set is of whoever runs it: an entry after its
+    array, a factor on what is set."""
     text = f'case = "{CASE}"\n[[scenario]]\nname = "a"\n'
     text += 'values = { "sensor.noise" = 0.1, "x0" = [1, 2, 3, 4], "plant.drain" = "x1.1" }\n'
     (here / "rig.toml").write_text(text, encoding="utf-8")
@@ -455,8 +456,11 @@ def test_numbers_of_a_file_are_kept_and_what_is_set_takes_their_place(here):
     assert lane.plant.drain.tolist() == [1.1 * 0.4] * 4
 
 
+APART = "controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]"
+
+
 def test_the_model_of_a_file_follows_its_plant(here):
-    """Whoever edits plant.* of the file that `init` prints simulates and tunes with a right model; a wrong one is reported."""
+    """Whoever edits plant.* of the file of `init` has a right model; a wrong one is reported."""
     text = done("init", "mirakhorli/sfc").out
     edited = text.replace('"plant.pump_gain" = [27.43, 19.55]', '"plant.pump_gain" = [35.0, 25.0]')
     wrong = edited.replace('#"controller.model.pump_gain"', '"controller.model.pump_gain"')
@@ -470,13 +474,13 @@ def test_the_model_of_a_file_follows_its_plant(here):
     assert "controller.model" not in right.err and "controller.model" not in said.err
     other = say("simulate", "wrong.toml", *SHORT, "--json")
     assert other.json["measures"]["rms_error_total"] > said.json["measures"]["rms_error_total"]
-    assert other.err.count("note: controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]") == 1
+    assert other.err.count(f"note: {APART}") == 1
     assert "more than [uncertain] has (5 %)" in other.err
 
 
 def test_a_plant_that_is_set_leaves_the_model_and_says_so():
     said = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[35,25]"))
-    assert said.err.count("controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]") == 1
+    assert said.err.count(APART) == 1
     near = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[28,20]"))  # within 5 %
     quiet = say("simulate", "mirakhorli/sfc", *SHORT, *setting("plant.pump_gain=[35,25]"), "--quiet")
     assert "controller.model" not in near.err + quiet.err and not quiet.err

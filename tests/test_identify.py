@@ -699,7 +699,7 @@ def test_json_as_in_the_contract(identified):
 
 
 def test_what_is_identified_is_what_is_tuned_for(identified):
-    """Scenarios of the case are changes of the plant that was found, with the noise that was found, in model and plant."""
+    """Scenarios of the case are changes of the plant that was found, with the noise found."""
     case = rig.load(identified[0] / "out" / "rig.toml")
     gain, levels = case.loop.plant.pump_gain, jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[0]
     assert gain[0] != 27.43 and np.array_equal(case.loop.controller.model.pump_gain, gain)

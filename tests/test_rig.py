@@ -144,7 +144,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
 
 @pytest.mark.parametrize("name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"])
 def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
-    """Controller and observer; entries too. A file written of a case with a wrong model has the model, and reads back as it was."""
+    """Controller and observer; entries too. A file written of a case with a wrong model has it."""
     case = presets.find(name)
     gain, drain = 1.3 * case.loop.plant.pump_gain, 1.01 * case.loop.plant.drain[-1]
     last = case.loop.plant.tanks - 1

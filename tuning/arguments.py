@@ -14,18 +14,20 @@ def open_case(args):
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig, step_length
 
-    case, told = rig.open_case(args.case), []
+    case, notes = rig.open_case(args.case), []
     if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
-        told = rig.doubts(case)
-        for sentence in told:
+        notes = rig.doubts(case)
+        for sentence in notes:
             print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values = settings(args)
     clock, case = case.clock, rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
     case, replaced = rig.overridden(case, values)
-    for name, scenarios in replaced.items() if args.command == "tune" and not args.scenario and not args.quiet else ():
-        print(f"jaxtank: note: --set {name} takes the place of the value of {_counted(scenarios)}", file=sys.stderr)
+    if args.command == "tune" and not args.scenario and not args.quiet:
+        for name, scenarios in replaced.items():
+            words = f"--set {name} takes the place of the value of {_counted(scenarios)}"
+            print(f"jaxtank: note: {words}", file=sys.stderr)
     for sentence in () if args.quiet else rig.model_doubts(case):
-        if sentence not in told:
+        if sentence not in notes:
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
     if case.clock != clock and not args.quiet:
         for sentence in rig.clock_doubts(case.clock):
@@ -46,8 +48,8 @@ def settings(args):
 
 
 def _counted(scenarios):
-    named = ", ".join(repr(printable(name)) for name in scenarios[:3]) + (", ..." if len(scenarios) > 3 else "")
-    return f"{len(scenarios)} scenario{'s' if len(scenarios) > 1 else ''} ({named})"
+    named = [repr(printable(name)) for name in scenarios[:3]] + ["..."] * (len(scenarios) > 3)
+    return f"{len(scenarios)} scenario{'s' if len(scenarios) > 1 else ''} ({', '.join(named)})"
 
 
 def schedule(texts):

@@ -109,8 +109,9 @@ def text(case):
     parts += _sentences(
         [
             "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
-            "controller.model.* and observer.model.* are the plant that controller and observer compute with, by the same names; --set "
-            "plant.* changes the rig and leaves them, in a rig file they follow plant.* unless they are set.",
+            "controller.model.* and observer.model.* are the plant that controller and observer compute with, "
+            "by the same names; --set plant.* changes the rig and leaves them, in a rig file they follow "
+            "plant.* unless they are set.",
         ]
     )
     parts += _chapter("What is measured") + [grid(_measures(case), ["measure", "unit", "of each", "what it is"], (22, 9, 8))]

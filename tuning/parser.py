@@ -120,8 +120,8 @@ def parser():
         action="append",
         default=[],
         metavar="NAME=VALUE[;NAME=VALUE]",
-        help='a run to judge by, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the case\'s own); replaces those of the '
-        "case; none: its own run; repeatable",
+        help='a run to judge by, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the case\'s own); '
+        "replaces those of the case; none: its own run; repeatable",
     )
     tune.add_argument(
         "--choose",

@@ -38,11 +38,12 @@ class Claim(NamedTuple):
 
 
 class Scenario(NamedTuple):
-    """One of several runs that a tuning is judged by: the case with `values` set by dotted name (a gust of noise, a tired pump, other
-    setpoints, another duration), its sensor noise drawn with `seed`, counted with `weight` in the mean over scenarios [-].
+    """One of several runs that a tuning is judged by: the case with `values` set by dotted name
+    (sensor noise, a weaker pump, other setpoints, another duration), its sensor noise drawn with
+    `seed`, counted with `weight` in the mean over scenarios [-].
 
-    A value is a number in the parameter's unit, or a text relative to the case as it stands: "x1.3", "by -0.5", "0.02 if zero", "steady"
-    (`rig.set_scenario`).
+    A value is a number in the parameter's unit, or a text relative to the case as it stands:
+    "x1.3", "by -0.5", "0.02 if zero", "steady" (`rig.set_scenario`).
     """
 
     name: str

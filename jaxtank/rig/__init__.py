@@ -2,7 +2,8 @@
 
 case = "gouta2015/backstepping"
 
-[values]                     # any parameter by its dotted name; controller.model.* and observer.model.* follow plant.* unless they are set
+[values]                     # any parameter by its dotted name; controller.model.* and
+                             # observer.model.* follow plant.* unless they are set
 "controller.k1" = 0.01
 "plant.area" = [21.2, 21.2, 21.2, 21.2]
 "clock.dt" = 0.01
@@ -63,8 +64,9 @@ h1 = "level 1 [mm]"
 name = "noisy"
 seed = 1
 weight = 2.0
-values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [5, 4, 3, 2] }  # relative to the case, or numbers;
-                             # also "by -0.5" (less), and "steady" for x0, actuator.initial and reference.initial
+# numbers, or relative to the case: also "by -0.5" (less), and "steady" for a start from rest: x0,
+# actuator.initial and reference.initial
+values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [5, 4, 3, 2] }
 """
 
 from jaxtank.presets.base import Case

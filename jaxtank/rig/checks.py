@@ -142,7 +142,7 @@ def scenario(case, entry, index):
         values = by_dotted_name(values, "scenario.values")
         set_scenario(case, values)
     except EquilibriumError:
-        pass  # of a plant without a steady state: `check` has more to say of it, and a run that needs one refuses it
+        pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
     except InputError as error:
         raise type(error)(f"scenario {name!r}: {error}") from None
     return Scenario(name, {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}, seed, float(weight))

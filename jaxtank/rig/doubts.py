@@ -10,8 +10,8 @@ from jaxtank.tree import is_component, split_index, walk
 
 def doubts(case):
     """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours after the end of the run, changes
-    that overlap, levels and setpoints above the rim, pumps that start outside their limits, models that are not the plant's. (Steps that
-    are too long: `step_length`.)"""
+    that overlap, levels and setpoints above the rim, pumps that start outside their limits, models
+    that differ from the plant. (Steps that are too long: `step_length`.)"""
     loop, (length, drive) = case.loop, case.loop.units
     found, end, rim = clock_doubts(case.clock), case.clock.duration, np.asarray(loop.plant.rim)
     reference, bank = steps(loop.reference), loop.actuator
@@ -47,34 +47,41 @@ def doubts(case):
 
 
 def model_doubts(case):
-    """Sentences on the parameters in the models of controller and observer that differ from the plant's by more than its uncertainty:
-    the share in [uncertain], or two standard deviations of [covariance]; by more than rounding where neither has them."""
+    """Return a sentence for each parameter in a model of controller or observer that differs from
+    the plant's by more than its uncertainty.
+
+    The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
+    but rounding where neither has the parameter. Rims count only in a model in which they are physics.
+    """
     found, plant = [], case.loop.plant
-    for holder, part in (("controller", case.loop.controller), ("observer", case.loop.observer)):
+    for holder in ("controller", "observer"):
+        part = getattr(case.loop, holder)
         inner = f"{holder}.law." if is_component(getattr(part, "law", None)) else f"{holder}."
         model = getattr(getattr(part, "law", part), "model", None)
         if model is None:
             continue
-        # without rims as physics no level depends on them
+        # no level depends on rims that are no physics
         vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
         theirs = {name: value for name, value, _ in walk(model)}
         for name, value, meta in walk(plant):
-            if name in vacant or value is None or theirs.get(name) is None or np.shape(theirs[name]) != np.shape(value):
+            other = None if name in vacant else theirs.get(name)
+            if value is None or other is None or np.shape(other) != np.shape(value):
                 continue
-            own, other = np.asarray(value, dtype=float), np.asarray(theirs[name], dtype=float)
+            own, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
             allowed, words = _uncertainty(case, f"plant.{name}", own)
             if np.any(np.abs(other - own) > np.maximum(allowed, 1e-9 * np.abs(own))):
                 unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+                here = f"{inner}model.{name}"
                 found.append(
-                    f"{inner}model.{name} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the {holder} computes with "
-                    f"another plant than the one that it runs on{words}; where that is not meant, set it to the plant's, "
-                    f"{inner}model.{name} = {_listed(own)} (a rig file without it follows the plant)"
+                    f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the "
+                    f"model of the {holder} differs from the plant{words}; unless that is meant, set "
+                    f"{here} = {_listed(own)}, or leave it out of the rig file: it follows the plant"
                 )
     return found
 
 
 def _uncertainty(case, name, value):
-    """(how far a model may be off the parameter `name` of the plant, in its unit and shape, in words)."""
+    """(how far a model may be off the plant's parameter `name`, in its unit; the same in words)."""
     allowed, words = np.zeros(np.shape(value)), ""
     for key, share in case.uncertain.items():
         base, index = split_index(key)

@@ -13,8 +13,8 @@ from jaxtank.signals import Constant, Ramps
 from jaxtank.tree import describe, get_value, is_component, parameters, walk
 
 RELATIVE = (
-    'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" (less), "0.02 if zero", and "steady" for '
-    "x0, actuator.initial and reference.initial"
+    'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" '
+    '(less), "0.02 if zero", and "steady" for x0, actuator.initial and reference.initial'
 )
 
 

@@ -83,7 +83,8 @@ def from_table(table):
     """The Case described by a table of the form of a rig file."""
     case = start_of(table)
     table = {**table, **{key: by_dotted_name(table[key], key) for key in ("values", "free", "uncertain") if key in table}}
-    case = set_and_schedule(case, with_models(case.loop, table.get("values", {})), table.get("schedule", {}))
+    values = with_models(case.loop, table.get("values", {}))
+    case = set_and_schedule(case, values, table.get("schedule", {}))
     if "limits" in table:
         case = case.replace(limits=checks.check_limits(case.loop, table["limits"]))
     if "objective" in table:

@@ -145,7 +145,8 @@ def _values(case, base, tankwise, same):
         for name, value, _ in fields
         if not isinstance(value, tuple)
     }
-    plants = {n: toml(np.asarray(v).tolist()) for k in ("leaf", "static") for n, v, _ in walk(loop.plant, kind=k) if v is not None}
+    plant = [*walk(loop.plant), *walk(loop.plant, kind="static")]
+    plants = {n: toml(np.asarray(v).tolist()) for n, v, _ in plant if v is not None}
     described = ("reference.", "disturbance.", "faults.") if signals.steps(loop.reference) else ("disturbance.", "faults.")
     for name, value, meta in [*walk(loop), *walk(loop, kind="static")]:
         if (
@@ -164,7 +165,7 @@ def _values(case, base, tankwise, same):
         if value is None:
             if not (scheduled and part == "controller"):
                 groups.setdefault(part, []).append(Key(toml(name), examples.absent(loop, name, meta), meta, False))
-        elif follows is not None:  # the file's plant.* decides, and is written wherever it is not built
+        elif follows is not None:  # by what the file has of the plant, unless it is written
             groups.setdefault(part, []).append(Key(toml(name), value, meta, follows != toml(value)))
         elif not built or known.get(name) != toml(value):
             groups.setdefault(part, []).append(Key(toml(name), value, meta))
@@ -177,7 +178,7 @@ def _values(case, base, tankwise, same):
 
 
 def _followed(name, plants):
-    """The value in a file of the plant's parameter that `name`, of a model of controller or observer, follows; None of another name."""
+    """The plant's value, as in a file, that `name` of a model follows; None of another name."""
     for model in MODELS:
         if name.startswith(model):
             return plants.get(name.removeprefix(model))
@@ -224,8 +225,8 @@ REACHABLE = {**BARE, "doc": "whether every plateau of the reference must have a 
 PARTS = {
     "plant": "plant: the rig as it is",
     "sensor": "sensor: what the computer sees of the levels",
-    "observer": "observer: estimates of the levels; observer.model.* follows plant.*, and a line below sets it apart",
-    "controller": "controller: the controller; controller.model.* follows plant.*, and a line below sets it apart, for a wrong model",
+    "observer": "observer: estimated levels; observer.model.* follows plant.* unless it is set",
+    "controller": "controller; controller.model.* follows plant.* unless it is set, for a wrong model",
     "actuator": "actuator: the pumps",
     "reference": "reference",
     "x0": "start",

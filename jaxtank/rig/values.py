@@ -1,4 +1,4 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock; values of scenarios, relative to the case."""
+"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios."""
 
 import dataclasses
 import re
@@ -18,8 +18,10 @@ MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 STEADY = ("x0", "actuator.initial", "reference.initial")
 """What a scenario may have as "steady"."""
 
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_RELATIVE = re.compile(rf"(?:x\s*(?P<factor>{_NUMBER})|by\s+(?P<offset>{_NUMBER})|(?P<default>{_NUMBER})\s+if zero)")
+_NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+_RELATIVE = re.compile(
+    rf"x *(?P<factor>{_NUMBER})|by +(?P<offset>{_NUMBER})|(?P<default>{_NUMBER}) +if zero",
+)
 
 
 def by_dotted_name(table, where):
@@ -64,9 +66,12 @@ def set_values(case, values):
 
 
 def with_models(loop, values):
-    """`values`, the plant's parameters among them set in the models of controller and observer too.
+    """Return `values` with the plant's parameters among them for the models that hold them too.
 
-    loop: ClosedLoop; values: {dotted name: value}. A model's parameter that is in `values` itself is left as it is given there.
+    Parameters
+    ----------
+    loop : ClosedLoop
+    values : {dotted name: value}; a model's parameter among them keeps the value that it has there
     """
     names = {name for kind in ("leaf", "static") for name, _, _ in walk(loop, kind=kind)}
     found = {}
@@ -83,17 +88,31 @@ def with_models(loop, values):
 
 
 def set_scenario(case, values):
-    """A copy of `case` with the values of a Scenario, which may be relative to the case as it stands.
+    """Return a copy of `case` with the values of a Scenario, which may be relative to the case.
 
-    values: as in `set_values`, or a text for a number: "x1.3" (times 1.3), "by -0.5" (0.5 less, in the unit of the parameter), "0.02 if
-    zero" (0.02 where the case has 0 in every entry, else the case's own), and for x0, actuator.initial and reference.initial "steady"
-    (the steady state of the case's plant at the setpoints of t = 0). Raises InputError as `set_values` does and for another text,
-    EquilibriumError where there is no steady state.
+    Parameters
+    ----------
+    case : Case
+    values : {dotted name: value} as in `set_values`, or a text for a number: "x1.3" (times 1.3),
+        "by -0.5" (0.5 less, in the unit of the parameter), "0.02 if zero" (0.02 where the case has 0
+        in every entry, else the case's own), and for x0, actuator.initial and reference.initial
+        "steady" (the steady state of the case's plant at the setpoints of t = 0)
+
+    Raises
+    ------
+    InputError as `set_values` does, and for another text; EquilibriumError without a steady state.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = presets.find("mirakhorli/sfc")
+    >>> rig.set_scenario(case, {"plant.split[0]": "x0.5"}).loop.plant.split.tolist()
+    [0.21, 0.34]
     """
     found = {name: _absolute(case, name, value) for name, value in values.items()}
     steady = [name for name in found if _is_steady(name, found[name])]
     if steady:
-        here = set_values(case, {name: value for name, value in found.items() if name not in steady})
+        here = set_values(case, {n: v for n, v in found.items() if n not in steady})
         short = dataclasses.replace(here.clock, duration=here.clock.dt)
         setpoints = [float(np.asarray(v)[0]) for v in here.loop.reference.sample(short)[0]]
         try:
@@ -106,22 +125,30 @@ def set_scenario(case, values):
 
 
 def overridden(case, values):
-    """(`case` whose scenarios have `values` in the place of their own, {name in `values`: names of the scenarios that had their own}).
+    """Let values that were set in a case take the place of those of its scenarios.
 
-    values: {dotted name: value} that were set in the case afterwards. A factor ("x1.3") or an offset ("by -0.5") is applied to them and
-    stays.
+    Parameters
+    ----------
+    case : Case in which `values` are set
+    values : {dotted name: value}
+
+    Returns
+    -------
+    (Case, {name in `values`: names of the scenarios that had their own}). A factor ("x1.3") or an
+    offset ("by -0.5") of a scenario stays, and is applied to what is set.
     """
-    scenarios, told = [], {}
+    scenarios, replaced = [], {}
     for s in case.scenarios:
         kept = {}
         for name, value in s.values.items():
             over = [n for n in values if overlap(n, name)] if not is_change(value) else []
             for n in over:
-                told.setdefault(n, []).append(s.name)
+                replaced.setdefault(n, []).append(s.name)
             if not any(n in (name, split_index(name)[0]) for n in over):
-                kept |= {name: value, **{n: values[n] for n in over}}  # an entry of an array, set after the array
+                # an entry of an array that the scenario sets whole: after it
+                kept |= {name: value, **{n: values[n] for n in over}}
         scenarios.append(s._replace(values=kept))
-    return case.replace(scenarios=tuple(scenarios)), told
+    return case.replace(scenarios=tuple(scenarios)), replaced
 
 
 def overlap(one, other):
@@ -140,15 +167,16 @@ def _is_steady(name, value):
 
 
 def _absolute(case, name, value):
-    """The value of a Scenario as a number where it is one relative to the case; any other, and "steady", as it is."""
+    """The number that a value relative to the case comes to; any other, and "steady", as it is."""
     own = _number_of(case, name) if isinstance(value, str) else None
     if own is None or _is_steady(name, value):
         return value
     found = _RELATIVE.fullmatch(value.strip())
     if found is None:
         more = ', or "steady"' if name in STEADY else ""
+        numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
         raise InputError(
-            f"{name} = {_short(value)}: must be a number or a list of numbers{unit(_meta(case, name))}, or relative to the case's own: "
+            f"{name} = {_short(value)}: must be {numbers}, or relative to the case's own: "
             f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
         )
     own = np.asarray(own, dtype=float)
@@ -171,7 +199,9 @@ def _number_of(case, name):
 
 
 def _meta(case, name):
-    return {"unit": CLOCK_UNITS.get(name.removeprefix("clock."), "-")} if name.startswith("clock.") else describe(case.loop, name)
+    if name.startswith("clock."):
+        return {"unit": CLOCK_UNITS.get(name.removeprefix("clock."), "-")}
+    return describe(case.loop, name)
 
 
 def set_and_schedule(case, values, table):
