@@ -3,8 +3,11 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 from jaxtank import measures as ms
 from tuning.evidence import flat_words
+from tuning.objective import EXPLODED
 from tuning.solvers import SLOPING
 
 BARELY = 0.5
@@ -145,7 +148,7 @@ def message(result, z, felt, redone, steps=()):
             )
         )
     if result.status == "not_converged" and not broken and steep != 0.0:
-        words.append("no search converged within its iterations: raise --iterations, or try other starts")
+        words.append(_why_not_converged(result))
     over = [c for c in constraint_rows(problem, result.tables["before"]) if c["margin"] < 0]
     if over and not broken:
         told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over[:4])
@@ -179,6 +182,26 @@ def message(result, z, felt, redone, steps=()):
     if problem.non_finite:
         words.append(f"{problem.non_finite} trial points gave numbers that are not finite and were shrunk away from")
     return "; ".join(words)
+
+
+def _why_not_converged(result):
+    """Why a search that broke no limit did not converge, and the remedy."""
+    if _none_finite(result):
+        return (
+            f"no search could begin: the objective, a limit or a derivative is above {EXPLODED:.0e} at every point that was tried, as where noise "
+            "and delay make the loop unstable; start from other values (--set) or lower the upper ends of the ranges (--free)"
+        )
+    if any(o["exhausted"] for o in result.starts):
+        return "no search converged within its iterations: raise --iterations, or try other starts"
+    return (
+        "the searches stopped before their iterations were used up, at a kink or in the noise of the objective: no line search found a lower "
+        "point, and the conditions of an optimum do not hold there; try more --starts or other starting values"
+    )
+
+
+def _none_finite(result):
+    """True if no evaluation gave finite numbers to search with."""
+    return all(not np.isfinite(violation) for _, _, violation, _ in result.history)
 
 
 def _agreement(result):

@@ -66,7 +66,7 @@ def tune(
     scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
     mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
     local searches, from the case's own values and the best distinct ones of `screening` Sobol
-    points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
+    points (one more from the best of all those points where it is better than what these reached); seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
     adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
     objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
     log: folder for
@@ -116,14 +116,22 @@ def tune(
         search.take(reference)
         zs, costs, margins, redone = screen(problem, screening, seed)
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)
-        for i, z in enumerate(distinct_starts(zs, merits, starts, first)):
-            search.start = i
-            count = len(search.history)
+
+        def begin(z, count):
+            search.exhausted = False
             if batch is None:
                 converged = METHODS[method](search, z, iterations)
             else:
-                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, i]))
+                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, search.start]))
             outcomes.append(_outcome(search, z, count, converged))
+
+        for z in distinct_starts(zs, merits, starts, first):
+            search.start = len(outcomes)
+            begin(z, len(search.history))
+        search.start, count = len(outcomes), len(search.history)
+        z = _best_screened(search, zs, costs, margins)
+        if z is not None:
+            begin(z, count)
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             least = _find_feasible(search, zs, margins, iterations)
@@ -216,6 +224,21 @@ def _settled(search, outcomes, iterations):
     return False
 
 
+def _best_screened(search, zs, costs, margins):
+    """The screened point (P,) within the limits that is better at the true step than all that the searches reached; None where there is none.
+
+    No more than RENEWED points are run again: the coarse step may rate many of them too low.
+    """
+    held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
+    new = [i for i in np.argsort(costs, kind="stable") if held[i] and zs[i].tobytes() not in search.memory]
+    for i in new[:RENEWED]:
+        if search.best is not None and search.violation(search.best) == 0 and costs[i] >= search.best.cost:
+            return None
+        if search.point(zs[i]) is search.best:
+            return zs[i]
+    return None
+
+
 def _find_feasible(search, zs, margins, iterations):
     """Where no search met the limits: least violations from the best so far and from the screened points that come nearest to them. True if
     one of these searches for the least came to its end."""
@@ -289,7 +312,7 @@ def run_measures(loop, clock, key):
 
 
 def _outcome(search, z, count, converged):
-    """One local search: where it began, the best it reached, and whether it converged."""
+    """One local search: where it began, the best it reached, whether it converged, and whether it used up its iterations."""
     mine = search.history[count:]
     reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
     if reached is None:  # every point it asked for was known already
@@ -302,6 +325,7 @@ def _outcome(search, z, count, converged):
         "violation": reached[2],
         "evaluations": len(mine),
         "converged": converged,
+        "exhausted": search.exhausted,
     }
 
 

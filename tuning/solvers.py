@@ -21,6 +21,9 @@ STEEPEST = 10.0
 STILL, LONG = 1e-9, 25
 """Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a line search never ends by itself [-]."""
 
+ITERATION_LIMIT = 9
+"""Status of scipy's SLSQP that has used up its iterations."""
+
 ROUGHLY = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
@@ -30,12 +33,13 @@ class Search:
 
     def __init__(self, problem, reference, report, tolerance=1e-8):
         self.problem, self.report, self.tolerance = problem, report, tolerance
-        self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
+        # a cost can be a scale where its slopes are not to be used
+        self.scale = reference.cost if 0 < reference.cost < EXPLODED else 1.0
         self.room = problem.rooms
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
         # a search ends within its tolerance of a limit, on either side
         self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
-        self.best_start = None
+        self.best_start, self.exhausted = None, False  # `exhausted`: the last local search used up its iterations
         self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
 
     def point(self, z):
@@ -104,6 +108,7 @@ def slsqp(search, z, iterations, tolerance=None):
         )
     except _Settled:
         return True
+    search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
     return bool(done.success) or done.status == 8
 
@@ -157,6 +162,7 @@ def _epigraph(search, z, iterations, tolerance):
         constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
         options={"maxiter": iterations, "ftol": tolerance},
     )
+    search.exhausted = done.status == ITERATION_LIMIT
     return bool(done.success) or done.status == 8
 
 
@@ -194,6 +200,7 @@ def trf(search, z, iterations, tolerance=1e-10):
         gtol=tolerance,
         max_nfev=iterations,
     )
+    search.exhausted = done.status == 0
     return bool(done.success)
 
 
@@ -301,6 +308,7 @@ def minibatches(search, z, iterations, batch, rng):
         z = np.clip(z + np.asarray(update), 0.0, 1.0)
         if (k + 1) % every == 0:
             search.point(z)
+    search.exhausted = True
     return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
@@ -332,7 +340,8 @@ def _augmented(search, z, iterations, optimiser, descend):
                 step, halvings = 0.5 * step, halvings + 1
                 new = np.clip(z + step, 0.0, 1.0)
             moved, z = float(np.linalg.norm(new - z)), new
-            if moved < 1e-6:
+            search.exhausted = moved >= 1e-6
+            if not search.exhausted:
                 break
         if len(weights):
             weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
