@@ -139,11 +139,16 @@ class Problem:
         self.scenarios = sc.check_scenarios(case, case.scenarios if scenarios is None else scenarios, self.names)
         self.lanes = sc.lanes_of(case, self.scenarios, seed)
         self.groups = sc.groups_of(self.lanes)
+        self.limit(limits)
+        self.memo = Memo() if memo is None else memo
+        self.simulations, self.gradients, self.non_finite = 0, 0, 0
+
+    def limit(self, limits):
+        """Replace the limits by `limits`, as in resolve_limits. What was remembered has the margins of the former ones and is dropped."""
         self.limits = [limit for i, lane in enumerate(self.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
         self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
-        self.memo = Memo() if memo is None else memo
-        self.simulations, self.gradients, self.non_finite = 0, 0, 0
+        self.memo = Memo()
 
     @property
     def names(self):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.evidence import flat_words
 from tuning.objective import EXPLODED
-from tuning.solvers import SLOPING
+from tuning.solvers import SLOPING, UNSTABLE
 
 BARELY = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
@@ -190,6 +190,11 @@ def _why_not_converged(result):
         return (
             f"no search could begin: the objective, a limit or a derivative is above {EXPLODED:.0e} at every point that was tried, as where noise "
             "and delay make the loop unstable; start from other values (--set) or lower the upper ends of the ranges (--free)"
+        )
+    if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
+        return (
+            "the slope at this point is that of an unstable or chaotic run (noise and delay at a high gain give one) and no guide to what is lower; "
+            "try more --starts, or other ranges (--free)"
         )
     if any(o["exhausted"] for o in result.starts):
         return "no search converged within its iterations: raise --iterations, or try other starts"

@@ -21,8 +21,8 @@ from tuning.long_steps import of_answer
 from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
-from tuning.screening import coarse_clock, distinct_starts, screen
-from tuning.solvers import METHODS, SETTLED, Search, downhill, minibatches, optimality, restore, slsqp
+from tuning.screening import best_screened, coarse_clock, distinct_starts, screen
+from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
@@ -129,12 +129,13 @@ def tune(
             search.start = len(outcomes)
             begin(z, len(search.history))
         search.start, count = len(outcomes), len(search.history)
-        z = _best_screened(search, zs, costs, margins)
+        z = best_screened(search, zs, costs, margins)
         if z is not None:
             begin(z, count)
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             least = _find_feasible(search, zs, margins, iterations)
+        approach(search)
         if tolerance is not None and search.best is not None:
             polished = _settled(search, outcomes, iterations)
         elif method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
@@ -222,21 +223,6 @@ def _settled(search, outcomes, iterations):
         if done and optimality(search, search.best)[1] < SETTLED:
             return True
     return False
-
-
-def _best_screened(search, zs, costs, margins):
-    """The screened point (P,) within the limits that is better at the true step than all that the searches reached; None where there is none.
-
-    No more than RENEWED points are run again: the coarse step may rate many of them too low.
-    """
-    held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
-    new = [i for i in np.argsort(costs, kind="stable") if held[i] and zs[i].tobytes() not in search.memory]
-    for i in new[:RENEWED]:
-        if search.best is not None and search.violation(search.best) == 0 and costs[i] >= search.best.cost:
-            return None
-        if search.point(zs[i]) is search.best:
-            return zs[i]
-    return None
 
 
 def _find_feasible(search, zs, margins, iterations):
@@ -330,12 +316,12 @@ def _outcome(search, z, count, converged):
 
 
 def _at_rest(search, iterations):
-    """True if nothing lower is found along what is left of the slope at the best point; where there is, the search goes on from it, a few
-    times."""
+    """True if nothing lower is found along what is left of the slope at the best point, and that slope is one to go by; where there is
+    something lower, the search goes on from it, a few times."""
     for _ in range(RENEWED):
         better = downhill(search, search.best)
         if better is None:
-            return True
+            return optimality(search, search.best)[1] < UNSTABLE
         slsqp(search, better.z, iterations)
     return downhill(search, search.best) is None
 

@@ -270,6 +270,29 @@ def restore(search, z, iterations):
     return bool(done.success) or done.status == 8
 
 
+def approach(search):
+    """Bring the best point within the limits closer to a lower one outside, where no limit that is broken there has a slope here: a measure that
+    changes in steps, or is 0 all over the inside, shows no way along its boundary. Halves the distance between the two."""
+    best = search.best
+    if best is None or search.violation(best) > 0:
+        return
+    blind = ~np.any(best.margin_slopes, axis=1)
+    outside = [
+        p
+        for p in search.memory.values()
+        if p.finite and p.cost < best.cost * (1 - LOWER_BY) and search.violation(p) < NEAR and np.all(p.margins[~blind] >= 0)
+    ]
+    if not outside:
+        return
+    out, inside = min(outside, key=lambda p: p.cost).z, best.z
+    for _ in range(HALVINGS):
+        middle = search.point(0.5 * (out + inside))
+        if middle.finite and search.violation(middle) == 0:
+            inside = middle.z
+        else:
+            out = middle.z
+
+
 def lbfgs(search, z, iterations):
     """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
     import optax
@@ -383,8 +406,15 @@ def _left(search, point):
     return residual, multipliers
 
 
+NEAR, HALVINGS = 0.1, 10
+"""Largest violation of a point that `approach` goes towards [-], and how often it halves the distance."""
+
 STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 """Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
+
+UNSTABLE = 1.0 / STRIDES[-1]
+"""KKT residual, of the scaled cost per unit of z, that would take the cost below 0 within the least of STRIDES: the derivative of an unstable
+or chaotic run, which is exact and yet describes no step that can be taken."""
 
 LOWER_BY = 1e-4
 """Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""
