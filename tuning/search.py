@@ -108,6 +108,7 @@ def tune(
         problem.memo = Log(log, fingerprint(problem, method, options), resume)
 
     search, outcomes, interrupted, redone, polished, curved = None, [], False, 0, False, None
+    idle = np.zeros(len(first), dtype=bool)  # parameters that no run exercises
     least, settled = False, False  # whether the least violation was found; whether nothing lower lies along a slope that is left
     report = _reporter(progress, problem, starts)
     try:
@@ -140,9 +141,11 @@ def tune(
             polished = _settled(search, outcomes, iterations)
         elif method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
-        if search.best is not None and search.violation(search.best) == 0:
-            settled = _at_rest(search, iterations)
-            curved = evidence.curvature(problem, search, search.best)
+        if search.best is not None:
+            held = search.violation(search.best) == 0
+            settled = held and _at_rest(search, iterations)
+            idle = evidence.unexercised(problem, search, first)
+            curved = evidence.curvature(problem, search, search.best, idle) if held else None
     except KeyboardInterrupt:
         interrupted = True
     best = search.best if search and search.best else None
@@ -150,6 +153,7 @@ def tune(
     values = problem.values(z)
     if best is not None and np.array_equal(z, first):
         values = own_values(problem)
+    values |= {n: v for (n, v), still in zip(own_values(problem).items(), idle) if still}
     felt = [None] * len(z) if interrupted or best is None else evidence.felt(problem, z)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
@@ -183,8 +187,9 @@ def tune(
                 "upper": b.high,
                 "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
                 "felt_percent": f,
+                "exercised": not still,
             }
-            for b, v, f in zip(problem.bounds, z, felt)
+            for b, v, f, still in zip(problem.bounds, z, felt, idle.tolist())
         },
         objective={"before": problem.total(tables["before"]), "after": problem.total(tables["after"]), "terms": problem.objective},
         measures={"before": before, "after": after},
