@@ -138,7 +138,9 @@ def resolve_in(lanes, limits=None, first=0):
         if not any(limit.measure == measure for limit in found):
             unit, text = ms.unit(measure, lanes[0].case.loop.units), ", ".join(f"{v:g}" for v in np.ravel(value))
             where = "in every scenario" if len(lanes) > 1 else "on this run"
-            raise InputError(f"limit {measure} = {text} {unit}: undefined {where}: {reason}, or drop the limit (--limit {measure}=none)")
+            raise InputError(
+                f"limit {measure} = {text} {unit}: undefined {where}: {reason}, or drop the limit (--limit {measure}=none)"
+            )
     return found
 
 

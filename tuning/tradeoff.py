@@ -15,7 +15,20 @@ MANY = 50
 """Values of the limit at most."""
 
 
-def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, scenarios=None, seed=0, iterations=60, screening=64, start=None):
+def tradeoff(
+    case,
+    measure,
+    values,
+    *,
+    free=None,
+    objective=None,
+    limits=None,
+    scenarios=None,
+    seed=0,
+    iterations=60,
+    screening=64,
+    start=None,
+):
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
 
     Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
