@@ -38,9 +38,12 @@ def felt(problem, z):
 
 
 def unexercised(problem, search, first):
-    """(P,) True for a parameter that no run of the problem exercises at the best of a Search (a knot of a schedule that no setpoint comes near):
-    the cost, the limits and every scenario have no slope in it, and no measure that is reported changes with its value. The best point is
-    replaced by one where these have their values at `first` (P,), the start."""
+    """Return (P,) True for each parameter that no run exercises at the best point of a Search.
+
+    Such a parameter (a knot of a schedule outside the range of the setpoints) has no slope in the
+    cost, in a limit or in a scenario, and no reported measure changes with its value. The best point
+    is replaced by one where these parameters have their values at `first` (P,), the start.
+    """
     point = search.best
     flat = ~np.any(np.vstack([point.gradient, point.margin_slopes, point.lane_slopes]), axis=0)
     idle = np.zeros(len(first), dtype=bool)
@@ -72,7 +75,8 @@ def unexercised(problem, search, first):
 def curvature(problem, search, point, idle=None):
     """The second derivative of the scaled cost at an answer, along the directions that active limits and bounds leave free.
 
-    By differences of the exact gradient. idle: (P,) True for parameters that are left as they are. Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
+    By differences of the exact gradient. idle: (P,) True for parameters that are left as they are.
+    Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
     [{name: component}, ...] in the unit cube, "flattest": {...}}, where "flattest" is a step along the first direction that moves its
     largest component by 10 % (of the range, where the parameter is linear): {"factors": {name: ratio or change, as it is printed},
     "changes_percent": of the objective, run with these very numbers}.

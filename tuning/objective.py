@@ -33,7 +33,8 @@ TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
 
 NOT_A_NUMBER = 1e6
-"""Amount by which a measure that is infinite (never settled) or undefined (never risen) is taken to break its limit."""
+"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of the
+step) is taken to break its limit."""
 
 NOTHING = 1e-3
 """Share of what a measure is about, below which a limit is as good as 0 [-]."""
@@ -68,8 +69,11 @@ class Limit(NamedTuple):
         return float(self.margins(np.ravel(measures[self.measure])[self.index]))
 
     def margins(self, values):
-        """The margin for each of `values` of the measure. An infinite value (never settled) breaks the limit by NOT_A_NUMBER, as does one that
-        is undefined (a rise that never reached 90 %); a settling time that is undefined holds, for the output never left its band."""
+        """Return the margin for each of `values` of the measure.
+
+        An infinite value (never settled) breaks the limit by NOT_A_NUMBER, as does an undefined one (a
+        rise that never reached 90 %). An undefined settling time holds: the output never left its band.
+        """
         undefined = NOT_A_NUMBER if self.measure == "settling_time" else -NOT_A_NUMBER
         found = np.clip(self.sign * (self.value - np.asarray(values)), -NOT_A_NUMBER, NOT_A_NUMBER)
         return np.where(np.isnan(values), undefined, found)
@@ -109,15 +113,17 @@ class Point(NamedTuple):
 def resolve_limits(case, limits=None, lane=0, scenario=""):
     """The Limits of {measure: number, list or "rim"}; the case's own where None.
 
-    With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume. An entry that is undefined
-    on the case's run (see `undefined`) has no Limit. Raises InputError for an unknown measure, a value that is no number, and a measure
-    all of whose entries are undefined.
+    With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume.
+    An entry that is undefined on the case's run (see `undefined`) has no Limit. Raises InputError for
+    an unknown measure, a value that is no number, and a measure all of whose entries are undefined.
     """
     return resolve_in([sc.Lane(scenario, case, None, 1.0)], limits, lane)
 
 
 def resolve_in(lanes, limits=None, first=0):
-    """`resolve_limits` in each of `lanes`; a measure must be defined in one of them. first: the number of the first lane."""
+    """Return the Limits of `resolve_limits` in each of `lanes`, numbered from `first`.
+
+    Raises InputError as it does, for a measure that is undefined in all of them."""
     found, why = [], {}
     for i, lane in enumerate(lanes, first):
         plant = lane.case.loop.plant
@@ -145,8 +151,11 @@ def resolve_in(lanes, limits=None, first=0):
 
 
 def undefined(measure, case):
-    """(why and what to do, (entries,) True where `measure` has no value on the run of `case` whatever its gains): overshoot, rise and settling
-    of an output whose setpoint has no step within the run, recovery where nothing is poured."""
+    """Return (reason and remedy, (entries,) True where `measure` has no value on the run of `case`).
+
+    Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has no
+    step within the run, and recovery where nothing is poured.
+    """
     spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
     since = np.asarray(loop.disturbance.since(clock)) if hasattr(loop.disturbance, "since") else np.full(1, -1.0)
     if spec.pours and hasattr(loop.disturbance, "since"):
@@ -183,7 +192,9 @@ class Problem:
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
 
     def limit(self, limits):
-        """Replace the limits by `limits`, as in resolve_limits. What was remembered has the margins of the former ones and is dropped."""
+        """Replace the limits by `limits`, as in `resolve_limits`.
+
+        The evaluation cache holds margins of the former limits, and is emptied."""
         self.limits = resolve_in(self.lanes, limits)
         self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))

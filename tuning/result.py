@@ -24,8 +24,10 @@ STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
 class TuningResult:
     """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
 
-    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent, exercised}}: how much 10 % of the value changes the
-    objective [%], and whether any run depends on the value (if not, it is kept as it was); measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
+    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent, exercised}}: how much
+    10 % of the value changes the objective [%], and whether any run depends on the value (if none does,
+    the value is that before);
+    measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
     that the search was judged by; constraints: one dict per limit and scenario with value, margin, tank and time; history: (start,
     cost, violation [share of the limit, see `objective.room_of`], z) of every evaluation; starts: one dict per local search; curvature,
     validation: see `evidence`; cloud: cost and highest level of every run of the validation, see `evidence.summary_of`; mirrored: the
@@ -88,8 +90,8 @@ class TuningResult:
 
 
 def constraint_rows(problem, table):
-    """One dict for each limit of the problem: {name, measure, unit, limit, value, margin, tank, time_s, scenario, reason}, the last why the value
-    is not a finite number, None where it is."""
+    """One dict for each limit of the problem: {name, measure, unit, limit, value, margin, tank, time_s,
+    scenario, reason}, the last why the value is not a finite number, None where it is."""
     rows = []
     for limit in problem.limits:
         measures, plant = table[limit.lane], problem.lanes[limit.lane].case.loop.plant
@@ -128,7 +130,7 @@ def _amount(row):
 
 
 def _unlimited(problem):
-    """Sentences on the entries of a limited measure that are undefined in every run, and so are not limited."""
+    """Sentences on the entries of a limited measure that are undefined in every run: not limited."""
     words = []
     for measure in dict.fromkeys(limit.measure for limit in problem.limits if ms.MEASURES[limit.measure].windows):
         here = {limit.index for limit in problem.limits if limit.measure == measure}
@@ -143,8 +145,8 @@ def message(result, z, felt, redone, steps=()):
     broken = [c for c in checked if c["margin"] < 0]
     if result.status == "not_converged" and broken:
         words.append(
-            f"no point that meets every limit was found before the search ended ({broken[0]['name']} is {_amount(broken[0])}, limit "
-            f"{broken[0]['limit']:.6g} {broken[0]['unit']}): more --iterations, --starts or --screening may find one"
+            f"no point that meets every limit was found before the search ended ({broken[0]['name']} is "
+            f"{_amount(broken[0])}, limit {broken[0]['limit']:.6g} {broken[0]['unit']}): more --iterations, --starts or --screening may find one"
         )
     if result.status == "infeasible":
         worst = sorted(zip((c["margin"] / room for c, room in zip(checked, problem.rooms)), range(len(checked))))
@@ -208,7 +210,8 @@ def message(result, z, felt, redone, steps=()):
     idle = [b for b in problem.bounds if not result.parameters[b.name]["exercised"]]
     if idle:
         kept = ", ".join(f"{b.name} {result.parameters[b.name]['after']:g} {b.unit}" for b in idle)
-        words.append(f"no run exercises {kept}: any value in the range gives the same run, so the start value is kept")
+        same = "any value in the range gives the same run, so the start value is kept"
+        words.append(f"no run exercises {kept}: {same}")
     for b, v, f in zip(problem.bounds, z, felt):
         if b in idle:
             continue
@@ -231,19 +234,21 @@ def _why_not_converged(result):
     """Why a search that broke no limit did not converge, and the remedy."""
     if _none_finite(result):
         return (
-            f"no search could begin: the objective, a limit or a derivative is above {EXPLODED:.0e} at every point that was tried, as where noise "
-            "and delay make the loop unstable; start from other values (--set) or lower the upper ends of the ranges (--free)"
+            f"no search could begin: the objective, a limit or a derivative exceeds {EXPLODED:.0e} at every "
+            "point that was tried, as where noise and delay make the loop unstable; start from other "
+            "values (--set) or narrow the ranges (--free)"
         )
     if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
         return (
-            "the slope at this point is that of an unstable or chaotic run (noise and delay at a high gain give one) and no guide to what is lower; "
-            "try more --starts, or other ranges (--free)"
+            "the slope at this point is that of an unstable or chaotic run (noise and delay at a high gain "
+            "give one), and points along it are not lower; try more --starts, or other ranges (--free)"
         )
     if any(o["exhausted"] for o in result.starts):
         return "no search converged within its iterations: raise --iterations, or try other starts"
     return (
-        "the searches stopped before their iterations were used up, at a kink or in the noise of the objective: no line search found a lower "
-        "point, and the conditions of an optimum do not hold there; try more --starts or other starting values"
+        "the searches stopped before their iterations were used up, at a kink or in the noise of the "
+        "objective: no line search found a lower point, and the conditions of an optimum do not hold "
+        "there; try more --starts or other starting values"
     )
 
 

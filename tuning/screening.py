@@ -14,7 +14,8 @@ from jaxtank.tree import with_values
 from tuning.scenarios import coarse_clock
 
 TRIED = 3
-"""Screened points that are run again at the true step, at most, to find one that is better than the best: a coarse step may rate many too low."""
+"""Screened points that are run again at the true step, at most, to find one that is better than the
+best: the coarse step may rate many too low."""
 
 LARGEST_STATE = 60
 """Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their cube."""
@@ -121,9 +122,10 @@ def distinct_starts(zs, merits, count, first):
 
 
 def best_screened(search, zs, costs, margins):
-    """The screened point (P,) that keeps the limits and is better, at the true step, than the best of a Search; None where there is none.
+    """Return the screened point (P,) that keeps the limits and is better than the best of a Search.
 
-    zs (points, P), costs (points,) and margins (points, limits) as `screen` returns them. What is run again enters the Search.
+    None where none is, at the true step. zs (points, P), costs (points,) and margins (points, limits) as
+    `screen` returns them. A point that is run again enters the Search.
     """
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
     new = [i for i in np.argsort(costs, kind="stable") if held[i] and zs[i].tobytes() not in search.memory]

@@ -66,7 +66,9 @@ def tune(
     scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
     mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
     local searches, from the case's own values and the best distinct ones of `screening` Sobol
-    points (one more from the best of all those points where it is better than what these reached); seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
+    points (and one more from the best of these points, where it is better than what those searches
+    reached);
+    seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
     adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
     objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
     log: folder for
@@ -303,7 +305,8 @@ def run_measures(loop, clock, key):
 
 
 def _outcome(search, z, count, converged):
-    """One local search: where it began, the best it reached, whether it converged, and whether it used up its iterations."""
+    """One local search: where it began, the best it reached, whether it converged, and whether it
+    used up its iterations."""
     mine = search.history[count:]
     reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
     if reached is None:  # every point it asked for was known already
@@ -321,8 +324,8 @@ def _outcome(search, z, count, converged):
 
 
 def _at_rest(search, iterations):
-    """True if nothing lower is found along what is left of the slope at the best point, and that slope is one to go by; where there is
-    something lower, the search goes on from it, a few times."""
+    """True if nothing lower is found along the slope that is left at the best point, and that slope
+    is below UNSTABLE. Where there is something lower, the search goes on from it, a few times."""
     for _ in range(RENEWED):
         better = downhill(search, search.best)
         if better is None:

@@ -39,7 +39,8 @@ class Search:
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
         # a search ends within its tolerance of a limit, on either side
         self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
-        self.best_start, self.exhausted = None, False  # `exhausted`: the last local search used up its iterations
+        self.best_start = None
+        self.exhausted = False  # whether the last local search used up its iterations
         self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
 
     def point(self, z):
@@ -271,8 +272,11 @@ def restore(search, z, iterations):
 
 
 def approach(search):
-    """Bring the best point within the limits closer to a lower one outside, where no limit that is broken there has a slope here: a measure that
-    changes in steps, or is 0 all over the inside, shows no way along its boundary. Halves the distance between the two."""
+    """Move the best feasible point towards a lower infeasible one, by halving the distance.
+
+    Only where each limit that is broken there has no slope at the feasible point: a measure that changes
+    in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along its boundary.
+    """
     best = search.best
     if best is None or search.violation(best) > 0:
         return
@@ -407,14 +411,14 @@ def _left(search, point):
 
 
 NEAR, HALVINGS = 0.1, 10
-"""Largest violation of a point that `approach` goes towards [-], and how often it halves the distance."""
+"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
 STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 """Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
 
 UNSTABLE = 1.0 / STRIDES[-1]
-"""KKT residual, of the scaled cost per unit of z, that would take the cost below 0 within the least of STRIDES: the derivative of an unstable
-or chaotic run, which is exact and yet describes no step that can be taken."""
+"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the least
+of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step."""
 
 LOWER_BY = 1e-4
 """Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""

@@ -33,8 +33,9 @@ def tradeoff(
 
     Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
     limit) and from that of the next tighter one, and the best is kept: a tighter limit's answer holds a looser one too, so that the
-    objective never falls as the limit is drawn in. Where one of `screening` Sobol points, or a point that was evaluated for another value,
-    keeps the limit at a lower objective, the search is begun again from it.
+    objective never falls as the limit is drawn in. Where one of `screening` Sobol points, or a point
+    that was evaluated for another value, keeps the limit at a lower objective, the search is begun
+    again from it.
 
     case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit holds for every entry of the measure, the other
     limits stay; start: {name: value} to begin at, the case's own where None. Returns {"measure", "points": [{"limit", "status" ("converged",
@@ -77,7 +78,8 @@ def tradeoff(
 
 
 def _candidates(problem, known, screening, seed):
-    """(zs, costs, margins under the problem's limits) of its screened points and of the finite Points among `known`."""
+    """Return (zs, costs, margins under the problem's limits) of screened points and of the finite Points
+    among `known`."""
     zs, costs, margins, _ = screen(problem, screening, seed)
     points = [p for p in known.values() if p.finite]
     old = [problem.margins(p.measures) for p in points]

@@ -188,7 +188,10 @@ def _landscape(ax, result, unit):
 
 
 def rig_of(result):
-    """(text of rig.toml, None), or (None, why there is none): a class of one's own has no name in a rig file."""
+    """Return (text of rig.toml, None), or (None, why there is none).
+
+    A class of one's own has no name in a rig file.
+    """
     try:
         return rig.dump(result.tuned), None
     except InputError as error:
@@ -199,9 +202,9 @@ def rig_of(result):
 def save(result, folder, command=None):
     """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
 
-    command: the line that made the result, for the report, where there is one. A case that no rig file can describe (with a plant or a
-    controller class of one's own) has no rig.toml: a UserWarning, result.json and the report give the reason, and an earlier result's
-    rig.toml is removed.
+    command: the line that made the result, for the report, where there is one. A case that no rig file
+    can describe (with a plant or a controller class of one's own) has no rig.toml: a UserWarning,
+    result.json and the report give the reason, and the rig.toml of an earlier result is removed.
     """
     check_folder(folder)
     folder = Path(folder)
