@@ -1,5 +1,7 @@
 """A plant and a law that somebody else wrote, with no more than their base classes ask: notebook 10's cone."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,3 +101,18 @@ def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
     assert all(v["count"] == 0 for v in found.violations())
     with pytest.raises(jaxtank.InputError, match=r"plant\.drain"):
         jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
+
+
+def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
+    """Neither class has a name in a rig file; all but rig.toml is written."""
+    result = tuning.tune(case, starts=1, screening=4, validation=4)
+    (tmp_path / "rig.toml").write_text("of an earlier result")
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.warns(UserWarning, match=r"rig\.toml is not written .*no name in a rig file.*controller\.Kc = "):
+        names = {path.name for path in result.save(tmp_path)}
+    assert {"result.json", "trajectory.csv", "before.csv", "report.html", "responses.png"} <= names
+    assert names == {path.name for path in tmp_path.iterdir()} and "rig.toml" not in names
+    saved = json.loads((tmp_path / "result.json").read_text())
+    assert saved["parameters"]["controller.Kc"]["after"] == result.parameters["controller.Kc"]["after"]
+    assert "rig.toml is not written" in saved["message"]
+    assert "rig.toml is not written" in (tmp_path / "report.html").read_text()

@@ -117,7 +117,7 @@ class Ensemble:
         rows = []
         for limit in self.limits:
             values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
-            broken = int(np.sum(self.failed | (limit.sign * (values - limit.value) > 0)))
+            broken = int(np.sum(self.failed | (limit.margins(values) < 0)))
             rows.append(
                 {
                     "name": limit.label,

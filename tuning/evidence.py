@@ -37,10 +37,46 @@ def felt(problem, z):
     return [float(c) if np.isfinite(c) else None for c in change]
 
 
-def curvature(problem, search, point):
+def unexercised(problem, search, first):
+    """Return (P,) True for each parameter that no run exercises at the best point of a Search.
+
+    Such a parameter (a knot of a schedule outside the range of the setpoints) has no slope in the
+    cost, in a limit or in a scenario, and no reported measure changes with its value. The best point
+    is replaced by one where these parameters have their values at `first` (P,), the start.
+    """
+    point = search.best
+    flat = ~np.any(np.vstack([point.gradient, point.margin_slopes, point.lane_slopes]), axis=0)
+    idle = np.zeros(len(first), dtype=bool)
+    if not flat.any():
+        return idle
+    names, here = tuple(m for m in REPORTED if ms.serves(m, problem.loop)), table_of(problem, problem.values(point.z))
+
+    def same(which):
+        away = np.where(point.z < 0.5, point.z + 0.4, point.z - 0.4)
+        tables = [table_of(problem, problem.values(np.where(which, z, point.z))) for z in (first, away)]
+        return all(
+            np.allclose(row[m], old[m], rtol=1e-9, atol=1e-12, equal_nan=True)
+            for table in tables
+            for row, old in zip(table, here)
+            for m in names
+        )
+
+    if same(flat):
+        idle = flat
+    elif flat.sum() > 1:
+        idle = np.array([bool(f) and same(np.arange(len(first)) == i) for i, f in enumerate(flat)])
+    kept = search.point(np.where(idle, first, point.z))
+    if kept.finite and search.violation(kept) <= search.violation(point) * (1 + 1e-9):
+        search.best = kept
+        return idle
+    return np.zeros(len(first), dtype=bool)
+
+
+def curvature(problem, search, point, idle=None):
     """The second derivative of the scaled cost at an answer, along the directions that active limits and bounds leave free.
 
-    By differences of the exact gradient. Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
+    By differences of the exact gradient. idle: (P,) True for parameters that are left as they are.
+    Returns None where there is nothing to tell, else {"eigenvalues": [...] rising, "directions":
     [{name: component}, ...] in the unit cube, "flattest": {...}}, where "flattest" is a step along the first direction that moves its
     largest component by 10 % (of the range, where the parameter is linear): {"factors": {name: ratio or change, as it is printed},
     "changes_percent": of the objective, run with these very numbers}.
@@ -57,7 +93,8 @@ def curvature(problem, search, point):
         columns.append((up.gradient - down.gradient) / (up.z - down.z)[i] / search.scale)
     near = point.margins / search.room - search.backoff < 1e-4
     held = list(point.margin_slopes[near])
-    held += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6]
+    still = np.zeros(count, dtype=bool) if idle is None else idle
+    held += [np.eye(count)[i] for i in range(count) if z[i] < 1e-6 or z[i] > 1 - 1e-6 or still[i]]
     basis = np.eye(count)
     if held:
         _, sizes, rows = np.linalg.svd(np.array(held))

@@ -33,7 +33,8 @@ TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
 
 NOT_A_NUMBER = 1e6
-"""Amount by which an infinite measure (never settled) is taken to break its limit, and one that does not apply to hold it."""
+"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of the
+step) is taken to break its limit."""
 
 NOTHING = 1e-3
 """Share of what a measure is about, below which a limit is as good as 0 [-]."""
@@ -64,12 +65,18 @@ class Limit(NamedTuple):
         return (self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}") + where
 
     def margin(self, measures):
-        """How far the limit is from being met exactly: positive where it holds. A measure that does not apply (the settling time of an
-        output that is never changed) holds by NOT_A_NUMBER, an infinite one breaks by as much."""
-        value = float(np.ravel(measures[self.measure])[self.index])
-        if np.isnan(value):
-            return NOT_A_NUMBER
-        return float(np.clip(self.sign * (self.value - value), -NOT_A_NUMBER, NOT_A_NUMBER))
+        """How far the limit is from being met exactly: positive where it holds. See `margins`."""
+        return float(self.margins(np.ravel(measures[self.measure])[self.index]))
+
+    def margins(self, values):
+        """Return the margin for each of `values` of the measure.
+
+        An infinite value (never settled) breaks the limit by NOT_A_NUMBER, as does an undefined one (a
+        rise that never reached 90 %). An undefined settling time holds: the output never left its band.
+        """
+        undefined = NOT_A_NUMBER if self.measure == "settling_time" else -NOT_A_NUMBER
+        found = np.clip(self.sign * (self.value - np.asarray(values)), -NOT_A_NUMBER, NOT_A_NUMBER)
+        return np.where(np.isnan(values), undefined, found)
 
 
 def room_of(limit, loop):
@@ -106,18 +113,59 @@ class Point(NamedTuple):
 def resolve_limits(case, limits=None, lane=0, scenario=""):
     """The Limits of {measure: number, list or "rim"}; the case's own where None.
 
-    With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume. Raises InputError for
-    an unknown measure or a value that is no number.
+    With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no overflow volume.
+    An entry that is undefined on the case's run (see `undefined`) has no Limit. Raises InputError for
+    an unknown measure, a value that is no number, and a measure all of whose entries are undefined.
     """
-    found, plant = [], case.loop.plant
-    for measure, value in check_limits(case.loop, case.limits if limits is None else limits).items():
-        value = np.asarray(plant.rim) if isinstance(value, str) else value
-        values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
-        for i, v in enumerate(values):
-            held = plant.overflow and measure == "max_level" and v >= plant.rim[i]
-            measured, at = ("overflow_volume", SPILL * float(plant.area[i] * plant.rim[i])) if held else (measure, float(v))
-            found.append(Limit(measured, i, at, lane, scenario))
+    return resolve_in([sc.Lane(scenario, case, None, 1.0)], limits, lane)
+
+
+def resolve_in(lanes, limits=None, first=0):
+    """Return the Limits of `resolve_limits` in each of `lanes`, numbered from `first`.
+
+    Raises InputError as it does, for a measure that is undefined in all of them."""
+    found, why = [], {}
+    for i, lane in enumerate(lanes, first):
+        plant = lane.case.loop.plant
+        given = check_limits(lane.case.loop, lane.case.limits if limits is None else limits)
+        for measure, value in given.items():
+            value = np.asarray(plant.rim) if isinstance(value, str) else value
+            values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
+            reason, missing = undefined(measure, lane.case)
+            if all(missing):
+                why.setdefault(measure, (value, reason))
+                continue
+            for j, v in enumerate(values):
+                held = plant.overflow and measure == "max_level" and v >= plant.rim[j]
+                measured, at = ("overflow_volume", SPILL * float(plant.area[j] * plant.rim[j])) if held else (measure, float(v))
+                if not missing[j]:
+                    found.append(Limit(measured, j, at, i, lane.name))
+    for measure, (value, reason) in why.items():
+        if not any(limit.measure == measure for limit in found):
+            unit, text = ms.unit(measure, lanes[0].case.loop.units), ", ".join(f"{v:g}" for v in np.ravel(value))
+            where = "in every scenario" if len(lanes) > 1 else "on this run"
+            raise InputError(
+                f"limit {measure} = {text} {unit}: undefined {where}: {reason}, or drop the limit (--limit {measure}=none)"
+            )
     return found
+
+
+def undefined(measure, case):
+    """Return (reason and remedy, (entries,) True where `measure` has no value on the run of `case`).
+
+    Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has no
+    step within the run, and recovery where nothing is poured.
+    """
+    spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
+    since = np.asarray(loop.disturbance.since(clock)) if hasattr(loop.disturbance, "since") else np.full(1, -1.0)
+    if spec.pours and hasattr(loop.disturbance, "since"):
+        why = f"nothing is poured within its {clock.duration:g} s; add a pour ([[pour]])"
+        return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
+    if spec.windows and hasattr(loop.reference, "windows"):
+        steps = [np.asarray(step) for _, step, *_ in loop.reference.windows(clock)]
+        why = f"no setpoint is stepped within its {clock.duration:g} s; add a step (reference.changes)"
+        return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
+    return "", [False] * ms.entries(measure, loop.plant)
 
 
 class Problem:
@@ -139,11 +187,18 @@ class Problem:
         self.scenarios = sc.check_scenarios(case, case.scenarios if scenarios is None else scenarios, self.names)
         self.lanes = sc.lanes_of(case, self.scenarios, seed)
         self.groups = sc.groups_of(self.lanes)
-        self.limits = [limit for i, lane in enumerate(self.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
-        self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
-        self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
+        self.limit(limits)
         self.memo = Memo() if memo is None else memo
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
+
+    def limit(self, limits):
+        """Replace the limits by `limits`, as in `resolve_limits`.
+
+        The evaluation cache holds margins of the former limits, and is emptied."""
+        self.limits = resolve_in(self.lanes, limits)
+        self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
+        self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))
+        self.memo = Memo()
 
     @property
     def names(self):

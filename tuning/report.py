@@ -72,7 +72,7 @@ def parts_of(result):
             number(p["after"]),
             f"{number(p['lower'])} : {number(p['upper'])}",
             "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
-            f"at {p['at_bound']} bound" if p["at_bound"] else "",
+            "not exercised, kept" if not p["exercised"] else f"at {p['at_bound']} bound" if p["at_bound"] else "",
         ]
         for n, p in result.parameters.items()
     ]
@@ -97,7 +97,7 @@ def parts_of(result):
                 c["unit"],
                 (">= " if c["measure"] in LOWER else "<= ") + number(c["limit"], 7),
                 number(c["value"], 7),
-                number(c["margin"], 3),
+                number(c["margin"], 3) if c["reason"] is None else "undefined",
                 f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
             ]
             for c in shown

@@ -3,9 +3,13 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 from jaxtank import measures as ms
 from tuning.evidence import flat_words
-from tuning.solvers import SLOPING
+from tuning.objective import EXPLODED
+from tuning.solvers import SLOPING, UNSTABLE
+from tuning.tables import ABSENT, REASONS
 
 BARELY = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
@@ -20,8 +24,10 @@ STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
 class TuningResult:
     """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
 
-    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent}}, the last how much 10 % of the value changes the
-    objective [%]; measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
+    parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent, exercised}}: how much
+    10 % of the value changes the objective [%], and whether any run depends on the value (if none does,
+    the value is that before);
+    measures: {"before": {}, "after": {}} of the case's own run; tables: {"before": [], "after": []} of every scenario
     that the search was judged by; constraints: one dict per limit and scenario with value, margin, tank and time; history: (start,
     cost, violation [share of the limit, see `objective.room_of`], z) of every evaluation; starts: one dict per local search; curvature,
     validation: see `evidence`; cloud: cost and highest level of every run of the validation, see `evidence.summary_of`; mirrored: the
@@ -84,26 +90,53 @@ class TuningResult:
 
 
 def constraint_rows(problem, table):
-    """One dict for each limit of the problem: {name, measure, unit, limit, value, margin, tank, time_s, scenario}."""
+    """One dict for each limit of the problem: {name, measure, unit, limit, value, margin, tank, time_s,
+    scenario, reason}, the last why the value is not a finite number, None where it is."""
     rows = []
     for limit in problem.limits:
         measures, plant = table[limit.lane], problem.lanes[limit.lane].case.loop.plant
         per = ms.MEASURES[limit.measure].per
         tank = limit.index if per == "tank" else plant.outputs[limit.index] if per == "output" else None
+        value = float(measures[limit.measure].ravel()[limit.index])
         rows.append(
             {
                 "name": limit.label,
                 "measure": limit.measure,
                 "unit": ms.unit(limit.measure, problem.loop.units),
                 "limit": limit.value,
-                "value": float(measures[limit.measure].ravel()[limit.index]),
+                "value": value,
                 "margin": limit.margin(measures),
                 "tank": None if tank is None else tank + 1,
                 "time_s": float(measures[ms.TIMES[limit.measure]][limit.index]) if limit.measure in ms.TIMES else None,
                 "scenario": limit.scenario or None,
+                "reason": _reason(limit, value),
             }
         )
     return rows
+
+
+def _reason(limit, value):
+    """Why the value of a limited measure is not a finite number; None where it is."""
+    if np.isfinite(value):
+        return None
+    if np.isnan(value) and limit.measure == "settling_time":
+        return "the output never left its band"
+    return REASONS.get(limit.measure, ABSENT)
+
+
+def _amount(row):
+    """The value of one of `constraint_rows` with its unit, or why it has none."""
+    return f"{row['value']:.6g} {row['unit']}" if row["reason"] is None else f"undefined ({row['reason']})"
+
+
+def _unlimited(problem):
+    """Sentences on the entries of a limited measure that are undefined in every run: not limited."""
+    words = []
+    for measure in dict.fromkeys(limit.measure for limit in problem.limits if ms.MEASURES[limit.measure].windows):
+        here = {limit.index for limit in problem.limits if limit.measure == measure}
+        absent = [i + 1 for i in range(ms.entries(measure, problem.loop.plant)) if i not in here]
+        words += [f"{measure} of output {i} is not limited: the setpoint has no step" for i in absent]
+    return words
 
 
 def message(result, z, felt, redone, steps=()):
@@ -112,20 +145,25 @@ def message(result, z, felt, redone, steps=()):
     broken = [c for c in checked if c["margin"] < 0]
     if result.status == "not_converged" and broken:
         words.append(
-            f"no point that meets every limit was found before the search ended ({broken[0]['name']} is {broken[0]['value']:.6g} of "
-            f"{broken[0]['limit']:.6g} {broken[0]['unit']}): more --iterations, --starts or --screening may find one"
+            f"no point that meets every limit was found before the search ended ({broken[0]['name']} is "
+            f"{_amount(broken[0])}, limit {broken[0]['limit']:.6g} {broken[0]['unit']}): more --iterations, --starts or --screening may find one"
         )
     if result.status == "infeasible":
         worst = sorted(zip((c["margin"] / room for c, room in zip(checked, problem.rooms)), range(len(checked))))
         worst = [(share, checked[i]) for share, i in worst if share < 0]
         told = [
-            f"{c['name']} is {c['value']:.6g} {c['unit']}, limit {c['limit']:.6g} {c['unit']}, missed by {-c['margin']:.3g} {c['unit']}"
+            f"{c['name']} is {_amount(c)}, limit {c['limit']:.6g} {c['unit']}"
+            + (f", missed by {-c['margin']:.3g} {c['unit']}" if c["reason"] is None else "")
             for _, c in worst[:4]
         ]
         more = f" (and {len(worst) - 4} more)" if len(worst) > 4 else ""
         words.append(
-            f"no point was found that meets every limit: {', '.join(told)}{more}; the largest of these, {-100 * worst[0][0]:.3g} % of its "
-            "limit, is the least that was found"
+            f"no point was found that meets every limit: {', '.join(told)}{more}"
+            + (
+                f"; the largest of these, {-100 * worst[0][0]:.3g} % of its limit, is the least that was found"
+                if worst[0][1]["reason"] is None
+                else ""
+            )
         )
     if result.status == "interrupted":
         words.append("interrupted: this is the best point so far")
@@ -145,12 +183,16 @@ def message(result, z, felt, redone, steps=()):
             )
         )
     if result.status == "not_converged" and not broken and steep != 0.0:
-        words.append("no search converged within its iterations: raise --iterations, or try other starts")
+        words.append(_why_not_converged(result))
     over = [c for c in constraint_rows(problem, result.tables["before"]) if c["margin"] < 0]
     if over and not broken:
-        told = ", ".join(f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}" for c in over[:4])
+        told = ", ".join(
+            f"{c['name']} {_amount(c)}" if c["reason"] else f"{c['name']} {c['value']:.4g} of {c['limit']:.4g} {c['unit']}"
+            for c in over[:4]
+        )
         more = f" and {len(over) - 4} more" if len(over) > 4 else ""
         words.append(f"the starting values break a limit ({told}{more}), so their objective is not one to reach")
+    words += _unlimited(problem)
     holding = result.optimality["multipliers"]
     tight = [c for c in checked if c["margin"] >= 0 and (c["margin"] < 1e-3 * abs(c["limit"]) or holding.get(c["name"], 0.0) > 0)]
     for c in tight:
@@ -165,7 +207,14 @@ def message(result, z, felt, redone, steps=()):
             f"the pumps travel {after:.4g} {unit} in all, {after / before:.0f} times as far as before: weigh it or limit it "
             "(--objective input_travel=..., --limit input_travel=...), or take a smaller step"
         )
+    idle = [b for b in problem.bounds if not result.parameters[b.name]["exercised"]]
+    if idle:
+        kept = ", ".join(f"{b.name} {result.parameters[b.name]['after']:g} {b.unit}" for b in idle)
+        same = "any value in the range gives the same run, so the start value is kept"
+        words.append(f"no run exercises {kept}: {same}")
     for b, v, f in zip(problem.bounds, z, felt):
+        if b in idle:
+            continue
         if v < 1e-6 or v > 1 - 1e-6:
             words.append(f"{b.name} ends at its {'lower' if v < 0.5 else 'upper'} bound, {b.low if v < 0.5 else b.high:g} {b.unit}")
         if f is not None and f < BARELY:
@@ -179,6 +228,33 @@ def message(result, z, felt, redone, steps=()):
     if problem.non_finite:
         words.append(f"{problem.non_finite} trial points gave numbers that are not finite and were shrunk away from")
     return "; ".join(words)
+
+
+def _why_not_converged(result):
+    """Why a search that broke no limit did not converge, and the remedy."""
+    if _none_finite(result):
+        return (
+            f"no search could begin: the objective, a limit or a derivative exceeds {EXPLODED:.0e} at every "
+            "point that was tried, as where noise and delay make the loop unstable; start from other "
+            "values (--set) or narrow the ranges (--free)"
+        )
+    if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
+        return (
+            "the slope at this point is that of an unstable or chaotic run (noise and delay at a high gain "
+            "give one), and points along it are not lower; try more --starts, or other ranges (--free)"
+        )
+    if any(o["exhausted"] for o in result.starts):
+        return "no search converged within its iterations: raise --iterations, or try other starts"
+    return (
+        "the searches stopped before their iterations were used up, at a kink or in the noise of the "
+        "objective: no line search found a lower point, and the conditions of an optimum do not hold "
+        "there; try more --starts or other starting values"
+    )
+
+
+def _none_finite(result):
+    """True if no evaluation gave finite numbers to search with."""
+    return all(not np.isfinite(violation) for _, _, violation, _ in result.history)
 
 
 def _agreement(result):

@@ -151,9 +151,7 @@ def _kept_off(case, limits, share):
 def _run(case, distributions, limits, names, fresh, seed):
     """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit or leaves the numbers)."""
     seen = ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False)
-    past = [
-        limit.sign * (seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index] - limit.value) > 0 for limit in seen.limits
-    ]
+    past = [limit.margins(seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0 for limit in seen.limits]
     return seen, seen.failed | np.any(past, axis=0) if past else seen.failed
 
 

@@ -13,6 +13,10 @@ from jaxtank.stepping import Inputs, initial, step
 from jaxtank.tree import with_values
 from tuning.scenarios import coarse_clock
 
+TRIED = 3
+"""Screened points that are run again at the true step, at most, to find one that is better than the
+best: the coarse step may rate many too low."""
+
 LARGEST_STATE = 60
 """Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their cube."""
 
@@ -115,3 +119,19 @@ def distinct_starts(zs, merits, count, first):
                 taken.append(zs[i])
         apart /= 2
     return taken
+
+
+def best_screened(search, zs, costs, margins):
+    """Return the screened point (P,) that keeps the limits and is better than the best of a Search.
+
+    None where none is, at the true step. zs (points, P), costs (points,) and margins (points, limits) as
+    `screen` returns them. A point that is run again enters the Search.
+    """
+    held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
+    new = [i for i in np.argsort(costs, kind="stable") if held[i] and zs[i].tobytes() not in search.memory]
+    for i in new[:TRIED]:
+        if search.best is not None and search.violation(search.best) == 0 and costs[i] >= search.best.cost:
+            return None
+        if search.point(zs[i]) is search.best:
+            return zs[i]
+    return None

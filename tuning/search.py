@@ -21,8 +21,8 @@ from tuning.long_steps import of_answer
 from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
-from tuning.screening import coarse_clock, distinct_starts, screen
-from tuning.solvers import METHODS, SETTLED, Search, downhill, minibatches, optimality, restore, slsqp
+from tuning.screening import best_screened, coarse_clock, distinct_starts, screen
+from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
@@ -66,7 +66,9 @@ def tune(
     scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
     mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
     local searches, from the case's own values and the best distinct ones of `screening` Sobol
-    points; seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
+    points (and one more from the best of these points, where it is better than what those searches
+    reached);
+    seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
     adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
     objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
     log: folder for
@@ -108,6 +110,7 @@ def tune(
         problem.memo = Log(log, fingerprint(problem, method, options), resume)
 
     search, outcomes, interrupted, redone, polished, curved = None, [], False, 0, False, None
+    idle = np.zeros(len(first), dtype=bool)  # parameters that no run exercises
     least, settled = False, False  # whether the least violation was found; whether nothing lower lies along a slope that is left
     report = _reporter(progress, problem, starts)
     try:
@@ -116,24 +119,35 @@ def tune(
         search.take(reference)
         zs, costs, margins, redone = screen(problem, screening, seed)
         merits = costs / search.scale + 10.0 * np.maximum(0.0, -margins / search.room).sum(axis=1)
-        for i, z in enumerate(distinct_starts(zs, merits, starts, first)):
-            search.start = i
-            count = len(search.history)
+
+        def begin(z, count):
+            search.exhausted = False
             if batch is None:
                 converged = METHODS[method](search, z, iterations)
             else:
-                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, i]))
+                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, search.start]))
             outcomes.append(_outcome(search, z, count, converged))
+
+        for z in distinct_starts(zs, merits, starts, first):
+            search.start = len(outcomes)
+            begin(z, len(search.history))
+        search.start, count = len(outcomes), len(search.history)
+        z = best_screened(search, zs, costs, margins)
+        if z is not None:
+            begin(z, count)
         search.start = len(outcomes)
         if search.best is not None and search.violation(search.best) > 0 and method not in FREELY:
             least = _find_feasible(search, zs, margins, iterations)
+        approach(search)
         if tolerance is not None and search.best is not None:
             polished = _settled(search, outcomes, iterations)
         elif method in ("slsqp", "trf", "coarse-trf", "trf-slsqp") and search.best is not None:
             polished = slsqp(search, search.best.z, iterations, tolerance=1e-12)
-        if search.best is not None and search.violation(search.best) == 0:
-            settled = _at_rest(search, iterations)
-            curved = evidence.curvature(problem, search, search.best)
+        if search.best is not None:
+            held = search.violation(search.best) == 0
+            settled = held and _at_rest(search, iterations)
+            idle = evidence.unexercised(problem, search, first)
+            curved = evidence.curvature(problem, search, search.best, idle) if held else None
     except KeyboardInterrupt:
         interrupted = True
     best = search.best if search and search.best else None
@@ -141,6 +155,7 @@ def tune(
     values = problem.values(z)
     if best is not None and np.array_equal(z, first):
         values = own_values(problem)
+    values |= {n: v for (n, v), still in zip(own_values(problem).items(), idle) if still}
     felt = [None] * len(z) if interrupted or best is None else evidence.felt(problem, z)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
@@ -174,8 +189,9 @@ def tune(
                 "upper": b.high,
                 "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
                 "felt_percent": f,
+                "exercised": not still,
             }
-            for b, v, f in zip(problem.bounds, z, felt)
+            for b, v, f, still in zip(problem.bounds, z, felt, idle.tolist())
         },
         objective={"before": problem.total(tables["before"]), "after": problem.total(tables["after"]), "terms": problem.objective},
         measures={"before": before, "after": after},
@@ -289,7 +305,8 @@ def run_measures(loop, clock, key):
 
 
 def _outcome(search, z, count, converged):
-    """One local search: where it began, the best it reached, and whether it converged."""
+    """One local search: where it began, the best it reached, whether it converged, and whether it
+    used up its iterations."""
     mine = search.history[count:]
     reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
     if reached is None:  # every point it asked for was known already
@@ -302,16 +319,17 @@ def _outcome(search, z, count, converged):
         "violation": reached[2],
         "evaluations": len(mine),
         "converged": converged,
+        "exhausted": search.exhausted,
     }
 
 
 def _at_rest(search, iterations):
-    """True if nothing lower is found along what is left of the slope at the best point; where there is, the search goes on from it, a few
-    times."""
+    """True if nothing lower is found along the slope that is left at the best point, and that slope
+    is below UNSTABLE. Where there is something lower, the search goes on from it, a few times."""
     for _ in range(RENEWED):
         better = downhill(search, search.best)
         if better is None:
-            return True
+            return optimality(search, search.best)[1] < UNSTABLE
         slsqp(search, better.z, iterations)
     return downhill(search, search.best) is None
 

@@ -21,6 +21,9 @@ STEEPEST = 10.0
 STILL, LONG = 1e-9, 25
 """Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a line search never ends by itself [-]."""
 
+ITERATION_LIMIT = 9
+"""Status of scipy's SLSQP that has used up its iterations."""
+
 ROUGHLY = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
@@ -30,12 +33,14 @@ class Search:
 
     def __init__(self, problem, reference, report, tolerance=1e-8):
         self.problem, self.report, self.tolerance = problem, report, tolerance
-        self.scale = reference.cost if reference.finite and reference.cost > 0 else 1.0
+        # a cost can be a scale where its slopes are not to be used
+        self.scale = reference.cost if 0 < reference.cost < EXPLODED else 1.0
         self.room = problem.rooms
         # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
         # a search ends within its tolerance of a limit, on either side
         self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
         self.best_start = None
+        self.exhausted = False  # whether the last local search used up its iterations
         self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
 
     def point(self, z):
@@ -104,6 +109,7 @@ def slsqp(search, z, iterations, tolerance=None):
         )
     except _Settled:
         return True
+    search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
     return bool(done.success) or done.status == 8
 
@@ -157,6 +163,7 @@ def _epigraph(search, z, iterations, tolerance):
         constraints=[{"type": "ineq", "fun": holds, "jac": slopes}],
         options={"maxiter": iterations, "ftol": tolerance},
     )
+    search.exhausted = done.status == ITERATION_LIMIT
     return bool(done.success) or done.status == 8
 
 
@@ -194,6 +201,7 @@ def trf(search, z, iterations, tolerance=1e-10):
         gtol=tolerance,
         max_nfev=iterations,
     )
+    search.exhausted = done.status == 0
     return bool(done.success)
 
 
@@ -263,6 +271,32 @@ def restore(search, z, iterations):
     return bool(done.success) or done.status == 8
 
 
+def approach(search):
+    """Move the best feasible point towards a lower infeasible one, by halving the distance.
+
+    Only where each limit that is broken there has no slope at the feasible point: a measure that changes
+    in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along its boundary.
+    """
+    best = search.best
+    if best is None or search.violation(best) > 0:
+        return
+    blind = ~np.any(best.margin_slopes, axis=1)
+    outside = [
+        p
+        for p in search.memory.values()
+        if p.finite and p.cost < best.cost * (1 - LOWER_BY) and search.violation(p) < NEAR and np.all(p.margins[~blind] >= 0)
+    ]
+    if not outside:
+        return
+    out, inside = min(outside, key=lambda p: p.cost).z, best.z
+    for _ in range(HALVINGS):
+        middle = search.point(0.5 * (out + inside))
+        if middle.finite and search.violation(middle) == 0:
+            inside = middle.z
+        else:
+            out = middle.z
+
+
 def lbfgs(search, z, iterations):
     """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
     import optax
@@ -301,6 +335,7 @@ def minibatches(search, z, iterations, batch, rng):
         z = np.clip(z + np.asarray(update), 0.0, 1.0)
         if (k + 1) % every == 0:
             search.point(z)
+    search.exhausted = True
     return search.best is not None and optimality(search, search.best)[1] < SETTLED
 
 
@@ -332,7 +367,8 @@ def _augmented(search, z, iterations, optimiser, descend):
                 step, halvings = 0.5 * step, halvings + 1
                 new = np.clip(z + step, 0.0, 1.0)
             moved, z = float(np.linalg.norm(new - z)), new
-            if moved < 1e-6:
+            search.exhausted = moved >= 1e-6
+            if not search.exhausted:
                 break
         if len(weights):
             weights = np.maximum(0.0, weights - stiffness * search.margins(z)[0])
@@ -374,8 +410,15 @@ def _left(search, point):
     return residual, multipliers
 
 
+NEAR, HALVINGS = 0.1, 10
+"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
+
 STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 """Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
+
+UNSTABLE = 1.0 / STRIDES[-1]
+"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the least
+of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step."""
 
 LOWER_BY = 1e-4
 """Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""

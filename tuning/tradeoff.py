@@ -7,21 +7,37 @@ import numpy as np
 
 from jaxtank.errors import InputError
 from jaxtank.measures import check_names
-from tuning.objective import LOWER, Problem, resolve_limits, room_of
-from tuning.solvers import Search, restore, slsqp
+from tuning.objective import LOWER, Problem
+from tuning.screening import best_screened, screen
+from tuning.solvers import Search, approach, restore, slsqp
 
 MANY = 50
 """Values of the limit at most."""
 
 
-def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, scenarios=None, seed=0, iterations=60, start=None):
+def tradeoff(
+    case,
+    measure,
+    values,
+    *,
+    free=None,
+    objective=None,
+    limits=None,
+    scenarios=None,
+    seed=0,
+    iterations=60,
+    screening=64,
+    start=None,
+):
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
 
     Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
     limit) and from that of the next tighter one, and the best is kept: a tighter limit's answer holds a looser one too, so that the
-    objective never falls as the limit is drawn in.
+    objective never falls as the limit is drawn in. Where one of `screening` Sobol points, or a point
+    that was evaluated for another value, keeps the limit at a lower objective, the search is begun
+    again from it.
 
-    case, free, objective, limits, scenarios, seed, iterations: as in `tune`; the limit holds for every entry of the measure, the other
+    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit holds for every entry of the measure, the other
     limits stay; start: {name: value} to begin at, the case's own where None. Returns {"measure", "points": [{"limit", "status" ("converged",
     "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises InputError for an unknown measure and for values
     that are not finite.
@@ -36,17 +52,42 @@ def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, s
     z = problem.start()
     if start is not None:
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
-    found, begin = [], z
+    found, begin, known = [], z, {}
+
+    def solve(value, z):
+        answer = _solve(problem, {**others, measure: value}, z, iterations)
+        known.update(answer.search.memory)
+        return answer
+
     for value in values:
-        found.append(_solve(problem, {**others, measure: value}, z, iterations))
+        found.append(solve(value, z))
         if found[-1].broken and z is not begin:
-            found[-1] = _better(found[-1], _solve(problem, {**others, measure: value}, begin, iterations))
+            found[-1] = _better(found[-1], solve(value, begin))
         z = z if found[-1].best is None else found[-1].best.z
-    for k in reversed(range(len(values) - 1)):
-        if not found[k + 1].broken:
-            again = _solve(problem, {**others, measure: values[k]}, found[k + 1].best.z, iterations)
-            found[k] = _better(found[k], again)
+    for k in reversed(range(len(values))):
+        if k + 1 < len(values) and not found[k + 1].broken:
+            found[k] = _better(found[k], solve(values[k], found[k + 1].best.z))
+        problem.limit({**others, measure: values[k]})
+        search = found[k].search
+        other = best_screened(search, *_candidates(problem, known, screening, seed))
+        if other is not None:
+            found[k] = _Answer(search, slsqp(search, other, iterations))
+        approach(search)
+        known.update(search.memory)
     return {"measure": measure, "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)]}
+
+
+def _candidates(problem, known, screening, seed):
+    """Return (zs, costs, margins under the problem's limits) of screened points and of the finite Points
+    among `known`."""
+    zs, costs, margins, _ = screen(problem, screening, seed)
+    points = [p for p in known.values() if p.finite]
+    old = [problem.margins(p.measures) for p in points]
+    return (
+        np.concatenate([zs, [p.z for p in points]]),
+        np.concatenate([costs, [p.cost for p in points]]),
+        np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),
+    )
 
 
 class _Answer(NamedTuple):
@@ -74,9 +115,7 @@ def _better(one, other):
 
 def _solve(problem, limits, z, iterations):
     """The _Answer of `problem` under `limits` {measure: value}, searched from z (P,)."""
-    problem.limits = [limit for i, lane in enumerate(problem.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
-    problem.rooms = np.array([room_of(limit, problem.loop) for limit in problem.limits])
-    problem.memo = type(problem.memo)()  # margins are of the limits: what is remembered would be of the last ones
+    problem.limit(limits)
     search = Search(problem, problem.point(problem.start()), lambda s: None)
     converged = slsqp(search, z, iterations)
     if search.best is not None and search.violation(search.best) > 0:

@@ -73,6 +73,7 @@ def _tune(args):
 
         answer = {n: p["after"] for n, p in result.parameters.items()}
         options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}
+        options["screening"] = whole("--screening", args.screening, 1, 65536)
         result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, **options))
     if args.bound and result.status != "interrupted":
         from tuning.bound import bound

@@ -1,11 +1,13 @@
 """Pictures, page and folder of a tuning result."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank import rig
+from jaxtank.errors import InputError
 from jaxtank.files import check_folder
 from tuning.report import json_of, parts_of, worst_of_scenarios
 from tuning.saving import pngs, run_for_people, trajectory_csv, write_files
@@ -93,13 +95,13 @@ def page_of(result, drawn, command=None):
 
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
-    broken = [c for c in result.constraints if c["margin"] < 0]
+    broken, (rig_text, _) = [c for c in result.constraints if c["margin"] < 0], rig_of(result)
     limits = f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold" if result.constraints else "none"
     facts = [
         ("objective before", f"{number(before)} {unit}".strip()),
         ("objective after", f"{number(after)} {unit}".strip()),
         ("limits", limits),
-        ("gains tuned", str(len(result.parameters))),
+        ("gains tuned", str(sum(p["exercised"] for p in result.parameters.values()))),
         ("simulations", str(result.evaluations["simulations"])),
         ("time", f"{result.wall_s:.1f} s"),
     ]
@@ -116,7 +118,7 @@ def page_of(result, drawn, command=None):
         parts_of(result)[1:],
         command,
         result.provenance,
-        {"The tuned rig as a file (rig.toml)": rig.dump(result.tuned)},
+        {"The tuned rig as a file (rig.toml)": rig_text} if rig_text else None,
     )
 
 
@@ -185,20 +187,42 @@ def _landscape(ax, result, unit):
     return ax
 
 
+def rig_of(result):
+    """Return (text of rig.toml, None), or (None, why there is none).
+
+    A class of one's own has no name in a rig file.
+    """
+    try:
+        return rig.dump(result.tuned), None
+    except InputError as error:
+        gains = ", ".join(f"{n} = {p['after']!r} {p['unit']}" for n, p in result.parameters.items())
+        return None, f"rig.toml is not written ({error}); set in Python what was tuned: {gains}"
+
+
 def save(result, folder, command=None):
     """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
 
-    command: the line that made the result, for the report, where there is one.
+    command: the line that made the result, for the report, where there is one. A case that no rig file
+    can describe (with a plant or a controller class of one's own) has no rig.toml: a UserWarning,
+    result.json and the report give the reason, and the rig.toml of an earlier result is removed.
     """
     check_folder(folder)
     folder = Path(folder)
+    rig_text, why = rig_of(result)
+    if why:
+        warnings.warn(why, stacklevel=3)  # the line that called result.save
+        result = result.replace(message=f"{result.message}; {why}")
     key = result_key(result)
     runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
     files = {
         "result.json": dumps(json_of(result)) + "\n",
-        "rig.toml": rig.dump(result.tuned),
+        **({"rig.toml": rig_text} if rig_text else {}),
         "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
         "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
     drawn = figures(result, runs)
-    return write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
+    stale = not rig_text and (folder / "result.json").is_file()
+    written = write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
+    if stale:  # of another result: its gains must not be taken for these
+        (folder / "rig.toml").unlink(missing_ok=True)
+    return written

@@ -43,7 +43,7 @@ def origin_of(case):
 
 
 def _statics(loop):
-    return [value for _, value, _ in walk(loop, kind="static")] + [np.asarray(loop.plant.area).tolist()]
+    return [value for _, value, _ in walk(loop, kind="static")] + [np.asarray(getattr(loop.plant, "area", ())).tolist()]
 
 
 def _optional(loop, fields=None):

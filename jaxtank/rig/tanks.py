@@ -261,8 +261,12 @@ def _entry(kind, index, entry, fields, units):
 
 def entries_of(loop, names):
     """[(title, kind, {key: value})] that describe the rig of a loop tank by tank. A steady inflow is the tanks' own. names: those of a
-    Case; "name" is (name, number from 1)."""
+    Case; "name" is (name, number from 1).
+
+    Raises InputError for a plant of another class than TankNetwork."""
     plant, bank, found = loop.plant, loop.actuator, []
+    if not isinstance(plant, TankNetwork):
+        raise InputError(f"its {type(plant).__name__} has no name in a rig file")
     steady = np.asarray(loop.disturbance.level) if isinstance(loop.disturbance, Constant) else np.zeros(plant.tanks)
     columns = {
         "area": plant.area,
