@@ -83,10 +83,10 @@ def run(args):
         raise InputError(f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of samples of the log")
     noise = None
     if args.noise is not None:
-        noise = [arguments.number("--noise", text) for text in args.noise.split(",")]
-        if min(noise) <= 0:
-            raise InputError(f"--noise {args.noise!r}: must be above 0")
-        noise = noise[0] if len(noise) == 1 else noise
+        noise = arguments.parse_value(args.noise, "--noise")
+        entries = noise if isinstance(noise, list) else [noise]
+        if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
+            raise InputError(f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel")
     gap = arguments.number("--gap", args.gap)
     if not gap >= 1:
         raise InputError(f"--gap {args.gap!r}: must be at least 1")
