@@ -263,7 +263,7 @@ def _shown(case):
     from jaxtank.tree import walk
 
     found = {}
-    for name, value, meta in walk(case.loop.controller, "controller."):
+    for name, value, meta in walk(case.loop.controller, "controller.", units=case.loop.units):
         if value is not None and ".model." not in name:
             unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
             found[name] = (

@@ -43,7 +43,11 @@ def schedule(texts):
         variable, colon, knots = rule.partition(":")
         if not colon:
             raise InputError(f"--schedule {name}={rule!r}: must be NAME=VARIABLE:K1,K2,...")
-        return {"gains": [n for n, _ in found], "variable": variable.strip(), "knots": parse_value(f"[{knots}]", f"--schedule {name}")}
+        return {
+            "gains": [n for n, _ in found],
+            "variable": variable.strip(),
+            "knots": parse_value(f"[{knots}]", f"--schedule {name}"),
+        }
     return {}
 
 
