@@ -1,5 +1,8 @@
 """Doors to other libraries: python-control, tables, Gymnasium."""
 
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -105,3 +108,29 @@ def test_noise_of_the_environment_follows_its_seed():
     env = TankEnv(case)
     one, two, other = (env.reset(seed=s)[0] for s in (1, 1, 2))
     assert np.array_equal(one, two) and not np.array_equal(one, other)
+
+
+def test_modules_are_reached_from_the_package_when_they_are_used():
+    """Nothing of them is imported with `jaxtank`; without gymnasium only its environment is missing."""
+    code = """
+import sys
+sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
+import jaxtank
+from jaxtank import *
+assert not {"jaxtank.neighbours", "jaxtank.environment", "jaxtank.export"} & set(sys.modules)
+assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
+assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
+try:
+    jaxtank.environment
+except ImportError as error:
+    print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.startswith("jaxtank.environment needs gymnasium: pip install gymnasium")
+
+
+def test_the_environment_is_reached_from_the_package():
+    pytest.importorskip("gymnasium")
+    ran = subprocess.run([sys.executable, "-c", "import jaxtank; print(jaxtank.environment.TankEnv.__name__)"], capture_output=True)
+    assert ran.stdout.decode().strip() == "TankEnv", ran.stderr
