@@ -62,16 +62,18 @@ _ROOMS = (
     "tree",
 )
 
+_OPTIONAL = ("environment", "export", "neighbours")  # not in __all__: `import *` must not need gymnasium
+
 __all__ = [*_HOMES, *_ROOMS]
 
 
 def __getattr__(name):
     if name in _HOMES:
         return getattr(importlib.import_module(_HOMES[name]), name)
-    if name in _ROOMS:
+    if name in _ROOMS or name in _OPTIONAL:
         return importlib.import_module(f"jaxtank.{name}")
     raise AttributeError(f"module 'jaxtank' has no attribute {name!r}")
 
 
 def __dir__():
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *__all__, *_OPTIONAL})

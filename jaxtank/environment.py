@@ -2,7 +2,10 @@
 
 import functools
 
-import gymnasium
+try:
+    import gymnasium
+except ImportError:
+    raise ImportError('jaxtank.environment needs gymnasium: pip install gymnasium, or "jaxtank[gym]"') from None
 import jax
 import jax.numpy as jnp
 import numpy as np

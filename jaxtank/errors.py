@@ -26,6 +26,8 @@ def nearest(name, names, count=3):
         difflib.get_close_matches(name, names, n=count, cutoff=0.3)
         or sorted(names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio())[:count]
     )
+    alike = [other for other in names if other.lower() == name.lower()]  # but for capitals
+    close = [*alike, *(other for other in close if other not in alike)][:count]
     return f"; nearest: {', '.join(close)}" if close else ""
 
 

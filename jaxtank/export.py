@@ -10,7 +10,7 @@ from jaxtank import codegen as cg
 from jaxtank.controllers import OpenLoop
 from jaxtank.errors import InputError
 from jaxtank.records import Tick
-from jaxtank.stepping import initial
+from jaxtank.stepping import commanded, initial
 
 LANGUAGES = ("c", "m")
 PRECISIONS = ("double", "float")
@@ -38,7 +38,7 @@ def law_of(case):
         plan = jax.tree.map(lambda a: a[0], loop.controller.prepare(*samples))
         tick = Tick(t=t, r=r, dr=dr, ddr=ddr, dt=dt, plan=plan, own=())
         estimate, observer = loop.observer.step(observer, tick, one(y))
-        command, controller = loop.controller.step(controller, tick, estimate)
+        command, controller = commanded(loop, controller, tick, estimate)
         metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
         applied = loop.actuator.limit(command, metric)
         observer = loop.observer.predict(observer, tick, command, applied)
@@ -263,7 +263,7 @@ def _shown(case):
     from jaxtank.tree import walk
 
     found = {}
-    for name, value, meta in walk(case.loop.controller, "controller."):
+    for name, value, meta in walk(case.loop.controller, "controller.", units=case.loop.units):
         if value is not None and ".model." not in name:
             unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
             found[name] = (

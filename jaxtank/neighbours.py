@@ -1,4 +1,4 @@
-"""Doors to other libraries: a python-control system of any rig, the columns of a run for pandas or xarray."""
+"""Interoperability: a python-control system of any rig, the columns of a run for pandas or xarray."""
 
 import numpy as np
 
@@ -7,33 +7,53 @@ from jaxtank.errors import InputError
 from jaxtank.units import local
 
 
-def to_control(plant, outputs=None, *, levels=None, inputs=None):
-    """The rig linearised at a steady state, as a `control.StateSpace` of python-control: delta x' = A delta x + B delta u, y = C delta x.
+def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):
+    """Return the rig linearised at a steady state as a `control.StateSpace` of python-control.
 
-    plant: a rig; outputs: (p,) levels of its controlled tanks at which it rests, in its unit of length; or levels (n,) and inputs (m,), where
-    the operating point is known. States are named h1 .., inputs pump1 .., outputs after their tanks. Raises InputError if python-control is
-    not installed (pip install control), or for an operating point that is not one.
+    delta x' = A delta x + B delta u, delta y = C delta x; states are named h1 .., inputs
+    pump1 .., outputs y_h1 ...
+
+    Parameters
+    ----------
+    plant : a rig of n tanks and m pumps.
+    outputs : indices of the tanks, from 0, whose levels are the system's outputs;
+        None: the rig's own, `plant.outputs`.
+    setpoints : (p,) steady levels of the rig's controlled tanks, in its unit of length.
+    levels, inputs : (n,) and (m,), instead of setpoints: the operating point itself.
+
+    Raises
+    ------
+    InputError : python-control is not installed (pip install control), an output is no tank of
+        the rig, or the operating point is missing, given twice or not finite.
     """
     try:
         import control
     except ImportError:
         raise InputError("to_control needs python-control: pip install control") from None
-    if (outputs is None) == (levels is None) or (levels is None) != (inputs is None):
-        raise InputError("to_control: give outputs to rest at, or both levels and inputs")
-    if outputs is not None:
-        levels, inputs = equilibrium(plant, outputs)
+    outputs = plant.outputs if outputs is None else outputs
+    if not all(isinstance(i, (int, np.integer)) and 0 <= i < plant.tanks for i in outputs):
+        raise InputError(
+            f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to {plant.tanks - 1}; "
+            "steady levels are given as setpoints=(...)"
+        )
+    if (setpoints is None) == (levels is None) or (levels is None) != (inputs is None):
+        raise InputError("to_control: give setpoints=(...), steady levels of the controlled tanks, or both levels and inputs")
+    if setpoints is not None:
+        if np.shape(setpoints) != (len(plant.outputs),):
+            raise InputError(f"to_control: setpoints = {setpoints!r}: must be {len(plant.outputs)} levels [{plant.units[0]}]")
+        levels, inputs = equilibrium(plant, setpoints)
     for name, value, size in (("levels", levels, plant.tanks), ("inputs", inputs, plant.pumps)):
         if np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")
-    A, B, C = (np.asarray(M) for M in linearise(plant, levels, inputs))
+    A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
     return control.ss(
         A,
         B,
-        C,
-        np.zeros((len(C), plant.pumps)),
+        np.eye(plant.tanks)[list(outputs)],
+        np.zeros((len(outputs), plant.pumps)),
         states=[f"h{i + 1}" for i in range(plant.tanks)],
         inputs=[f"pump{j + 1}" for j in range(plant.pumps)],
-        outputs=[f"y_h{i + 1}" for i in plant.outputs],
+        outputs=[f"y_h{i + 1}" for i in outputs],
     )
 
 
@@ -50,14 +70,28 @@ FIELDS = (
 """Columns of a run: (name, field of `Trajectory`, unit)."""
 
 
-def columns(run, units=("cm", "V")):
-    """{column with its unit: (rows,) array} of a Trajectory: `pandas.DataFrame(columns(run))`, or xarray's variables.
+def columns(run, units=("cm", "V"), dimension=None):
+    """Return the columns of a Trajectory, for pandas or xarray.
 
-    run: as `jaxtank.simulate` gives it; units: those of the rig, loop.units. Time, levels h, readings y, estimates, setpoints r, inputs u, and
-    what was lost over the rims.
+    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and what was lost over
+    the rims.
+
+    Parameters
+    ----------
+    run : Trajectory, as `jaxtank.simulate` returns it.
+    units : (length, pump input) of the rig, `loop.units`.
+    dimension : None, or the name of the one dimension that all columns share in xarray.
+
+    Returns
+    -------
+    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
+    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
+    `xarray.Dataset(columns(run, dimension="t"))`.
     """
-    found = {"t [s]": np.asarray(run.t)}
+    found = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
         values = np.asarray(getattr(run, field))
-        found |= {f"{name}{i + 1} [{local(unit, units)}]": values[:, i] for i in range(values.shape[1])}
-    return found
+        found |= {(f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])}
+    if dimension is None:
+        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
+    return {dimension if name == "t" else name: (dimension, values, {"units": unit}) for (name, unit), values in found.items()}

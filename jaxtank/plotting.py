@@ -1,6 +1,7 @@
 """Pictures: one function each, drawn on given matplotlib axes and returning them. The only room here that imports matplotlib."""
 
 import contextlib
+import itertools
 import textwrap
 
 import matplotlib.pyplot as plt
@@ -15,6 +16,9 @@ BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
     "#CC79A7",
     "#009E73",
 )  # Okabe and Ito, colour-blind safe
+RUNS = ((BEFORE, "--"), (AFTER, "-"), (OTHER, "-."), ("#E69F00", "-"), ("#56B4E9", "--"), ("0.45", "-."))
+"""(colour, line style) of the runs that are drawn over each other; from the seventh on the colours return in other styles."""
+
 WATER, GLASS = "#9CCEEB", "0.35"
 """What is in a tank and what it is made of, in drawings of a rig."""
 
@@ -108,9 +112,10 @@ def responses(loop, trajectories, title="", limits=None):
 
     trajectories: {name: Trajectory}, the first drawn dashed where there are several; limits: (tanks,) level limits [cm] or None.
     """
-    names = list(trajectories)
-    styles = [(AFTER, "-")] if len(names) == 1 else [(BEFORE, "--"), (AFTER, "-"), (OTHER, "-.")]
-    drawn = {name: (run, *style) for (name, run), style in zip(trajectories.items(), styles)}
+    count = len(RUNS)
+    again = [(colour, RUNS[(i + i // count) % count][1]) for i, (colour, _) in zip(range(len(trajectories)), itertools.cycle(RUNS))]
+    styles = [(AFTER, "-")] if len(trajectories) == 1 else again
+    drawn = {name: (run, *style) for (name, run), style in zip(trajectories.items(), styles, strict=True)}
     outputs = list(loop.plant.outputs)
     others = [i for i in range(loop.plant.tanks) if i not in outputs]
     if len(others) > SHOWN:
@@ -150,7 +155,8 @@ def responses(loop, trajectories, title="", limits=None):
         for ax in axes.flat:
             for handle, label in zip(*ax.get_legend_handles_labels()):
                 handles.setdefault(label, handle)
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+        across = len(handles) if len(handles) <= 6 else max(4, round(width / 2))  # entries beside each other
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=across)
         figure.suptitle("\n".join(textwrap.fill(plain(line), int(12 * width)) for line in title.splitlines()), fontsize=10)
     return figure
 
@@ -333,8 +339,10 @@ def fan(loop, bands, title):
                     linestyle="--",
                     label="setpoint",
                 )
-            if high.max() > 0.5 * rims[i]:
+            if high.max() > 0.25 * rims[i]:
                 ax.axhline(rims[i], color="#D55E00", linewidth=1.0, label="rim")
+            else:  # a rim far above all levels would only flatten the picture
+                ax.plot([], [], color="#D55E00", linewidth=1.0, label=f"rim {rims[i]:g} {loop.units[0]}, above the picture")
             ax.set_title(f"tank {i + 1}")
             ax.set_ylabel(f"level [{loop.units[0]}]")
             ax.legend(loc="best", fontsize="x-small")

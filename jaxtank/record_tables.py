@@ -17,7 +17,7 @@ def check_log(plant, table):
         if not (isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2 and all(isinstance(v, str) and v.strip() for v in pair)):
             raise InputError(f"log {slot} = {_short(spec)}: must be a column's header, or [header, unit]")
         for other, taken in found.items():
-            if (taken if isinstance(taken, str) else taken[0]).strip() == pair[0].strip():
+            if (taken if isinstance(taken, str) else taken[0]).strip() == pair[0].strip() != "none":
                 raise InputError(f"log {slot} = {_short(pair[0])}: that column is {other} already")
         found[slot] = pair[0] if len(pair) == 1 else tuple(pair)
     return found

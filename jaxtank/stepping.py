@@ -147,7 +147,7 @@ def step(loop, clock, state, now):
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y = loop.sensor.read(state.x, now.xi)
     estimate, observer = loop.observer.step(state.observer, tick, y)
-    command, controller = loop.controller.step(state.controller, tick, estimate)
+    command, controller = commanded(loop, state.controller, tick, estimate)
     metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
     applied = loop.actuator.limit(command, metric)
     observer = loop.observer.predict(observer, tick, command, applied)
@@ -170,6 +170,24 @@ def step(loop, clock, state, now):
         spilled=spilled,
     )
     return State(state.k + 1, x, observer, controller, actuator, excess), sample
+
+
+def commanded(loop, state, tick, estimate):
+    """Return the controller's ((m,) inputs before their limits, new state).
+
+    Raises InputError, while the loop is traced, for a number of inputs that is not that of the pumps.
+    """
+    command, state = loop.controller.step(state, tick, estimate)
+    pumps = loop.plant.pumps
+    count = (len(command),) if isinstance(command, tuple | list) else np.shape(command)[:1]
+    if count != (pumps,):
+        law = type(loop.controller).__name__
+        found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
+        raise InputError(
+            f"controller {law}: its step returns {found} for {pumps} pump{'' if pumps == 1 else 's'}: "
+            "must return (inputs, state), a tuple with one input for each pump"
+        )
+    return command, state
 
 
 def _advance(plant, clock, t, x, excess, u, d):

@@ -242,4 +242,5 @@ def _fitted(old, index, value, name):
         return value
     if np.ndim(value) == 0:
         return jnp.broadcast_to(value, shape) if on_device else np.full(shape, value)
-    raise InputError(f"{name} has shape {np.shape(value)}: must be a number or shape {shape}")
+    wanted = f"must be a number or shape {shape}" if shape else "must be one number, its decimals after a point"
+    raise InputError(f"{name} has shape {np.shape(value)}: {wanted}")

@@ -6,6 +6,7 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.errors import InputError
 from jaxtank.loop import _evaluate
 from jaxtank.tree import get_value, walk
 from tuning import cli
@@ -117,3 +118,30 @@ def test_printed_units_follow_the_rig(capsys):
     said = capsys.readouterr().out
     assert " m " in said and "m^3/s" in said and "cm" not in said
     assert jaxtank.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"] == "m^3/(s U0)"
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("gouta2015/backsteping", "gouta2015/backstepping"),
+        ("mirakhorli/SFC", "mirakhorli/sfc"),
+        ("Gouta2022/PI", "gouta2022/pi"),
+        ("khalid/ngpc", "khalid/gpc"),  # of the paper that is named, not of the others
+        ("laguerre-constrained", "khalid/laguerre-constrained"),
+    ],
+)
+def test_a_mistyped_case_is_answered_with_the_nearest(name, nearest):
+    with pytest.raises(InputError, match=rf"^unknown case {name!r}; nearest: {nearest}(,|$)"):
+        presets.find(name)
+    paper, _, case = name.partition("/")
+    if paper in presets.PAPERS:
+        with pytest.raises(InputError, match=rf"^unknown case {case!r}; nearest: {nearest.partition('/')[2]}(,|$)"):
+            presets.load(paper).cases[case]
+
+
+@pytest.mark.parametrize("name", [None, 3, ("gouta2015", "ngpc")])
+def test_a_case_that_is_no_text_is_refused(name):
+    with pytest.raises(InputError, match="must be a text, as 'gouta2015/ngpc'"):
+        presets.find(name)
+    with pytest.raises(InputError, match="unknown paper"):
+        presets.load(name)

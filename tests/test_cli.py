@@ -631,7 +631,22 @@ BAD = [  # arguments, words that the line must have
     (["tune", CASE, "--limit", "max_level=high"], "limit max_level = 'high': must be a finite number [cm]"),
     (["tune", CASE, "--limit", "max_level=nan"], "limit max_level = nan: must be a finite number"),
     (["tune", CASE, "--limit", "max_level=true"], "limit max_level = True"),
-    (["tune", CASE, "--limit", "max_level=1,2"], "or 4 of them"),
+    (["tune", CASE, "--limit", "max_level=[1,2]"], "or 4 of them"),
+    (["tune", CASE, "--limit", "max_level=30,5"], "--limit max_level=30,5: the comma may be a decimal one: write 30.5"),
+    (["simulate", CASE, *setting("sensor.noise=0,05")], "write 0.05, with a point, for a number, or [0, 5] for a list"),
+    (["simulate", CASE, *setting("actuator.high=12,10")], "write 12.10, with a point, for a number, or [12, 10] for a list"),
+    (["simulate", CASE, *setting("clock.dt=0,1")], "--set clock.dt=0,1: the comma may be a decimal one: write 0.1"),
+    (["simulate", CASE, *setting("controller.k=-1,5e-2")], "write -1.5e-2, with a point"),
+    (["simulate", CASE, *setting("plant.rim=1.000,5")], "write 1000.5, with a point"),
+    (["simulate", CASE, *setting("sensor.noise=1,,5")], "--set sensor.noise=1,,5: an entry of the list is empty"),
+    (["simulate", CASE, *setting("sensor.noise=[1,]")], "--set sensor.noise=[1,]: an entry of the list is empty"),
+    (["simulate", CASE, *setting("sensor.noise=,")], "--set sensor.noise=,: an entry of the list is empty"),
+    (["simulate", CASE, *setting("sensor.noise=0,05,0,05")], "entry 05 begins with a zero"),
+    (["simulate", CASE, *setting("controller.k=[1,2]")], "controller.k has shape (2,): must be one number"),
+    (["simulate", CASE, "--schedule", "controller.k=r1:3,,6"], "--schedule controller.k=[3,,6]: an entry of the list is empty"),
+    (["tune", CASE, "--scenario", "sensor.noise=0,02"], "--scenario sensor.noise=0,02: the comma may be a decimal one"),
+    (["tune", CASE, "--choose", "clock.substeps=1,,2"], "--choose clock.substeps=1,,2: must be values with commas"),
+    (["tune", CASE, "--choose", "controller.k=0,05"], "--choose controller.k=0,05: must be values with commas"),
     (["tune", CASE, "--limit", "rms_error=rim"], "limit rms_error = 'rim': must be a finite number"),
     (["tune", CASE, "--method", "newton"], "'newton': must be one of auto"),
     (["tune", CASE, "--method", "trf"], "trf cannot hold limits"),
@@ -681,6 +696,12 @@ def test_bad_input_is_told_in_one_line_and_leaves_nothing(args, words, here):
     assert said.err.count("\n") == 1 and said.err.endswith("\n") and said.err.startswith("jaxtank: ")
     assert words in said.err
     assert {p.name: p.read_text(encoding="utf-8") for p in here.iterdir()} == RIGS
+
+
+def test_a_list_whose_comma_cannot_be_a_decimal_one_is_read():
+    for text in ("[11, 12]", "[11,12]", "11.0,12.0", "11, 12"):
+        said = done("simulate", "cascaded/pi", *setting("clock.duration=20", f"plant.rim={text}"), "--dt", "1", "--json")
+        assert said.json["parameters"]["plant.rim"] == [11.0, 12.0]
 
 
 @pytest.mark.parametrize(

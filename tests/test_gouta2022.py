@@ -475,3 +475,7 @@ def test_the_rig_that_was_fitted_to_the_paper():
     np.testing.assert_allclose(mean("error"), (0.622, 1.171), atol=0.01)
     # the noise throws the second level out of its band once more, much later, in three of these draws: the median
     np.testing.assert_allclose(np.median([f["settling"] for f in found], axis=0), (24.9, 34.2), atol=0.6)
+
+
+def test_the_citation_names_the_authors():
+    assert presets.load("gouta2022").citation.startswith("H. Gouta, W. H. Al-Ashek, B. Saad, Automatika 63(3), 2022")

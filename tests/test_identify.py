@@ -7,6 +7,7 @@ import io
 import json
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -22,6 +23,7 @@ from tuning.coordinates import coordinates
 from tuning.distributions import Draws
 from tuning.ensemble import spread_of
 from tuning.experiments import candidates, compare_experiments, settled
+from tuning.proposal import with_pi
 
 RECORD = pathlib.Path(__file__).parents[2] / "shared" / "data" / "cascaded_tanks.csv"
 recorded = pytest.mark.skipif(
@@ -798,6 +800,9 @@ def test_the_page_names_what_matters(identified):
         (("--data", "LOG", "--column", "h1=x"), 5, "no column 'x'"),
         (("--data", "LOG", "--column", "h1"), 2, "--column"),
         (("--data", "LOG", "--decimal", ";"), 2, "--decimal"),
+        (("--data", "LOG", "--law", "pid"), 2, "--law 'pid': must be one of pi"),
+        (("--data", "LOG", "--noise", "0,05"), 2, "--noise=0,05: the comma may be a decimal one"),
+        (("--data", "LOG", "--column", "pump1=none"), 2, "only a level may be left out"),
         (("--data", "LOG", "--iterations", "0"), 2, "--iterations"),
         (("--data", "LOG", "--dta", "x"), 2, "nearest: --data"),
         (("--plan", "--duration", "0"), 2, "--duration"),
@@ -836,6 +841,115 @@ def test_a_log_that_cannot_tell_writes_no_rig(tmp_path, resting):
     code, said, told = command("identify", str(rig_file), "--data", str(path), *FLAGS[2:], "--out", str(out), "--quiet")
     assert code == 5 and told.count("\n") == 1 and "cannot tell apart" in told and "no rig is written" in told
     assert not (out / "rig.toml").exists() and "not identifiable" in said and "What would tell them apart" in said
+
+
+# A rig without a controller
+
+OPEN = """
+name = "one tank"
+[[tank]]
+area = 100.0
+rim = 40.0
+drain = 0.5
+level = 5.0
+[[pump]]
+gain = 15.0
+to = 1
+high = 10.0
+initial = 3.0
+[law]
+kind = "open-loop"
+initial = [3.0]
+changes = [[60.0, 1, 6.0], [260.0, 1, 4.0]]
+[values]
+"clock.dt" = 2.0
+"clock.duration" = 400.0
+"""
+
+
+def log_of(text, folder):
+    """The rig file `text` and a log of its run, with noise, in `folder`."""
+    (folder / "rig.toml").write_text(text)
+    run = jaxtank.simulate((case := rig.loads(text)).loop, case.clock)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(len(run.t))
+    rows = [f"{t:g},{u:.5g},{h + e:.5g}" for t, u, h, e in zip(run.t, run.u[:, 0], run.x[:, 0], noise)]
+    (folder / "log.csv").write_text("t [s],pump1 [V],h1 [cm]\n" + "\n".join(rows) + "\n")
+
+
+def estimated(folder, out, *more):
+    ranges = ("--free", "plant.pump_gain=5:30", "--free", "plant.drain=0.1:2", "--starts", "1")
+    data = ("--data", str(folder / "log.csv"), "--out", str(folder / out))
+    return command("identify", str(folder / "rig.toml"), *data, *ranges, *more)
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """A folder with a rig of one tank in open loop, a log of it, and in "pi" what `identify --law pi` makes of them; its output."""
+    folder = tmp_path_factory.mktemp("open")
+    log_of(OPEN, folder)
+    return folder, estimated(folder, "pi", "--law", "pi")
+
+
+QUICK = ("--samples", "2", "--fresh", "2", "--starts", "1", "--screening", "1", "--iterations", "1", "--quiet")
+
+
+def test_a_rig_without_a_controller_is_not_sent_to_the_tuner(logged):
+    folder, _ = logged
+    code, _, err = estimated(folder, "plain")
+    assert code == 0 and "go on with" not in err
+    assert "rig.toml has no controller to tune: identify with --law pi" in err.splitlines()[-1]
+    assert command("tune", str(folder / "plain" / "rig.toml"), "--robust", "cvar")[0] == 2  # as the note says
+
+
+def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
+    """Kc = 0.5/K and Ti = T/2 of one tank, K = k/G, T = A/G with G = s sqrt(g / 2 h) at the mean input of the log."""
+    folder, (code, out, err) = logged
+    found = rig.load(folder / "pi" / "rig.toml")
+    k, s = float(found.loop.plant.pump_gain[0]), float(found.loop.plant.drain[0])
+    mean = np.loadtxt(folder / "log.csv", delimiter=",", skiprows=1)[:, 1].mean()
+    level = (k * mean / s) ** 2 / (2 * 981.0)
+    G = s * np.sqrt(981.0 / (2.0 * level))
+    law = found.loop.controller
+    assert float(law.Kc[0]) == pytest.approx(0.5 * G / k, rel=1e-4)
+    assert float(law.Ti[0]) == pytest.approx(50.0 / G, rel=1e-4)
+    assert float(found.loop.x0[0]) == pytest.approx(level, rel=1e-4) and float(law.bias[0]) == pytest.approx(mean)
+    assert set(found.free) == {"controller.Kc", "controller.Ti"} and "proposed: PI with controller.Kc" in out
+    run = jaxtank.evaluate(found.loop, found.clock, ["settling_time", "max_level"], key=jax.random.key(0))
+    assert code == 0 and run["max_level"][0] < 1.2 * level
+    words = err.splitlines()[-1].removeprefix("go on with: jaxtank ").split()
+    code, out, err = command(*words, *QUICK)
+    assert code in (0, 3) and "controller.Kc[0]" in out, err
+
+
+def test_robust_tuning_without_the_scenarios_of_the_rig(logged):
+    """Costs of the drawn plants are those of the rig's own run, not of its scenario with a setpoint ten times further."""
+    file = logged[0] / "pi" / "scenario.toml"
+    file.write_text(
+        (logged[0] / "pi" / "rig.toml").read_text() + '[[scenario]]\nname = "far"\nvalues = { "reference.targets" = [20.0] }\n'
+    )
+    case = rig.load(file)
+    own = float(jaxtank.evaluate(case.loop, case.clock, ["rms_error_total"], jax.random.key(0))["rms_error_total"])
+    for more, low, high in (((), 5.0, 50.0), (("--scenario", "none"), 0.9, 1.1)):
+        code, out, err = command("tune", str(file), "--robust", "mean", *QUICK, "--validation", "0", "--json", *more)
+        assert code in (0, 3), err
+        costs = [row["objective"]["before"] / own for row in json.loads(out)["scenarios"]]
+        assert low < min(costs) <= max(costs) < high
+
+
+def test_a_controller_that_cannot_be_proposed_leaves_the_rig_and_the_reason(tmp_path):
+    text = OPEN.replace("rim = 40.0", "rim = 15.0").replace("[[60.0, 1, 6.0], [260.0, 1, 4.0]]", "[[10.0, 1, 6.5]]")
+    log_of(text.replace('duration" = 400.0', 'duration" = 50.0'), tmp_path)
+    code, out, err = estimated(tmp_path, "out", "--law", "pi")
+    why = "tank 1 has no steady level between 0 and its rim at the mean inputs of the log"
+    assert code == 0 and f"note: --law pi: {why}" in err.splitlines()[-1]
+    assert f"no pi controller is proposed: {why}" in " ".join(out.split())
+    assert len(rig.load(tmp_path / "out" / "rig.toml").free) == 0
+
+
+def test_a_pi_controller_is_not_proposed_where_no_gain_is_stable(case):
+    """Integral action of pump i on output i of the non-minimum-phase rig: the relative gain is negative."""
+    with pytest.raises(InputError, match="output i under a PI of pump i is not stable at any gain"):
+        with_pi(case, np.array([3.0, 3.0]))
 
 
 # The public record

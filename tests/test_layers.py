@@ -41,7 +41,7 @@ ABOVE = [
         "one_line",
         "long_steps",
     },
-    {"log_file", "playback"},
+    {"log_file", "playback", "proposal"},
     {"experiments", "estimation", "identified"},
     {"identifiability"},
     {"identify", "many"},

@@ -177,6 +177,19 @@ def test_columns_named_by_option_or_rig(read, case):
     assert same(found, read(text()))
 
 
+def test_a_level_is_left_out_by_none(read, case):
+    """Whether its header names it, or the [log] table of a rig; a pump, or the time, is needed."""
+    assert read(text(), columns={"h3": "none", "h1": "none"}).tanks == (1, 3)
+    table = {"h1": "h3 [cm]", "h3": "h1 [cm]"}
+    assert read(text(), columns=table | {"h3": "none"}).tanks == (0, 1, 3)
+    assert rig.loads(rig.dump(case.replace(log={"h3": "none", "h4": "none"}))).log == {"h3": "none", "h4": "none"}
+    for slot in ("t", "pump2"):
+        with pytest.raises(InputError, match=f"log column {slot} = none: only a level may be left out"):
+            read(text(), columns={slot: "none"})
+    with pytest.raises(DataError, match="no column for a level"):
+        read(text(), columns=dict.fromkeys(("h1", "h2", "h3", "h4"), "none"))
+
+
 def test_the_log_table_of_a_rig_file(tmp_path, read, case):
     table = {"t": ("when", "s"), "pump1": "left [V]", "pump2": ("right", "mV"), "h2": ("b", "mm")}
     path = tmp_path / "rig.toml"

@@ -1,5 +1,8 @@
 """Doors to other libraries: python-control, tables, Gymnasium."""
 
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ def test_python_control_sees_the_linearised_rig():
     """mirakhorli at 12/12: zeros and steady gain of spec 1; poles from the printed time constants."""
     control = pytest.importorskip("control")
     plant = presets.find("mirakhorli/sfc").loop.plant
-    system = neighbours.to_control(plant, (12.0, 12.0))
+    system = neighbours.to_control(plant, setpoints=(12.0, 12.0))
     assert sorted(control.zeros(system).real) == pytest.approx([-0.10717, 0.02467], abs=1e-5)
     np.testing.assert_allclose(control.dcgain(system), [[3.5849, 4.0151], [4.9506, 2.0684]], atol=1e-4)
     np.testing.assert_allclose(sorted(-1 / control.poles(system).real), [19.0178, 33.4252, 43.2223, 43.2223], atol=1e-3)
@@ -25,12 +28,27 @@ def test_an_operating_point_is_asked_for():
     plant = presets.find("mirakhorli/sfc").loop.plant
     for options in (
         {},
-        {"outputs": (12.0, 12.0), "levels": (1.0,) * 4},
+        {"setpoints": (12.0, 12.0), "levels": (1.0,) * 4},
+        {"setpoints": (12.0,)},
+        {"outputs": (0, 1)},  # which levels are outputs: no operating point
+        {"outputs": (0, 4), "setpoints": (12.0, 12.0)},
+        {"outputs": (12.0, 12.0)},
         {"levels": (1.0,) * 4},
         {"levels": (1.0,) * 3, "inputs": (1.0, 1.0)},
     ):
         with pytest.raises(InputError, match="to_control"):
             neighbours.to_control(plant, **options)
+
+
+def test_outputs_of_the_system_are_indices_of_tanks_as_those_of_the_plant():
+    pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    system = neighbours.to_control(plant, [3, 0], setpoints=(12.0, 12.0))
+    assert system.output_labels == ["y_h4", "y_h1"]
+    np.testing.assert_array_equal(system.C, [[0, 0, 0, 1], [1, 0, 0, 0]])
+    np.testing.assert_allclose(system.A, neighbours.to_control(plant, setpoints=(12.0, 12.0)).A)
+    with pytest.raises(InputError, match=r"outputs = \[12.0, 12.0\]: must be indices .* given as setpoints"):
+        neighbours.to_control(plant, [12.0, 12.0])
 
 
 def test_columns_of_a_run_have_units():
@@ -39,6 +57,22 @@ def test_columns_of_a_run_have_units():
     found = neighbours.columns(run, case.loop.units)
     assert {"t [s]", "h1 [m]", "r1 [m]"} <= set(found) and len({len(v) for v in found.values()}) == 1
     np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
+
+
+def test_columns_share_one_dimension_where_it_is_named():
+    """As xarray takes them: (dimension, values, attributes), time the coordinate of the dimension's name."""
+    case = rig.set_values(presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0})
+    run = jaxtank.simulate(case.loop, case.clock)
+    found = neighbours.columns(run, case.loop.units, dimension="t")
+    flat = neighbours.columns(run, case.loop.units)
+    assert {dims for dims, _, _ in found.values()} == {"t"}
+    assert [f"{name} [{attrs['units']}]" for name, (_, _, attrs) in found.items()] == list(flat)
+    for (_, values, _), wanted in zip(found.values(), flat.values()):
+        np.testing.assert_array_equal(values, wanted)
+    xarray = pytest.importorskip("xarray")
+    data = xarray.Dataset(found)
+    assert dict(data.sizes) == {"t": len(flat["t [s]"])} and set(data.coords) == {"t"}
+    assert float(data.h1.sel(t=20.0, method="nearest")) == flat["h1 [m]"][int(np.abs(flat["t [s]"] - 20.0).argmin())]
 
 
 def test_the_environment_plays_the_case():
@@ -74,3 +108,29 @@ def test_noise_of_the_environment_follows_its_seed():
     env = TankEnv(case)
     one, two, other = (env.reset(seed=s)[0] for s in (1, 1, 2))
     assert np.array_equal(one, two) and not np.array_equal(one, other)
+
+
+def test_modules_are_reached_from_the_package_when_they_are_used():
+    """Nothing of them is imported with `jaxtank`; without gymnasium only its environment is missing."""
+    code = """
+import sys
+sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
+import jaxtank
+from jaxtank import *
+assert not {"jaxtank.neighbours", "jaxtank.environment", "jaxtank.export"} & set(sys.modules)
+assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
+assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
+try:
+    jaxtank.environment
+except ImportError as error:
+    print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.startswith("jaxtank.environment needs gymnasium: pip install gymnasium")
+
+
+def test_the_environment_is_reached_from_the_package():
+    pytest.importorskip("gymnasium")
+    ran = subprocess.run([sys.executable, "-c", "import jaxtank; print(jaxtank.environment.TankEnv.__name__)"], capture_output=True)
+    assert ran.stdout.decode().strip() == "TankEnv", ran.stderr

@@ -1,5 +1,6 @@
 """A plant and a law that somebody else wrote, with no more than their base classes ask: notebook 10's cone."""
 
+import dataclasses
 import json
 
 import jax
@@ -12,6 +13,7 @@ import jaxtank
 import tuning
 from jaxtank import numerics, presets
 from jaxtank.controllers.base import Controller
+from jaxtank.export import export
 from jaxtank.plants.base import Plant
 from jaxtank.tree import component, leaf, number, static
 
@@ -116,3 +118,30 @@ def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
     assert saved["parameters"]["controller.Kc"]["after"] == result.parameters["controller.Kc"]["after"]
     assert "rig.toml is not written" in saved["message"]
     assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
+
+
+@component
+class Several(Controller):
+    """Returns `count` inputs, whatever the rig has; a bare number for 0."""
+
+    count: int = static(default=1)
+
+    def step(self, state, tick, estimate):
+        return (5.0 * tick.r[0],) * self.count if self.count else 5.0 * tick.r[0], state
+
+
+@pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
+def test_a_controller_returns_one_input_for_each_pump(count, words):
+    case = jaxtank.rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0})
+    case = case.replace(loop=dataclasses.replace(case.loop, controller=Several(count=count)))
+    wrong = f"controller Several: its step returns {words} for 2 pumps"
+    for run in (
+        lambda: jaxtank.simulate(case.loop, case.clock),
+        lambda: jaxtank.evaluate(case.loop, case.clock, ["rms_error"]),
+        lambda: jax.jit(lambda loop: jaxtank.evaluate(loop, case.clock, ["rms_error"]))(case.loop),
+        lambda: export(case),
+    ):
+        with pytest.raises(jaxtank.InputError, match=wrong):
+            run()
+    right = dataclasses.replace(case.loop, controller=Several(count=2))
+    assert np.asarray(jaxtank.simulate(right, case.clock).command).shape == (21, 2)

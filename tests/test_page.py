@@ -240,3 +240,32 @@ def test_a_browser_opens_the_page_without_complaint(results, folders, tmp_path, 
 def test_a_complaint_would_be_heard(tmp_path):
     (tmp_path / "bad.html").write_text("<!DOCTYPE html><title>x</title><script>console.error('oh')</script>")
     assert seen(tmp_path / "bad.html", tmp_path / "shot.png")[0]
+
+
+@browser
+@pytest.mark.parametrize("width", [1400, 900, 390])
+def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
+    """What a box of the page holds is no wider than the box: nothing has to be pushed aside to be read."""
+    words = "the ideal rig starts faster, without delay, lag or noise, and its pumps are stronger than those of the paper"
+    row = {"quantity": "RMS error of CHADPC against ENMPC, paper-like rig", "unit": "cm^3/(s V)", "where": "sec. 5.1, 5.3, Table 2"}
+    row |= {"published": words, "measured": words, "verdict": "not reproduced", "reason": words}
+    listed = row | {"published": tuple(0.123456 + k for k in range(16)), "measured": tuple(0.654321 + k for k in range(16))}
+    compare.save({"calofir": {"paper": "calofir", "citation": "C", "rows": [row, listed]}}, tmp_path)
+    whole = (tmp_path / "report.html").read_text()
+    probe = "Math.max(...[...document.querySelectorAll('.scroll, main')].map(e => e.scrollWidth - e.clientWidth))"
+    (tmp_path / "probe.html").write_text(whole.replace("</body>", f"<script>document.title = 'cut ' + {probe}</script></body>"))
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking"]
+    flags += [f"--window-size={width},1000", f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=2000", "--dump-dom"]
+    options = {"capture_output": True, "text": True, "timeout": 120, "check": True}
+    dom = subprocess.run([BROWSER, *flags, (tmp_path / "probe.html").as_uri()], **options).stdout
+    assert "<title>cut 0</title>" in dom, dom[dom.index("<title>") :][:60]
+
+
+def test_cells_of_a_table_of_texts_carry_their_headings():
+    """A narrow window shows them one below the other."""
+    table = tables.table([["x", 2, "w" * 80], ["y", 3, ""]], ["name", "value", 'why "so"'])
+    read = page.document("t", "", "s", True, [], [], [], [table])
+    assert '<div class="scroll texts">' in read and read.count('data-head="name"') == 2
+    assert 'data-head="why &quot;so&quot;"' in read
+    plain = page.document("t", "", "s", True, [], [], [], [tables.table([["x", 2]], ["name", "value"])])
+    assert "data-head=" not in plain and '<div class="scroll">' in plain

@@ -157,7 +157,7 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"plant": {"outputs": [1]}}, "list of 1"),
         ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),
         ({"plant": {"overflow": 1}}, "true or false"),
-        ({"units": ["ft", "V"]}, "gravity"),
+        ({"units": ["yd", "V"]}, "gravity"),
         ({"units": ["cm", "V\x1b[31m\n"]}, "units: entry = 'V.x1b.31m.n': must be a text of printable characters"),
         ({"units": ["cm\u202e", "V"]}, "must be a text of printable characters"),
         ({"case": "gouta2015/ngpc"}, "leave out case"),
@@ -247,9 +247,17 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
 
 def test_gravity_and_film_of_a_network_are_those_of_its_unit():
     one = {"area": 1.0, "drain": 1.0, "pump_gain": 1.0, "feeds": [(0, None)], "rim": 1.0}
-    for unit, gravity, knee in (("cm", 981.0, 0.01), ("m", 9.81, 1e-4), ("V", 981.0, 0.01)):
-        plant = network(**one, units=(unit, "V"))
-        assert float(plant.gravity) == gravity and plant.knee == knee
+    file = 'units = ["{}", "V"]\n[[tank]]\narea = 1e6\nrim = 1.0\ndrain = 1e-3\n'
+    file += '[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n[law]\nkind = "open-loop"\n'
+    for unit, gravity, knee in (("cm", 981.0, 0.01), ("m", 9.81, 1e-4), ("mm", 9810.0, 0.1), ("ft", 981.0 / 30.48, 0.01 / 30.48)):
+        for plant in (network(**one, units=(unit, "V")), rig.loads(file.format(unit)).loop.plant):
+            assert float(plant.gravity) == pytest.approx(gravity, rel=1e-15) and plant.knee == pytest.approx(knee, rel=1e-15)
+    for unit in ("V", "furlong"):  # no length, or none that is known: refused in both
+        with pytest.raises(InputError, match=f'plant.gravity: must be given for a rig whose length is "{unit}"'):
+            network(**one, units=(unit, "V"))
+        with pytest.raises(InputError, match=f'plant.gravity: must be given for a rig whose length is "{unit}"'):
+            rig.loads(file.format(unit))
+    assert network(**one, units=("V", "V"), gravity=0.5).knee == 0.01
     with pytest.raises(InputError, match="at least 1e-15 m"):
         network(**one, units=("m", "V"), knee=0.0)
 

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
-from jaxtank import plotting, rig, run_plots
+from jaxtank import plotting, presets, rig, run_plots
 from jaxtank.records import Trajectory
 
 
@@ -168,4 +168,38 @@ def test_a_rig_of_many_tanks_is_drawn_on_one_page():
     titles = [ax.get_title() for ax in figure.axes if ax.get_visible()]
     assert [word for word in titles if word.startswith("tank ")] == ["tank 1", "tank 32", *[f"tank {i}" for i in range(16, 32)]]
     assert figure.get_size_inches()[0] < 20 and "of the 30 tanks between, the 16" in figure.get_suptitle()
+    plt.close(figure)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 12])
+def test_every_run_is_drawn_and_can_be_told_from_the_others(count):
+    loop = presets.find("mirakhorli/sfc").loop
+    runs = {f"run {i}": made(x=columns(*np.full((4, 1001), 1.0 + 0.1 * i))) for i in range(count)}
+    figure = plotting.responses(loop, runs)
+    panels = [ax for ax in figure.axes if ax.get_visible()]
+    assert len(panels) == 8
+    for ax in panels:
+        lines = [line for line in ax.lines if line.get_label() in runs]
+        assert [line.get_label() for line in lines] == list(runs)
+        assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == count
+    (legend,) = figure.legends
+    figure.canvas.draw()
+    box = legend.get_window_extent()
+    assert {text.get_text() for text in legend.get_texts()} >= set(runs) and box.x0 >= 0 and box.x1 <= figure.bbox.x1
+    plt.close(figure)
+
+
+def test_the_rim_is_in_every_panel_of_a_fan():
+    """As a line, or in words where it stands far above all levels."""
+    loop = presets.find("mirakhorli/sfc").loop
+    rims = np.asarray(loop.plant.rim)
+    t = np.linspace(0.0, 10.0, 11)
+    top = rims * [1.1, 0.6, 0.3, 0.2]
+    figure = plotting.fan(loop, {"t": t, "r": np.ones((11, 2)), "x": np.ones((5, 11, 4)) * top}, "fan")
+    for i, ax in enumerate(figure.axes):
+        (line,) = [line for line in ax.lines if line.get_label().startswith("rim")]
+        if i < 3:
+            assert list(line.get_ydata()) == [rims[i]] * 2 and ax.get_ylim()[1] > rims[i]
+        else:
+            assert line.get_label() == f"rim {rims[i]:g} cm, above the picture" and ax.get_ylim()[1] < rims[i]
     plt.close(figure)

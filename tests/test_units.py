@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from jaxtank.measures import MEASURES
 from jaxtank.measures import unit as measure_unit
 from jaxtank.units import local
 from tuning import cli
@@ -60,3 +61,25 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
     file.write_text(file.read_text().replace("R = [1.0]", "Q = [1.0, 1.0]"))
     assert cli.main(["simulate", str(file)]) == 2
     assert "needs R [1/(m^3/s)^2]" in capsys.readouterr().err
+
+
+def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_path, capsys):
+    file = tmp_path / "rig.toml"
+    file.write_text(
+        'name = "r"\nunits = ["cm", "L/min"]\n'
+        "[[tank]]\narea = 100.0\nrim = 50.0\ndrain = 0.5\nlevel = 10.0\n"
+        "[[pump]]\ngain = 16.67\nto = 1\nlow = 0.0\nhigh = 20.0\n"
+        '[law]\nkind = "pid"\nKc = 1.0\nTi = 30.0\n'
+        "[reference]\ninitial = [10.0]\nchanges = [[5.0, 1, 12.0]]\n"
+    )
+    for language in ("c", "m"):
+        assert cli.main(["export", str(file), "--lang", language, "--out", str(tmp_path / language)]) == 0
+        (source,) = (tmp_path / language).glob(f"*.{language}")
+        text = source.read_text()
+        assert "controller.Kc = [1.] (L/min)/cm" in text and "controller.bias = [" in text
+        assert "V/cm" not in text and "] V\n" not in text
+    capsys.readouterr()
+    assert cli.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
+    (line,) = (row for row in capsys.readouterr().out.splitlines() if row.startswith("rms_input"))
+    assert "L/min" in line and "voltage" not in line
+    assert not any("voltage" in each.doc for each in MEASURES.values())

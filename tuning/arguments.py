@@ -1,6 +1,7 @@
 """What the words of a command line mean: numbers, ranges, NAME=VALUE, the case they describe."""
 
 import os
+import re
 import sys
 
 from jaxtank.errors import InputError
@@ -39,7 +40,7 @@ def open_case(args):
 
 def settings(args):
     """{name: value} of --set and --dt."""
-    values = once("--set", [pair("--set", text, parse_value) for text in args.values]) or {}
+    values = once("--set", [pair("--set", text) for text in args.values]) or {}
     if args.dt is not None:
         if "clock.dt" in values:
             raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
@@ -62,15 +63,21 @@ def schedule(texts):
         variable, colon, knots = rule.partition(":")
         if not colon:
             raise InputError(f"--schedule {name}={rule!r}: must be NAME=VARIABLE:K1,K2,...")
-        return {"gains": [n for n, _ in found], "variable": variable.strip(), "knots": parse_value(f"[{knots}]")}
+        return {
+            "gains": [n for n, _ in found],
+            "variable": variable.strip(),
+            "knots": parse_value(f"[{knots}]", f"--schedule {name}"),
+        }
     return {}
 
 
-def pair(option, text, read):
+def pair(option, text, read=None):
+    """(name, value) of NAME=VALUE; read: makes the value of its text, `parse_value` where it is None."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"{option} {text!r}: must be NAME=VALUE")
-    return name.strip(), read(value.strip())
+    name, value = name.strip(), value.strip()
+    return name, parse_value(value, f"{option} {name}") if read is None else read(value)
 
 
 def once(option, pairs):
@@ -82,17 +89,38 @@ def once(option, pairs):
     return dict(pairs) or None
 
 
-def parse_value(text):
-    """A number, a truth value, a list of numbers ("1,2" or "[1,2]"), or the text itself."""
+DECIMAL_COMMA = re.compile(r"([+-]?)(\d+|[1-9]\d{0,2}(?:\.\d{3})+),(\d+(?:[eE][+-]?\d+)?)")
+"""Text that is either a list of two numbers or one number with a decimal comma: 0,05 or 1.000,5."""
+
+
+def parse_value(text, where):
+    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself.
+
+    A list needs brackets where a decimal comma could be meant. where: option and name, for the
+    error. Raises InputError for such a text, for an empty entry and for an entry such as 05.
+    """
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
-    parts = [p for p in inner.split(",") if p.strip()]
+    parts = [p.strip() for p in inner.split(",")] if inner.strip() else []
     try:
-        found = [plain_number(p) for p in parts]
+        found = [plain_number(p) for p in parts if p]
     except ValueError:
         return text
-    return found if len(found) != 1 or inner is not text else found[0]
+    if len(found) < len(parts):
+        raise InputError(f"{where}={text}: an entry of the list is empty: leave out the comma, or give its number")
+    if comma := DECIMAL_COMMA.fullmatch(text):
+        sign, whole, digits = comma.groups()
+        point = f"{sign}{whole.replace('.', '')}.{digits}"
+        raise InputError(
+            f"{where}={text}: the comma may be a decimal one: write {point}, with a point, for a number, "
+            f"or [{', '.join(map(str, found))}] for a list"
+        )
+    if len(parts) > 1 and (odd := next((p for p in parts if re.match(r"[+-]?0\d", p)), None)):
+        raise InputError(
+            f"{where}={text}: entry {odd} begins with a zero, as the digits after a decimal comma do: write decimals with a point, as 0.05"
+        )
+    return found[0] if len(found) == 1 and inner is text else found if found or inner is not text else text
 
 
 def plain_number(text):

@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.errors import InputError
 from jaxtank.tree import with_values
 
 
@@ -32,7 +33,22 @@ def bare(plant):
     return Case(name="plant", title="a plant without a law", loop=loop, clock=Clock(), limits={}, free={}, objective={})
 
 
-def identified(result):
+def proposed(result):
+    """(Case, why): `identified(result)` under the controller of result.law; why: the reason where there is none, else None."""
+    case = identified_plant(result)
+    if result.law is None:
+        return case, None
+    from tuning.proposal import with_pi
+
+    logs = result.estimation.logs
+    inputs = np.concatenate([one.u for one in logs]).mean(axis=0)
+    try:
+        return with_pi(case, inputs), None
+    except InputError as error:
+        return case, str(error)
+
+
+def identified_plant(result):
     """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of law and observer; what its uncertainty
     is made of; noise of the residuals where they are white, else of the record from sample to sample."""
     case = result.case

@@ -1,6 +1,7 @@
 """Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the answer is to be believed."""
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -15,9 +16,10 @@ from jaxtank.tree import describe
 from tuning import identifiability as idf
 from tuning import logs as lg
 from tuning.estimation import Estimation, Fit, check_length
-from tuning.identified import bare, identified
+from tuning.identified import bare, proposed
 from tuning.memo import Log, Memo
 from tuning.parts import digest
+from tuning.proposal import check_law
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001
@@ -43,11 +45,17 @@ class Identification:
     profile: dict | None
     wall_s: float
     seed: int
+    law: str | None = None  # controller that is proposed for the rig
+
+    @functools.cached_property
+    def proposed(self):
+        """(`identified`, why): why no controller of the kind `law` could be proposed, None where it was, or none was asked for."""
+        return proposed(self)
 
     @property
     def identified(self):
         """The case with the estimated plant in it, in the law's and the observer's models too, with covariance and noise."""
-        return identified(self)
+        return self.proposed[0]
 
     @property
     def message(self):
@@ -102,6 +110,7 @@ def identify(
     resume=False,
     progress=None,
     ready=None,
+    law=None,
 ):
     """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
 
@@ -116,7 +125,8 @@ def identify(
     substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
     gap: longest step between samples, in median steps; folder: where a log of the searches is kept, with which resume=True goes on after a
     kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
-    KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search.
+    KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search;
+    law: "pi" for the identified rig under a PI controller with gains from its model (see `tuning.proposal`), None for the case's own.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
@@ -124,6 +134,7 @@ def identify(
     if not jax.config.jax_enable_x64:
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     case = bare(case) if isinstance(case, Plant) else case
+    check_law(law, case)
     logs = [log] if isinstance(log, lg.Log) else list(log)
     if not logs:
         raise InputError("no log is given")
@@ -206,6 +217,7 @@ def identify(
         profile=idf.profile(estimation, best, spread, loss) if profile and not interrupted else None,
         wall_s=time.perf_counter() - began,
         seed=seed,
+        law=law,
     )
 
 

@@ -34,7 +34,7 @@ def add(commands, parents):
         action="append",
         default=[],
         metavar="SLOT=HEADER[;UNIT]",
-        help="which column is t, pump1, .., h1, .., where its header does not say so; repeatable",
+        help="which column is t, pump1, .., h1, .., where its header does not say so; h3=none: leave that level out; repeatable",
     )
     one.add_argument("--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,")
     one.add_argument("--gap", default="1.5", metavar="X", help="longest step between samples, in median steps (default 1.5)")
@@ -49,6 +49,9 @@ def add(commands, parents):
         "--noise", metavar="SD", help="standard deviation of the readings, one or one per channel (default: from the log)"
     )
     one.add_argument("--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber")
+    one.add_argument(
+        "--law", metavar="KIND", help="write the rig under a controller to tune: pi, with gains from the identified model"
+    )
     one.add_argument("--profile", action="store_true", help="also: profile likelihood of the parameter known worst")
     one.add_argument("--plan", action="store_true", help="no log: compare experiments by the standard deviations they would leave")
     one.add_argument("--duration", metavar="S", help="of a planned experiment [s] (default 300)")
@@ -83,10 +86,10 @@ def run(args):
         raise InputError(f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of samples of the log")
     noise = None
     if args.noise is not None:
-        noise = [arguments.number("--noise", text) for text in args.noise.split(",")]
-        if min(noise) <= 0:
-            raise InputError(f"--noise {args.noise!r}: must be above 0")
-        noise = noise[0] if len(noise) == 1 else noise
+        noise = arguments.parse_value(args.noise, "--noise")
+        entries = noise if isinstance(noise, list) else [noise]
+        if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
+            raise InputError(f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel")
     gap = arguments.number("--gap", args.gap)
     if not gap >= 1:
         raise InputError(f"--gap {args.gap!r}: must be at least 1")
@@ -112,6 +115,7 @@ def run(args):
         resume=args.resume is not None,
         progress=Interrupts().check,  # between two searches
         ready=ready,
+        law=args.law,
     )
     try:
         written = found.save(args.out, args.line) if args.out else []
@@ -126,8 +130,21 @@ def run(args):
         words = "; ".join(f"cannot tell {identify_report.untold(d)}" for d in found.directions)
         print(f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written; {_advice(found, free)}", file=sys.stderr)
     elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
-        print(f"go on with: jaxtank tune {printable(args.out.rstrip('/'))}/rig.toml --robust cvar", file=sys.stderr)
+        print(_next(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
     return STATUS[found.status]
+
+
+def _next(found, file):
+    """What to do with the rig that was written to `file`."""
+    case, why = found.proposed
+    if why:
+        return f"jaxtank: {file}: note: --law {found.law}: {why}"
+    if case.free:
+        return f"go on with: jaxtank tune {file} --robust cvar"
+    return (
+        f"{file} has no controller to tune: identify with --law pi for a PI controller with gains from this model, "
+        "or give the file a [law], a [reference] that changes and [free] ranges"
+    )
 
 
 def _advice(found, free):
@@ -161,6 +178,8 @@ def plan(args, case, free):
     """Compare experiments; returns the exit code."""
     if args.data:
         raise InputError(f"--plan compares experiments before there is a log: leave it out to fit --data {args.data[0]!r}")
+    if args.law:
+        raise InputError(f"--plan identifies nothing: leave --law {args.law!r} out")
     if args.out:
         raise InputError(f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)")
     import numpy as np

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank import rig as rigs
 from jaxtank.files import check_folder
+from jaxtank.units import local
 from tuning import identifiability as idf
 from tuning import page, pictures, saving, search, tables
 from tuning.identify import stopped
@@ -60,7 +61,20 @@ def message(found):
             words.append(f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval")
     if identifiable(found) and found.case.reachable and (why := rigs.unreachable(found.identified)):
         words.append(f"{why}; rig.toml says reachable = false for it: choose other setpoints before tuning")
+    if identifiable(found) and found.law:
+        words.append(_proposal(found))
     return "; ".join(words)
+
+
+def _proposal(found):
+    """The controller that is proposed, in words."""
+    case, why = found.proposed
+    if why:
+        return f"no {found.law} controller is proposed: {why}"
+    law, (length, drive) = case.loop.controller, case.loop.units
+    Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (law.Kc, law.Ti))
+    unit = local("V/cm", (length, drive))
+    return f"proposed: PI with controller.Kc = {Kc} {unit}, controller.Ti = {Ti} s, from the identified model (T-sum rule), to be tuned"
 
 
 def identifiable(found):

@@ -30,7 +30,8 @@ def read_log(path, loop, columns=None, decimal="."):
     """The Log of a CSV file, for the rig of `loop` (a ClosedLoop).
 
     columns: {"t", "pump1", .., "h1", ..: a column's header, or (header, unit)}, where the header does not say it in its own words ("h1 [cm]",
-    "pump1_V", "time [s]"); decimal: "." or ",". Comma or semicolon or tab between cells, "#" for lines to pass over, an empty cell or
+    "pump1_V", "time [s]"); "none" leaves a level out; decimal: "." or ",".
+    Comma or semicolon or tab between cells, "#" for lines to pass over, an empty cell or
     "nan" for a reading that is missing. Raises DataError, naming line and column, for anything else.
     """
     path = Path(path)
@@ -173,6 +174,10 @@ def _columns(header, name, line, loop, given):
         if slot not in slots:
             raise InputError(f"unknown log column {slot!r}{nearest(slot, slots)}")
         wanted, unit = (spec, None) if isinstance(spec, str) else spec
+        if wanted.strip() == "none" and wanted not in header:
+            if slots[slot][0] != "level":
+                raise InputError(f"log column {slot} = none: only a level may be left out, as h1=none")
+            continue
         if wanted not in header:
             raise DataError(f"{name}, line {line}: there is no column {wanted!r} for {slot}{nearest(wanted, header)}")
         taken[slot] = (header.index(wanted), unit or split_header(wanted)[1])

@@ -1,5 +1,6 @@
 """What the options that several commands share mean, and what every command says of the files it wrote."""
 
+import re
 import sys
 
 from jaxtank.errors import InputError
@@ -11,12 +12,12 @@ def limits_of(args, case):
     limits, given = dict(case.limits), [text.partition("=")[0].strip() for text in args.limit]
     for name in given:
         if given.count(name) > 1:
-            raise InputError(f"--limit {name} is given {given.count(name)} times: give it once (several tanks: {name}=30,28)")
+            raise InputError(f"--limit {name} is given {given.count(name)} times: give it once (several tanks: {name}=[30,28])")
     for text in args.limit:
         if text == "none":
             limits = {}
             continue
-        measure, value = pair("--limit", text, parse_value)
+        measure, value = pair("--limit", text)
         from jaxtank.measures import check_names
 
         check_names([measure])
@@ -37,7 +38,7 @@ def scenarios_of(args):
         return ()
     found = []
     for i, text in enumerate(args.scenario):
-        values = once("--scenario", [pair("--scenario", part, parse_value) for part in text.split(";") if part.strip()]) or {}
+        values = once("--scenario", [pair("--scenario", part) for part in text.split(";") if part.strip()]) or {}
         for name, value in values.items():
             if any(rig.overlap(name, given) for given in settings(args)) and not rig.is_change(value):
                 raise InputError(
@@ -50,10 +51,14 @@ def scenarios_of(args):
 
 
 def choices_of(args):
-    def values(text):
-        return [parse_value(part.strip()) for part in text.split(",") if part.strip()]
+    def values(name, text):
+        parts = [part.strip() for part in text.split(",")]
+        if "" in parts or any(re.match(r"[+-]?0\d", part) for part in parts):
+            raise InputError(f"--choose {name}={text}: must be values with commas between them, decimals with a point, as 0.5,1.5")
+        return [parse_value(part, f"--choose {name}") for part in parts]
 
-    return once("--choose", [pair("--choose", text, values) for text in args.choose])
+    pairs = [pair("--choose", text, str) for text in args.choose]
+    return once("--choose", [(name, values(name, text)) for name, text in pairs])
 
 
 def tradeoff_of(args):

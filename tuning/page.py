@@ -13,6 +13,9 @@ LARGEST = 500_000
 DENSE = 800
 """Points of a line that may be drawn as dots where a picture is too large."""
 
+LONG = 60
+"""Characters of a cell above which it is text that is wrapped."""
+
 WIDE = 480.0
 """Width of a picture [pt] above which it is not squeezed into a narrower window than it can be read in."""
 
@@ -35,7 +38,16 @@ table { border-collapse: collapse; font-size: 0.88rem; overflow-wrap: normal; }
 th, td { padding: 0.25rem 0.7rem 0.25rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd; }
 th { border-bottom: 2px solid #888; }
 td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
-td.long { min-width: 16rem; }
+td.long { min-width: 10rem; }
+@media screen and (max-width: 60rem) { /* a table of texts has no room for its columns: one below the other, each with its heading */
+  .texts table, .texts tbody, .texts tr, .texts td { display: block; }
+  .texts thead { display: none; }
+  .texts tr { border-bottom: 1px solid #888; padding: 0.4rem 0; }
+  .texts td { border: 0; padding: 0.1rem 0; white-space: normal; overflow-wrap: anywhere; }
+  .texts td::before { content: attr(data-head) ": "; color: #444; }
+  .texts td:first-child { font-weight: 600; }
+  .texts td:first-child::before, .texts td:empty::before { content: none; }
+}
 figure { margin: 1.2rem 0; }
 figure svg, figure img { display: block; max-width: 100%; height: auto; margin: 0 auto; }
 figure svg * { stroke-linejoin: round; stroke-linecap: butt; }
@@ -146,14 +158,18 @@ NUMBER = re.compile(r"[-+<>=≤≥ ]*[-+]?\d[\d.,e+\-: %]*( ?(s|cm|m|V))?|-")
 
 
 def _table(head, rows):
-    def cell(value):
+    texts = any(len(str(value)) > LONG and not NUMBER.fullmatch(str(value)) for row in rows for value in row)
+
+    def cell(value, heading):
         text = str(value)
-        kind = ' class="number"' if NUMBER.fullmatch(text) else ' class="long"' if len(text) > 60 else ""
-        return f"<td{kind}>{escape(text)}</td>"
+        kind = "number" if NUMBER.fullmatch(text) and len(text) <= LONG // 2 else "long" if len(text) > LONG else ""
+        attributes = (f' class="{kind}"' if kind else "") + (f' data-head="{escape(heading)}"' if texts and heading else "")
+        return f"<td{attributes}>{escape(text)}</td>"
 
     top = "<thead><tr>" + "".join(f"<th>{escape(h)}</th>" for h in head) + "</tr></thead>" if any(head or ()) else ""
-    body = "".join("<tr>" + "".join(cell(v) for v in row) + "</tr>" for row in rows)
-    return f'<div class="scroll"><table>{top}<tbody>{body}</tbody></table></div>'
+    heads = list(head or ()) or [""] * max(map(len, rows), default=0)
+    body = "".join("<tr>" + "".join(map(cell, row, heads)) + "</tr>" for row in rows)
+    return f'<div class="scroll{" texts" if texts and top else ""}"><table>{top}<tbody>{body}</tbody></table></div>'
 
 
 def identifier(name):

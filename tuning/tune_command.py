@@ -37,8 +37,10 @@ def _tune(args):
     if args.robust is not None:
         from tuning.robust import tune_robust
 
-        if choices or args.scenario:
-            raise InputError("--robust makes scenarios of its own: no --scenario, no --choose beside it")
+        if choices or scenarios:
+            raise InputError("--robust makes scenarios of its own: no --choose and no --scenario but none beside it")
+        if scenarios == ():  # --scenario none: plants of the case's own run alone
+            case = case.replace(scenarios=())
         finder = functools.partial(
             tune_robust,
             distributions=varied,

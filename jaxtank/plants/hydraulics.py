@@ -4,6 +4,7 @@ import math
 
 import jax.numpy as jnp
 
+from jaxtank.errors import InputError
 from jaxtank.numerics import ROOT_KNEE, root
 
 GRAVITY = 981.0
@@ -17,6 +18,19 @@ def in_unit(centimetres, length):
     """A number of `centimetres` [cm], or of one of them per s^2, in the unit `length` of a rig; as it is where that is no length: levels in
     the volts of a sensor have no other scale."""
     return centimetres * PER_CENTIMETRE.get(length, 1.0)
+
+
+def usual_gravity(length):
+    """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`: 981 cm/s^2.
+
+    Raises InputError where `length` is no unit of length, as the volts of a sensor.
+    """
+    if length not in PER_CENTIMETRE:
+        raise InputError(
+            f'plant.gravity: must be given for a rig whose length is "{length}" '
+            f"(known without it: {', '.join(PER_CENTIMETRE)}; 981 for cm, 9.81 for m)"
+        )
+    return in_unit(GRAVITY, length)
 
 
 def usual_knee(length):

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank.errors import InputError
 from jaxtank.numerics import at_least, clip, root, signed_root
 from jaxtank.plants.base import Plant
-from jaxtank.plants.hydraulics import GRAVITY, efflux, in_unit, usual_knee
+from jaxtank.plants.hydraulics import efflux, usual_gravity, usual_knee
 from jaxtank.tree import check_value, component, leaf, number, static
 from jaxtank.units import DEFAULT
 
@@ -189,9 +189,9 @@ def network(
 
     area, drain, rim: (n,) or a number; pump_gain, split: (m,) or a number; feeds: m pairs (first tank, second tank or None);
     links, pipes, spills: pairs (from, to), with one orifice, pipe, caught each. Units as in TankNetwork, or those of `units`.
-    gravity, knee: 981 cm/s^2 and 0.01 cm where they are None, in the length of `units` (see `hydraulics.in_unit`).
+    gravity, knee: 981 cm/s^2 and 0.01 cm where they are None, in the length of `units`; InputError for no gravity beside levels in volts.
     """
-    gravity = in_unit(GRAVITY, units[0]) if gravity is None else gravity
+    gravity = usual_gravity(units[0]) if gravity is None else gravity
     knee = usual_knee(units[0]) if knee is None else knee
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
     links, pipes, spills = (tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills))

@@ -20,7 +20,7 @@ PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name !
 def load(paper):
     """The Preset of `paper`, one of PAPERS. Raises InputError for another name."""
     if paper not in PAPERS:
-        raise unknown("paper", paper, PAPERS)
+        raise unknown("paper", str(paper), PAPERS)
     return _load(paper)
 
 
@@ -28,7 +28,15 @@ def load(paper):
 def _load(paper):
     preset = importlib.import_module(f"jaxtank.presets.{paper}").preset()
     spread = {name: share for name, (share, _) in preset.uncertain.items()}
-    return dataclasses.replace(preset, cases={name: case.replace(uncertain=spread) for name, case in preset.cases.items()})
+    cases = Cases({name: case.replace(uncertain=spread) for name, case in preset.cases.items()})
+    return dataclasses.replace(preset, cases=cases)
+
+
+class Cases(dict):
+    """The cases of a paper by name; `cases[name]` raises InputError for an unknown one, with the nearest."""
+
+    def __missing__(self, name):
+        raise unknown("case", str(name), self)
 
 
 def names():
@@ -38,10 +46,14 @@ def names():
 
 def find(name):
     """The Case of "paper/case". Raises InputError for an unknown one, with the nearest names."""
+    if not isinstance(name, str):
+        raise InputError(f"case {name!r}: must be a text, as 'gouta2015/ngpc'")
     paper, _, case = name.partition("/")
-    if paper in PAPERS and case in (cases := load(paper).cases):
-        return cases[case]
-    raise unknown("case", name, names())
+    if paper not in PAPERS:
+        raise unknown("case", name, names())
+    if case not in (cases := load(paper).cases):
+        raise unknown("case", name, [f"{paper}/{other}" for other in cases])
+    return cases[case]
 
 
 __all__ = ["PAPERS", "Case", "Claim", "Free", "InputError", "Mirror", "Preset", "Published", "Scenario", "find", "load", "names"]

@@ -324,7 +324,7 @@ def preset():
     """The Preset of this paper."""
     return Preset(
         paper="gouta2022",
-        citation="H. Gouta, K. Al-Ashek, A. Saad, Automatika 63(3), 2022: coupled two-tank MIMO system, explicit nonlinear model predictive "
+        citation="H. Gouta, W. H. Al-Ashek, B. Saad, Automatika 63(3), 2022: coupled two-tank MIMO system, explicit nonlinear model predictive "
         "control, disturbance observer, CHADPC",
         cases={
             name: Case(

@@ -8,7 +8,6 @@ from jaxtank.actuators import PumpBank
 from jaxtank.errors import InputError, unknown
 from jaxtank.loop import ClosedLoop
 from jaxtank.observers import Direct
-from jaxtank.plants.hydraulics import GRAVITY
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.presets.base import Case
 from jaxtank.records import Clock
@@ -152,7 +151,7 @@ def build(table):
         split=[p["split"] if feeds[j][1] is not None else 1.0 for j, p in enumerate(pumps)],
         feeds=feeds,
         outputs=[tank(v, "plant.outputs") for v in outputs],
-        gravity=_gravity(length) if more["gravity"] is None else more["gravity"],
+        gravity=more["gravity"],
         overflow=bool(more["overflow"]),
         bottom=bool(more["bottom"]),
         units=(length, drive),
@@ -196,12 +195,6 @@ def _units(value):
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, str) and v for v in value)):
         raise InputError(f'units = {_short(value)}: must be [length, pump input], as ["cm", "V"]')
     return tuple(name_of("units: entry", v) for v in value)
-
-
-def _gravity(length):
-    if length not in ("cm", "m"):
-        raise InputError(f'plant.gravity: must be given for a rig whose length is "{length}" (981 for cm, 9.81 for m)')
-    return GRAVITY if length == "cm" else GRAVITY / 100
 
 
 def _check_shares(overflows, written, spills):
