@@ -78,12 +78,13 @@ class TankNetwork(Plant):
         no tank gives more than it holds.
 
         In each stage an outlet of area s_k of tank i, orifice or pipe, passes at most its share
-        s_k / (sum of the tank's outlets) of A_i max(h_i, 0) / step. For constant or growing inflow
-        each Runge-Kutta stage then stays at or above zero, and so does every rk4 step whatever the
-        inflow, as long as it is not negative: of the stages h_s = h + c_s step I the weights b_s take
-        at most sum b_s h_s <= h + step I / 2 (midpoint: where the inflow does not halve within half a
-        step). What leaves one tank arrives in the next, so volume is conserved whatever the step, and
-        the lower clip in `spill` adds only what a negative inflow could not take (`shortfall`).
+        s_k / (sum of the tank's outlets) of A_i max(h_i, 0) / step. An rk4 step then ends at or above
+        zero where no inflow from outside is negative: stage s holds at most h_i plus what flows in up
+        to it, so the weighted sum of the outflows is less than h_i plus the sum of the inflows (the
+        midpoint rule: where an inflow does not fall by half within half a step). What leaves one tank
+        arrives in the next, so volume is conserved whatever the step, and the lower clip in `spill`
+        adds only what a negative inflow could not take (`shortfall`).
+
         The limit acts below h = (step sqrt(2 g) sum s_k / A)^2, where the tank holds less than it
         gives in one step; elsewhere the rates are those of `derivative`, bit for bit. Where it acts,
         what passes the tank is delayed by up to one step (`step_length` reports how high it stands).
