@@ -84,7 +84,7 @@ def physics(plant):
     for (source, sink), share in zip(plant.spills, np.asarray(plant.caught)):
         found.append(f"{100 * share:.4g} % of what passes the rim of tank {source + 1} falls into tank {sink + 1}.")
     if plant.bottom:
-        found.append("A level stops at zero whatever is drawn from it.")
+        found.append("A level stops at zero whatever is drawn from it; in one step no tank gives more than it holds.")
     found.append(
         f"Flow turns laminar (linear in the level) below {plant.knee:g} {length}, of a level or of a difference of levels."
     )

@@ -151,7 +151,11 @@ def _simulate(loop, clock, key, save_every):
 
     zero = zero_of(loop)
     (state, _), saved = scan(row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows)
-    columns = {name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value for name, value in saved._asdict().items()}
+    columns = {
+        name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value
+        for name, value in saved._asdict().items()
+        if name in Trajectory._fields
+    }
     return Trajectory(**columns), is_broken(state)
 
 

@@ -222,6 +222,7 @@ ACCUMULATORS = {
     "saturation_excess": _sum(lambda run: run.pumps, _saturation_excess),
     "over_rim2": _sum(lambda run: run.tanks, lambda run, s: tuple(v * v for v in _over_rim(run, s))),
     "spilled": _sum(lambda run: run.tanks, lambda run, s: s.spilled),
+    "shortfall": _sum(lambda run: run.tanks, lambda run, s: s.shortfall),
     "max_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a > b, -jnp.inf),
     "min_level": _extreme(lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf),
     "max_error": _extreme(
@@ -382,6 +383,13 @@ MEASURES = {
         scale=lambda run: 1.0 / run.samples,
     ),
     "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
+    "inflow_shortfall": Measure(
+        "cm^3",
+        "tank",
+        ("shortfall",),
+        lambda run, acc: _list(acc["shortfall"]),
+        "volume that a negative inflow could not take from an empty tank",
+    ),
     "overshoot_percent": Measure(
         "%", "output", ("overshoot",), _overshoot_percent, "worst overshoot of a change, in percent of it", windows=True
     ),
@@ -460,9 +468,11 @@ def wants_rests(names):
 
 def serves(name, loop):
     """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into, its steady inputs
-    are known in closed form."""
+    are known in closed form, its levels have a lower clip."""
     spec = MEASURES[name]
     if spec.rests and (getattr(loop.plant, "pipes", None) != () or loop.plant.pumps != len(loop.plant.outputs)):
+        return False
+    if "shortfall" in spec.needs and not loop.plant.bottom:
         return False
     return (not spec.windows or hasattr(loop.reference, "windows")) and (not spec.pours or hasattr(loop.disturbance, "since"))
 

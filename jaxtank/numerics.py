@@ -61,6 +61,34 @@ def signed_root_slope(x, knee=ROOT_KNEE):
     return (1.0 - 0.5 * x * x / square) / jnp.sqrt(jnp.sqrt(square))
 
 
+def limited_root(h, knee, supply):
+    r"""Return the smaller of `root(h, knee)` and supply h; 0 below an empty tank.
+
+    h : (...) level [cm].  knee : as in `root` [cm].  supply : largest ratio of root to level
+    [cm^-0.5], at most 1.5 knee^-0.5 (the slope of `root` at 0, which then holds nowhere).
+    Slope `supply` at h = 0, the one from above: a level comes no lower.
+    """
+    held = at_least(h, 0.0)
+    q, most = root(held, knee), supply * held
+    return jnp.where(most <= q, most, q)
+
+
+@jax.custom_jvp
+def limited_flow(s, most, least):
+    """Return `s` limited to [-least, most], with most and least >= 0: what the tanks at the two ends
+    of a pipe can give. At a tie the slopes are those from above of most and least, which are 0 at an
+    empty tank and come no lower."""
+    return jnp.where(s > most, most, jnp.where(s < -least, -least, s))
+
+
+@limited_flow.defjvp
+def _limited_flow_jvp(primals, tangents):
+    (s, most, least), (ds, dmost, dleast) = primals, tangents
+    forth, back = (s >= 0.0) & (most <= s), (s <= 0.0) & (least <= -s)
+    slope = jnp.where(forth, dmost, 0.0) - jnp.where(back, dleast, 0.0)
+    return limited_flow(s, most, least), jnp.where(forth | back, slope, ds)
+
+
 @jax.custom_jvp
 def floored_root(h, floor):
     """sqrt(max(h, floor)), floor > 0: the root a law takes of a level it multiplies or divides by. Slope 0 below the floor."""

@@ -116,6 +116,7 @@ class Sample(NamedTuple):
     applied: tuple  # the command within the pumps' limits, one per pump [V]
     u: tuple  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
     spilled: tuple  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
+    shortfall: tuple = ()  # volume that a negative inflow could not take from each tank in that time [cm^3]
 
 
 class Trajectory(NamedTuple):

@@ -7,6 +7,10 @@ Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the
 of the film of `numerics.root`, and a Runge-Kutta step h follows it while lambda h is below 2.785 (rk4) or 2 (midpoint), the ends of their
 stability regions on the negative axis (Hairer & Wanner 1996, sec. IV.2). Beyond, a level that should rest at 0 is thrown up again and again.
 How high depends on lambda h alone, counted in knees, and is found here by doing it: 9 knees at 6.6, 160 at 15, 120,000 at 100.
+
+In a rig with `bottom` a tank gives no more in one step than it holds (`TankNetwork.limited`): nothing is thrown up and no volume appears, but
+a level below (h sqrt(2 g) (sum a_j + sum p_k) / A)^2 stands too high, by at most that. Beyond lambda h = 2.785 of the pipes alone, levels
+that a pipe has made equal still oscillate.
 """
 
 import functools
@@ -22,18 +26,19 @@ LIMITS = {"rk4": 2.785, "midpoint": 2.0}
 SEEN = 0.01  # share of the levels that a run is about up to which one may be thrown without a word
 
 
-def film_rates(plant):
-    """(n,) lambda of each tank [1/s]; None of a plant of another kind, or one whose leaves are traced."""
+def film_rates(plant, orifices=1.5, pipes=2.0):
+    """Return (n,) lambda of each tank [1/s], with these slopes of the film of its orifices and pipes; None of a plant of another kind, or
+    one whose leaves are traced."""
     try:
-        out, pipes = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
+        out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
         for k, (source, _) in enumerate(plant.links):
             out[source] += np.asarray(plant.orifice)[k]
         for k, ends in enumerate(plant.pipes):
             for i in ends:
-                pipes[i] += np.asarray(plant.pipe)[k]
+                joined[i] += np.asarray(plant.pipe)[k]
         with np.errstate(all="ignore"):
             speed = np.sqrt(2.0 * np.asarray(plant.gravity, dtype=float) / plant.knee)
-            rates = speed * (1.5 * out + 2.0 * pipes) / np.asarray(plant.area, dtype=float)
+            rates = speed * (orifices * out + pipes * joined) / np.asarray(plant.area, dtype=float)
         return np.minimum(rates, 1e200)
     except (AttributeError, TypeError):  # what jax raises for a traced number is a TypeError
         return None
@@ -86,6 +91,8 @@ def doubts(loop, clock):
     tank, height, remedy = max(shown, key=lambda one: one[1] / loop.plant.rim[one[0]])
     others = f" (and so do {len(shown) - 1} more)" if len(shown) > 1 else ""
     up = f"thrown up by {height:.2g} {length}" if math.isfinite(height) else "thrown up without end"
+    if loop.plant.bottom:
+        up = f"up to {height:.2g} {length} too high" if math.isfinite(height) else "wrong"
     return [f"tank {tank + 1} runs empty faster than the steps follow{others}: once it is, its level is {up} ({remedy})"]
 
 
@@ -148,7 +155,16 @@ def _thrown(loop, clock):
     step, limit = clock.dt / clock.substeps, LIMITS[clock.integrator]
     for tank, product in enumerate(rates * step):
         if product > limit:
-            height = thrown(float(f"{product:.3g}"), clock.integrator) * loop.plant.knee
+            height = _height(loop.plant, tank, step, product, clock.integrator) * loop.plant.knee
             substeps = math.ceil(clock.substeps * product / limit)
             remedy = f"clock.substeps = {substeps}" if substeps <= 10 else f"clock.dt of at most {step * limit / product:.2g} s"
             yield tank, height, f"{remedy} is short enough"
+
+
+def _height(plant, tank, step, product, integrator):
+    """How far off the level of a tank may be once it is empty, in knees."""
+    if not plant.bottom:
+        return thrown(float(f"{product:.3g}"), integrator)
+    held = (step * film_rates(plant, 1.0, 1.0)[tank]) ** 2
+    pipes = step * film_rates(plant, 0.0, 2.0)[tank]
+    return max(held, thrown(float(f"{pipes:.3g}"), integrator) if pipes > LIMITS[integrator] else 0.0)

@@ -154,7 +154,7 @@ def step(loop, clock, state, now):
     controller = loop.controller.track(controller, tick, command, applied)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, excess, spilled = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
+    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
         t=t,
@@ -168,6 +168,7 @@ def step(loop, clock, state, now):
         applied=applied,
         u=u,
         spilled=spilled,
+        shortfall=shortfall,
     )
     return State(state.k + 1, x, observer, controller, actuator, excess), sample
 
@@ -191,18 +192,20 @@ def commanded(loop, state, tick, estimate):
 
 
 def _advance(plant, clock, t, x, excess, u, d):
-    """Levels after dt with u and d held, what rounding has added to them too much, and the volume lost over each rim on the way [cm^3]."""
+    """Levels after dt with u and d held, what rounding has added to them too much, the volume lost over each rim on the way [cm^3], and
+    the volume that a negative inflow could not take from each empty tank [cm^3]."""
     h = clock.dt / clock.substeps
-    spilled = None
+    spilled = shortfall = (0.0,) * plant.tanks
     for j in range(clock.substeps):
         if excess:
             changes = change(plant, clock.integrator, t + j * h, x, u, d, h)
             x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
         else:
             x = integrate(plant, clock.integrator, t + j * h, x, u, d, h)
+        shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
         x, lost = plant.spill(x)
-        spilled = lost if spilled is None else tuple(a + b for a, b in zip(spilled, lost))
-    return x, excess, spilled
+        spilled = tuple(a + b for a, b in zip(spilled, lost))
+    return x, excess, spilled, shortfall
 
 
 def run_of(loop, clock):

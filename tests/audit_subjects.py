@@ -86,6 +86,17 @@ def _(rng):
     return 10 ** rng.uniform(-4, 1, 2), lambda p: numerics.floored_root(p[0], p[1])
 
 
+@subject("numerics.limited_root limited_flow", quick=True, points=60)
+def _(rng):
+    """Levels from empty up, the limit and the flow holding in about half of the points each."""
+    h, supply, s = 10 ** rng.uniform(-4, 1, 2), 10 ** rng.uniform(-1, 1.1), rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1)
+    return (*h, supply, s), lambda p: (
+        numerics.limited_root(p[0], 0.01, p[2]),
+        numerics.limited_root(-p[0], 0.01, p[2]),
+        numerics.limited_flow(p[3], p[0], p[1]),
+    )
+
+
 @subject("numerics.root_of_mean", quick=True, points=20)
 def _(rng):
     return 10 ** rng.uniform(-6, 3), numerics.root_of_mean
@@ -154,9 +165,10 @@ def _(rng):
     return small_point(rng)[:2], lambda p: p[0].spill(tuple(p[1]))
 
 
-def stepped(integrator):
+def stepped(integrator, h=0.1):
     def function(p):
-        return p[0].spill(integrate(p[0], integrator, 0.0, tuple(p[1]), tuple(p[2]), tuple(p[3]), 0.1))
+        x = integrate(p[0], integrator, 0.0, tuple(p[1]), tuple(p[2]), tuple(p[3]), h)
+        return (*p[0].spill(x), p[0].shortfall(x))
 
     return function
 
@@ -169,6 +181,11 @@ def _(rng):
 @subject("plants.integrate midpoint and spill")
 def _(rng):
     return small_point(rng), stepped("midpoint")
+
+
+@subject("plants.integrate rk4 and spill, steps in which a tank runs empty")
+def _(rng):
+    return small_point(rng), stepped("rk4", 5.0)
 
 
 @subject("plants.Faults")

@@ -26,6 +26,7 @@ DRILLS = {
     "fuzz": ("broken rig files, logs and command lines", "`pytest -m slow tests/test_fuzz.py`"),
     "gradient audit": ("points at which derivatives are compared with differences", "`python tests/gradient_audit.py`"),
     "properties": ("random rigs, over all properties", "`pytest -m slow tests/test_properties.py`"),
+    "stiff rigs": ("random stiff rigs with tanks that are drawn empty, against small steps", "`python tests/stiff_rigs.py`"),
     "kills": ("SIGKILLs of tune, uncertainty and identify", "`python tests/fault_drill.py 50`"),
     "other faults": (
         "full disks, read-only folders, Ctrl-C, two runs in one folder",
@@ -100,6 +101,8 @@ def run(name):
         record(name, len(found), summed(found))
     elif name == "kills":
         subprocess.run([sys.executable, HERE / "fault_drill.py", "50", "--record"])
+    elif name == "stiff rigs":
+        subprocess.run([sys.executable, HERE / "stiff_rigs.py", "--record"])
     elif name == "gradient audit":
         subprocess.run([sys.executable, HERE / "gradient_audit.py", "--record"])
     else:

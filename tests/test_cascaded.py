@@ -1,6 +1,7 @@
 """The public two-tank rig: its record, a fit from elsewhere, recorded signals, gradients."""
 
 import dataclasses
+import json
 import pathlib
 
 import jax
@@ -17,6 +18,7 @@ from jaxtank.presets import cascaded
 from jaxtank.records import Clock
 from jaxtank.signals import Table
 from jaxtank.tree import get_value, with_values
+from tuning import cli
 
 CASES = presets.load("cascaded").cases
 RECORD = pathlib.Path(__file__).parents[2] / "shared" / "data" / "cascaded_tanks.csv"
@@ -147,3 +149,87 @@ def test_what_is_measured():
         np.testing.assert_allclose(value, preset.published[name].value, rtol=preset.published[name].tolerance)
     low = lambda name, values, save_every=1: run(name, {**values, "plant.rim": 8.0}, save_every)
     assert abs(preset.measured(low)["plant.rim"] - 8.0) < 1e-6
+
+
+STIFF = {"plant.area": [3.24, 3.79], "plant.orifice": 0.328, "plant.drain": [0.0, 0.00456], "plant.pump_gain": 0.00625}
+
+
+def levels_for(loop, inputs, start, dt):
+    """(samples, 2) levels by scipy's Radau with `inputs` held for dt [s] each: nothing flows out of an empty tank, and a negative inflow
+    takes nothing from it (an event ends the first part, in which its level falls)."""
+    plant, knee = loop.plant, loop.plant.knee
+    (a1, a2), k1, k2 = plant.area, float(plant.orifice[0]), float(plant.drain[1])
+    film = lambda h: np.sqrt(h) if h >= knee else knee**0.5 * (1.5 * max(h, 0.0) / knee - 0.5 * (max(h, 0.0) / knee) ** 2)
+    path, x = [], np.array(start, dtype=float)
+    empty = lambda t, h: h[0]
+    empty.terminal, empty.direction = True, -1
+    for u in inputs:
+        path.append(x)
+        into = float(plant.pump_gain[0]) * u + float(loop.disturbance.level[0])
+        t = 0.0
+        while t < dt:
+            dry = x[0] <= 0.0 and into <= 0.0
+            rate = lambda _, h, dry=dry, into=into: [
+                0.0 if dry else (into - k1 * film(h[0])) / a1,
+                ((0.0 if dry else k1 * film(h[0])) - k2 * film(h[1])) / a2,
+            ]
+            found = solve_ivp(rate, (t, dt), x, method="Radau", rtol=1e-8, atol=1e-10, events=None if dry else empty)
+            t, x = found.t[-1], found.y[:, -1]
+            if found.status == 1:
+                x = np.array([0.0, x[1]])
+    return np.array(path)
+
+
+@pytest.mark.parametrize("substeps, dt", [(1, 4.0), (2, 4.0), (3, 4.0), (4, 4.0), (10, 4.0), (10, 0.4)])
+def test_a_negative_inflow_draws_nothing_from_the_tank_below(substeps, dt):
+    """A stiff rig with an inflow that is negative for most of the run: the lower level at 600 s does not depend on the step."""
+    case = rig.set_values(CASES["pi"], STIFF)
+    clock = Clock(dt=dt, duration=600.0, substeps=substeps)
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, clock))
+    assert run.x[-1, 0] == 0.0 and abs(run.x[-1, 1] - 5.69) < 0.02
+    if (substeps, dt) == (4, 4.0):
+        exact = levels_for(case.loop, run.u[:, 0], case.loop.x0, dt)
+        assert exact[:, 0].min() == 0.0 and np.abs(run.x - exact).max() < 0.05  # 0.5 % of the rim
+
+
+@pytest.mark.parametrize("substeps, within", [(1, 3e-3), (2, 1e-3), (4, 3e-4), (10, 3e-5)])
+def test_with_the_pump_off_the_lower_tank_empties_through_its_own_outlet(substeps, within):
+    case = rig.set_values(CASES["pi"], {"actuator.high": 1e-9})
+    clock = Clock(dt=4.0, duration=100.0, substeps=substeps)
+    run = jaxtank.simulate(case.loop, clock)
+    exact = levels_for(case.loop, np.zeros(26), case.loop.x0, 4.0)[-1]
+    assert abs(exact[1] - 0.421) < 1e-3 and abs(float(run.x[-1, 1]) - exact[1]) < within
+
+
+def test_what_an_inflow_could_not_take_is_counted(capsys):
+    """With the pump off for good: what is drawn from the upper tank after it has run empty. By the command."""
+    words = ["simulate", "cascaded/pi", "--set", "actuator.high=1e-9", "--set", "x0=0,0", "--set", "clock.duration=100", "--json"]
+    assert cli.main(words) == 0
+    counted = json.loads(capsys.readouterr().out)["measures"]["inflow_shortfall"]
+    # 26 samples of 4 s
+    np.testing.assert_allclose(counted, [-cascaded.K_PUMP * cascaded.OFFSET * 104.0, 0.0], rtol=1e-6)
+
+
+def test_gradients_of_a_rig_that_runs_dry():
+    """Against central differences: tanks empty from the start, nearly, and on the way, in steps that are too long for the orifice."""
+    case = rig.set_values(CASES["pi"], {**STIFF, "clock.duration": 400.0, "actuator.high": 2.0})
+    names = [
+        "plant.orifice[0]",
+        "plant.drain[1]",
+        "plant.pump_gain[0]",
+        "disturbance.level[0]",
+        "plant.area[1]",
+        "controller.Kc[0]",
+    ]
+    z = jnp.array([float(get_value(case.loop, n)) for n in names])
+
+    def f(factors, start):
+        loop = with_values(case.loop, {**dict(zip(names, z * factors)), "x0": start})
+        found = jaxtank.evaluate(loop, case.clock, ["rms_error_total", "inflow_shortfall"])
+        return jnp.stack([found["rms_error_total"], found["inflow_shortfall"][0]])
+
+    value, slope, ones = jax.jit(f), jax.jit(jax.jacfwd(f)), jnp.ones(len(names))
+    for start in jnp.array([(5.4, 5.2), (0.0, 3.0), (0.004, 0.004), (3.0, 3.0)]):
+        assert value(ones, start)[1] > 1.0
+        pairs = [value(ones + d, start) - value(ones - d, start) for d in 1e-6 * np.eye(len(names))]
+        np.testing.assert_allclose(slope(ones, start), np.stack(pairs, axis=1) / 2e-6, rtol=2e-5, atol=1e-8)

@@ -114,6 +114,12 @@ def rimmed(h, **more):
     return network(area=[20.0], drain=[0.2], pump_gain=[5.0], feeds=((0, None),), rim=[10.0], overflow=True, **more).spill((h,))
 
 
+def limited(one, other):
+    """Flow of a pipe between two levels whose tanks give at most 2 and 3 times their level."""
+    one, other = numerics.at_least(one, 0.0), numerics.at_least(other, 0.0)
+    return numerics.limited_flow(numerics.signed_root(one - other), 2.0 * one, 3.0 * other)
+
+
 BOX = ((2.0, 0.5, 1.0), np.array([0.0, 0.0]), np.array([10.0, 10.0]))
 PUMP = actuators.PumpBank(
     low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1), pulse=np.full(1, 4.0), lag=None,
@@ -135,6 +141,12 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
     ("root of a mean of nothing", lambda e: numerics.root_of_mean(e * e), 0.0, 0.0),
     ("root at an empty tank", numerics.root, 0.0, 15.0),
     ("root at its knee", numerics.root, 0.01, 5.0),
+    ("limited root at an empty tank", lambda h: numerics.limited_root(h, 0.01, 2.0), 0.0, 2.0),
+    ("limited root where the limit ends", lambda h: numerics.limited_root(h, 0.01, 2.0), 0.25, 2.0),
+    ("a pipe's flow from an empty tank", lambda h: limited(h, 0.0), 0.0, 2.0),
+    ("a pipe's flow into an empty tank", lambda h: limited(0.0, h), 0.0, -3.0),
+    ("a pipe's flow between equal levels", lambda h: limited(1.0 + h, 1.0), 0.0, 10.0),
+    ("a pipe's flow from a full tank into an empty one", lambda h: limited(4.0, h), 0.0, None),
     ("signed root between equal levels", numerics.signed_root, 0.0, 10.0),
     ("membership where it begins", lambda e: membership(e, 1.0, 0.4), 0.6, 0.0),
     ("membership where it is as wide as it may be", lambda w: membership(0.7, 1.0, w), 1.0, None),

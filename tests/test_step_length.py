@@ -7,6 +7,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
+import stiff_rigs
 
 import jaxtank
 import tuning
@@ -245,3 +246,26 @@ def test_draws_of_steps_too_long_say_so(substeps, tmp_path):
         found.save(tmp_path)
     told = [repr(found), *((tmp_path / name).read_text() for name in ("result.json", "report.html"))]
     assert [DOUBT in text for text in told] == [substeps == 1] * 3
+
+
+@pytest.mark.parametrize("kind", stiff_rigs.KINDS)
+def test_a_random_stiff_rig_is_right_or_reported(kind):
+    """No level is off by more than 5 % of its rim without a StepWarning (`python tests/stiff_rigs.py` tries more)."""
+    found = stiff_rigs.tried(kind, range(8))
+    assert len(found) == 8 and [error for error, reported in found if not reported and error > stiff_rigs.OFF] == []
+    assert min(error for error, _ in found) < 0.01
+
+
+def test_the_level_of_an_unresolved_film_is_reported():
+    """A stiff tank with `bottom`, fed a little: its level stands where one step's inflow is, and no higher than is reported."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", step_length.StepWarning)
+        case = rig.loads(ONE.format(drain=0.4).replace("high = 12.0", "high = 0.5").replace("initial = 0.0", "initial = 0.5"))
+        plant = dataclasses.replace(case.loop.plant, bottom=True)
+        loop, clock = dataclasses.replace(case.loop, plant=plant), Clock(dt=2.0, duration=200.0)
+        level = np.asarray(jaxtank.simulate(loop, clock).x)[-1, 0]
+    (sentence,) = step_length.doubts(loop, clock)
+    reported = float(sentence.split("up to ")[1].split(" cm")[0])
+    exact = (0.5 * 8.0 / 0.4) ** 2 / (2 * 981.0)  # Torricelli
+    np.testing.assert_allclose(level, 2.0 * 0.5 * 8.0 / 20.0, rtol=1e-9)
+    assert exact < level < exact + reported

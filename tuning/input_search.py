@@ -15,7 +15,7 @@ from tuning.inputs import RUNNING, Held, Terms, look, open_loop, value_and_gradi
 from tuning.objective import resolve_limits
 from tuning.projected import minimise
 
-SUMS = {"e2", "abs_e", "u2", "over_rim2", "spilled", "travel", "saturation_excess", "deviation2", "changes2", "past2"}
+SUMS = {"e2", "abs_e", "u2", "over_rim2", "spilled", "shortfall", "travel", "saturation_excess", "deviation2", "changes2", "past2"}
 """Accumulators that are sums over the run with a slope in every input: measures of these alone can be made small, or be limited."""
 
 TOLERANCE = 3e-5

@@ -20,6 +20,9 @@ class Plant(abc.ABC):
     overflow = False
     """True where a level stops at its rim and what would rise past it is lost."""
 
+    bottom = False
+    """True where a level stops at zero whatever is drawn from it."""
+
     @property
     @abc.abstractmethod
     def tanks(self):
@@ -33,6 +36,16 @@ class Plant(abc.ABC):
     @abc.abstractmethod
     def derivative(self, t, x, u, d):
         """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or None; returns (n) [cm/s]."""
+
+    def limited(self, step):
+        """Return the vector field of one integration step of `step` [s]: `derivative`, unless a plant
+        limits what may leave a tank in that time."""
+        return self.derivative
+
+    def shortfall(self, x):
+        """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
+        tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
+        return (0.0,) * len(x)
 
     def rates(self, x, u):
         """`derivative` of arrays x (n) and u (m), without time and inflows, as an array (n); a plant of many tanks may have one that is

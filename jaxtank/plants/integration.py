@@ -26,10 +26,11 @@ def _along(x, rates, by):
 
 def _rates(plant, integrator, t, x, u, d, h):
     """Rates of the midpoint, or of the four stages."""
+    rate = plant.limited(h)
     if integrator == "midpoint":
-        return plant.derivative(t + 0.5 * h, _along(x, plant.derivative(t, x, u, d), 0.5 * h), u, d)
+        return rate(t + 0.5 * h, _along(x, rate(t, x, u, d), 0.5 * h), u, d)
     # each rate is read by the next stage and by the sum. The two of the midpoint rule are read once.
-    k1 = materialised(plant.derivative(t, x, u, d))
-    k2 = materialised(plant.derivative(t + 0.5 * h, _along(x, k1, 0.5 * h), u, d))
-    k3 = materialised(plant.derivative(t + 0.5 * h, _along(x, k2, 0.5 * h), u, d))
-    return k1, k2, k3, plant.derivative(t + h, _along(x, k3, h), u, d)
+    k1 = materialised(rate(t, x, u, d))
+    k2 = materialised(rate(t + 0.5 * h, _along(x, k1, 0.5 * h), u, d))
+    k3 = materialised(rate(t + 0.5 * h, _along(x, k2, 0.5 * h), u, d))
+    return k1, k2, k3, rate(t + h, _along(x, k3, h), u, d)

@@ -1,13 +1,14 @@
 """Tanks, orifices, pipes, pumps: one network serves every rig."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.errors import InputError
-from jaxtank.numerics import at_least, clip, root, signed_root
+from jaxtank.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import efflux, usual_gravity, usual_knee
 from jaxtank.tree import check_value, component, leaf, number, static
@@ -25,7 +26,8 @@ class TankNetwork(Plant):
     freely, so its flow depends on the level above it alone; a pipe's flow depends on the difference of the two levels and changes its
     direction with it. Levels may fall to zero and stay there; with `overflow` they stop at the rim and what would rise past it is lost
     (and counted), except for the share `caught` that falls into another tank; otherwise a rim is only a limit and levels may rise
-    past it. With `bottom`, a level stops at zero where a negative inflow would take it below.
+    past it. With `bottom`, a level stops at zero where a negative inflow would take it below, and no
+    tank gives more in one integration step than it holds (see `limited`).
     """
 
     area: np.ndarray = leaf("cm^2", "(n,) cross-section A of each tank", low=0.0, strict=True)
@@ -69,6 +71,41 @@ class TankNetwork(Plant):
         return shares
 
     def derivative(self, t, x, u, d):
+        return self._flows(t, x, u, d)
+
+    def limited(self, step):
+        """Return the vector field of one integration step of `step` [s]: `derivative`; with `bottom`,
+        no tank gives more than it holds.
+
+        In each stage an outlet of area s_k of tank i, orifice or pipe, passes at most its share
+        s_k / (sum of the tank's outlets) of A_i max(h_i, 0) / step. An rk4 step then ends at or above
+        zero where no inflow from outside is negative: stage s holds at most h_i plus what flows in up
+        to it, so the weighted sum of the outflows is less than h_i plus the sum of the inflows (the
+        midpoint rule: where an inflow does not fall by half within half a step). What leaves one tank
+        arrives in the next, so volume is conserved whatever the step, and the lower clip in `spill`
+        adds only what a negative inflow could not take (`shortfall`).
+
+        The limit acts below h = (step sqrt(2 g) sum s_k / A)^2, where the tank holds less than it
+        gives in one step; elsewhere the rates are those of `derivative`, bit for bit. Where it acts,
+        what passes the tank is delayed by up to one step (`step_length` reports how high it stands).
+        """
+        if not self.bottom or type(self).derivative is not TankNetwork.derivative:
+            return self.derivative
+        return functools.partial(self._flows, step=step)
+
+    def _supply(self, step):
+        """(n) largest ratio of root to level in a step [cm^-0.5]: at most that of `numerics.root`."""
+        areas = [self.drain[i] for i in range(self.tanks)]
+        for k, (source, _) in enumerate(self.links):
+            areas[source] = areas[source] + self.orifice[k]
+        for k, ends in enumerate(self.pipes):
+            for i in ends:
+                areas[i] = areas[i] + self.pipe[k]
+        # of the inverse, which is 0 and not infinite for a tank without outlets
+        turnover = step * jnp.sqrt(2.0 * self.gravity)
+        return [1.0 / at_least(turnover * s / self.area[i], self.knee**0.5 / 1.5) for i, s in enumerate(areas)]
+
+    def _flows(self, t, x, u, d, step=None):
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed once by the loop. What u and d bring
         # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
         n, w = self.tanks, jnp.sqrt(2.0 * self.gravity)
@@ -78,11 +115,15 @@ class TankNetwork(Plant):
         rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
         for j, tank, gain in self._shares():
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
-        q = [root(h, self.knee) for h in x]
+        supply = None if step is None else self._supply(step)
+        q = [root(h, self.knee) if step is None else limited_root(h, self.knee, supply[i]) for i, h in enumerate(x)]
+        held = x if step is None else [at_least(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
             rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
         for k, (one, other) in enumerate(self.pipes):
-            s = signed_root(x[one] - x[other], self.knee)
+            s = signed_root(held[one] - held[other], self.knee)
+            if step is not None:
+                s = limited_flow(s, supply[one] * held[one], supply[other] * held[other])
             rate[one] = rate[one] - (self.pipe[k] * w / self.area[one]) * s
             rate[other] = rate[other] + (self.pipe[k] * w / self.area[other]) * s
         return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
@@ -109,6 +150,11 @@ class TankNetwork(Plant):
         """Pumped and disturbing inflow less what leaves for the basin [cm^3/s]: the rate of change of the stored volume."""
         inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
         return inflow - sum(self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks))
+
+    def shortfall(self, x):
+        if not self.bottom:
+            return super().shortfall(x)
+        return tuple(self.area[i] * (at_least(h, 0.0) - h) for i, h in enumerate(x))
 
     def spill(self, x):
         lost = [0.0] * self.tanks
