@@ -171,6 +171,9 @@ HOSTILE = {
     "a batch twice": {"x.npy": ARRAY, "y.npy": ARRAY},
     "an array of 745 GiB": {"x.npy": header("(100000000000,)") + bytes(16)},
     "a header that is a program": {"x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"},
+    "a header of 9,000 brackets": {"x.npy": b"\x93NUMPY\x01\x00" + (9000).to_bytes(2, "little") + b"[" * 9000},
+    "a header of 9,000 signs": {"x.npy": b"\x93NUMPY\x01\x00" + (9001).to_bytes(2, "little") + b"-" * 9000 + b"1"},
+    "an array longer than a number can say": {"x.npy": header(f"({10**30},)")},
     "an object, pickled": {"x.npy": ARRAY.replace(b"<f8", b"|O ")},
     "nothing": {},
 }
