@@ -14,17 +14,31 @@ MANY = 50
 """Values of the limit at most."""
 
 
-def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, scenarios=None, seed=0, iterations=60, start=None):
+def tradeoff(
+    case,
+    measure,
+    values,
+    *,
+    free=None,
+    objective=None,
+    limits=None,
+    scenarios=None,
+    seed=0,
+    iterations=60,
+    start=None,
+    progress=None,
+):
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
 
     Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
     limit) and from that of the next tighter one, and the best is kept: a tighter limit's answer holds a looser one too, so that the
     objective never falls as the limit is drawn in.
 
-    case, free, objective, limits, scenarios, seed, iterations: as in `tune`; the limit holds for every entry of the measure, the other
-    limits stay; start: {name: value} to begin at, the case's own where None. Returns {"measure", "points": [{"limit", "status" ("converged",
-    "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises InputError for an unknown measure and for values
-    that are not finite.
+    case, free, objective, limits, scenarios, seed, iterations: as in `tune`; the limit holds for every
+    entry of the measure, the other limits stay; start: {name: value} to begin at, the case's own where
+    None; progress: called after every evaluation. Returns {"measure", "points": [{"limit", "status"
+    ("converged", "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises
+    InputError for an unknown measure and for values that are not finite.
     """
     check_names([measure])
     values = [float(v) for v in values]
@@ -38,13 +52,13 @@ def tradeoff(case, measure, values, *, free=None, objective=None, limits=None, s
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
     found, begin = [], z
     for value in values:
-        found.append(_solve(problem, {**others, measure: value}, z, iterations))
+        found.append(_solve(problem, {**others, measure: value}, z, iterations, progress))
         if found[-1].broken and z is not begin:
-            found[-1] = _better(found[-1], _solve(problem, {**others, measure: value}, begin, iterations))
+            found[-1] = _better(found[-1], _solve(problem, {**others, measure: value}, begin, iterations, progress))
         z = z if found[-1].best is None else found[-1].best.z
     for k in reversed(range(len(values) - 1)):
         if not found[k + 1].broken:
-            again = _solve(problem, {**others, measure: values[k]}, found[k + 1].best.z, iterations)
+            again = _solve(problem, {**others, measure: values[k]}, found[k + 1].best.z, iterations, progress)
             found[k] = _better(found[k], again)
     return {"measure": measure, "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)]}
 
@@ -72,12 +86,12 @@ def _better(one, other):
     return other if one.search.better(other.best, one.best) else one
 
 
-def _solve(problem, limits, z, iterations):
+def _solve(problem, limits, z, iterations, progress=None):
     """The _Answer of `problem` under `limits` {measure: value}, searched from z (P,)."""
     problem.limits = [limit for i, lane in enumerate(problem.lanes) for limit in resolve_limits(lane.case, limits, i, lane.name)]
     problem.rooms = np.array([room_of(limit, problem.loop) for limit in problem.limits])
     problem.memo = type(problem.memo)()  # margins are of the limits: what is remembered would be of the last ones
-    search = Search(problem, problem.point(problem.start()), lambda s: None)
+    search = Search(problem, problem.point(problem.start()), progress or (lambda search: None))
     converged = slsqp(search, z, iterations)
     if search.best is not None and search.violation(search.best) > 0:
         restore(search, search.best.z, iterations)
