@@ -51,11 +51,11 @@ def export_law(args):
     case = open_case(args)
     from pathlib import Path
 
-    from jaxtank.export import export
+    from jaxtank.export import export, function_name
     from tuning import saving, tables
 
     text = export(case, args.lang, args.precision, args.name)
-    name = args.name or case.name.replace("/", "_").replace("-", "_").replace(" ", "_")
+    name = args.name or function_name(case)
     if args.json:
         print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:

@@ -11,7 +11,7 @@ from jaxtank.numerics import at_least, clip, root, signed_root
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import GRAVITY, efflux, in_unit, usual_knee
 from jaxtank.tree import check_value, component, leaf, number, static
-from jaxtank.units import DEFAULT
+from jaxtank.units import DEFAULT, check_unit
 
 
 @component
@@ -191,6 +191,8 @@ def network(
     links, pipes, spills: pairs (from, to), with one orifice, pipe, caught each. Units as in TankNetwork, or those of `units`.
     gravity, knee: 981 cm/s^2 and 0.01 cm where they are None, in the length of `units` (see `hydraulics.in_unit`).
     """
+    for unit in units:
+        check_unit("plant.units: entry", unit)
     gravity = in_unit(GRAVITY, units[0]) if gravity is None else gravity
     knee = usual_knee(units[0]) if knee is None else knee
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
