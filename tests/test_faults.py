@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import files, presets
+from jaxtank import files, plotting, presets
 from jaxtank.errors import InputError
-from tuning import cli, holds, memo, parts
+from tuning import cli, holds, memo, parts, pictures
 
 HERE = Path(__file__).parent
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
@@ -135,7 +135,7 @@ def old_result(folder, words, capsys):
 @pytest.mark.parametrize(
     "name", [n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow) for n in WRITERS]
 )
-def test_a_full_disk_leaves_the_old_result_whole(name, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     before = old_result(folder, words, capsys)
@@ -146,11 +146,76 @@ def test_a_full_disk_leaves_the_old_result_whole(name, tmp_path, capsys, monkeyp
     last = [line for line in err if line.startswith("jaxtank: ")]
     assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
     assert "Traceback" not in "".join(err)
-    assert {n: data for n, data in contents(folder).items() if n in before} == before
-    left = contents(folder).keys() - before.keys()
+    after, drawn = contents(folder), {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))}
+    if after.get("result.json") == before.get("result.json"):  # there was no room for the new one: all of the old is there
+        assert {n: data for n, data in after.items() if n in before} == before
+    else:  # the new one, with no picture of the old
+        assert not drawn & after.keys() and before.keys() - drawn <= after.keys() and json.loads(after["result.json"])
+    left = after.keys() - before.keys()
     assert all(n == memo.NAME or n == parts.MANIFEST or parts.NAME.fullmatch(n) for n in left), left
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
         assert out.strip()  # the answer is told all the same
+
+
+DRAWERS = [n for n in WRITERS if n != "export"]
+
+
+@pytest.mark.parametrize("name", [n if n in ("simulate", "show") else pytest.param(n, marks=pytest.mark.slow) for n in DRAWERS])
+def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, capsys, monkeypatch):
+    """A text that matplotlib cannot set, in one kind of picture; then a function that cannot draw."""
+    monkeypatch.chdir(tmp_path)
+    words, folder = WRITERS[name], tmp_path / "out"
+    whole = old_result(folder, words, capsys)
+    plot, broken = (plotting, "responses") if name == "simulate" else (pictures, "rig")
+    usual = getattr(plot, broken)
+
+    def unset(*args):
+        drawn = usual(*args)
+        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
+            figure.suptitle(r"$\x{$")
+        return drawn
+
+    def undrawn(*_):
+        raise ZeroDivisionError
+
+    for fault in (unset, undrawn):
+        monkeypatch.setattr(plot, broken, fault)
+        code, _, err = say([*words, "--out", folder], capsys)
+        notes = [line for line in err if line.startswith("jaxtank: ")]
+        assert code in (0, 3) and len(notes) >= 1 and all("note: " in n and "could not be drawn" in n for n in notes), err
+        left = contents(folder)
+        missing = whole.keys() - left.keys()
+        assert missing and all(n.endswith((".png", ".svg")) for n in missing)
+        if name != "show":
+            assert json.loads(left["result.json"]) and (name == "simulate" or "report.html" in left)
+
+
+@pytest.mark.parametrize("name", [n if n in ("simulate", "show") else pytest.param(n, marks=pytest.mark.slow) for n in DRAWERS])
+def test_what_a_file_calls_things_is_never_set_as_mathematics(name, tmp_path, capsys, monkeypatch):
+    if name == "compare":
+        pytest.skip("it takes no file")
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text("""case = "cascaded/pi"
+name = "$\\\\x{$ $\\\\y{$"
+[values]
+"clock.dt" = 1.0
+"clock.duration" = 400.0
+[[scenario]]
+name = "$\\\\x{$"
+seed = 1
+""")
+    words = [w for w in WRITERS[name] if w not in SHORT]
+    if name == "identify":
+        old_result(tmp_path / "out", WRITERS[name], capsys)
+        Path("log.csv").rename("$ $_^{.csv")
+        words = [*words, "--free", "plant.drain[0]=0.01:0.1"]
+        words[words.index("log.csv")] = "$ $_^{.csv"
+    else:
+        words = [words[0], "rig.toml", *(w for w in words[1:] if w != "cascaded/pi")]
+        old_result(tmp_path / "out", WRITERS[name], capsys)
+    code, _, err = say([*words, "--out", "new"], capsys)
+    assert code in (0, 3, 5) and not [line for line in err if "could not be drawn" in line or "internal error" in line], err
+    assert {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {"estimates.png"} <= contents(tmp_path / "new").keys()
 
 
 @pytest.mark.parametrize("name", WRITERS)

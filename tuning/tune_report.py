@@ -8,7 +8,7 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.files import check_folder
 from tuning.report import json_of, parts_of, worst_of_scenarios
-from tuning.saving import pngs, run_for_people, trajectory_csv, write_files
+from tuning.saving import earlier, run_for_people, trajectory_csv, write_result
 from tuning.tables import dumps, number, objective_unit
 
 
@@ -112,7 +112,7 @@ def page_of(result, drawn, command=None):
         result.success,
         facts,
         result.message.split("; "),
-        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        page.drawings(drawn, CAPTIONS),
         parts_of(result)[1:],
         command,
         result.provenance,
@@ -186,7 +186,7 @@ def _landscape(ax, result, unit):
 
 
 def save(result, folder, command=None):
-    """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
+    """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and report.html; returns their paths.
 
     command: the line that made the result, for the report, where there is one.
     """
@@ -200,5 +200,5 @@ def save(result, folder, command=None):
         "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
         "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
-    drawn = figures(result, runs)
-    return write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
+    stale = earlier(folder, CAPTIONS)
+    return write_result(folder, files, lambda: figures(result, runs), lambda drawn: page_of(result, drawn, command), stale)
