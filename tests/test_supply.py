@@ -54,6 +54,7 @@ READS = {
 MADE = {
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("tuning.cli", "_run", "import_module"): "modules of its own table of commands",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -73,6 +74,7 @@ READ = {
     ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.streams", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.holds", "_locked", "open"): "its own lock, of which 20 bytes are read",
+    ("tuning.holds", "release", "open"): "its own lock, of which nothing is read",
 }
 
 
