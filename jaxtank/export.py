@@ -48,6 +48,21 @@ def law_of(case):
     return step, begin
 
 
+def function_name(case):
+    """The name of a Case with what no language allows in a name as _."""
+    return re.sub(r"[^A-Za-z0-9]+", "_", case.name).strip("_")
+
+
+def comment(text):
+    """`text` as what may stand in a comment of C and of MATLAB, on one line that ends nothing and goes on nowhere.
+
+    Characters that do not print, line breaks of every script among them, are spaces; a backslash is a slash; the ends of comments and the
+    trigraphs of C are taken apart.
+    """
+    text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
+    return re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
+
+
 def export(case, language="c", precision="double", name=None):
     """The law of a Case as source code.
 
@@ -64,8 +79,8 @@ def export(case, language="c", precision="double", name=None):
         raise InputError(f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to export")
     if case.loop.controller.inputs(case.clock) != ():
         raise InputError(f"{case.name}: its law plays a signal of its own back, which code without a run cannot have")
-    name = name or re.sub(r"\W+", "_", case.name).strip("_")
-    if not re.fullmatch(r"[A-Za-z]\w{0,50}", name):
+    name = name or function_name(case)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
         raise InputError(
             f"--name {name!r}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51"
         )
@@ -256,7 +271,7 @@ def _about(law, case, mark, name, begin):
         "",
         *(f"{n} = {v}" for n, v in gains),
     ]
-    return [f"{mark} {line}".rstrip() for line in lines]
+    return [f"{mark} {comment(line)}".rstrip() for line in lines]
 
 
 def _shown(case):

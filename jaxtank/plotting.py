@@ -66,7 +66,7 @@ def plain(text):
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
     """Levels of one tank [unit] over time [s], one line per {name: (Trajectory, colour, style)}; its setpoint, rim and limit."""
     for name, (run, colour, style) in trajectories.items():
-        ax.plot(run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=name)
+        ax.plot(run.t, run.x[:, tank], color=colour, linestyle=style, linewidth=1.4, label=plain(name))
     last = next(iter(trajectories.values()))[0]
     if output is not None:
         ax.plot(last.t, last.r[:, output], color=REFERENCE, linestyle=":", linewidth=1.2, label="setpoint")
@@ -86,7 +86,7 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
 def voltage(ax, trajectories, pump, low, high, unit="V"):
     """Input of one pump [unit], within its limits, over time [s], what lies outside its limits shaded."""
     for name, (run, colour, style) in trajectories.items():
-        ax.plot(run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=name)
+        ax.plot(run.t, run.u[:, pump], color=colour, linestyle=style, linewidth=1.2, label=plain(name))
     ax.set(title=f"pump {pump + 1}", ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
     lowest, highest = (f([f(run.u[:, pump]) for run, _, _ in trajectories.values()]) for f in (np.min, np.max))
     if highest - lowest < 0.1 * (high - low):  # limits far away say nothing
@@ -101,7 +101,7 @@ def voltage(ax, trajectories, pump, low, high, unit="V"):
 def error(ax, trajectories, output, tank, unit="cm"):
     """Tracking error of one output [unit] over time [s]."""
     for name, (run, colour, style) in trajectories.items():
-        ax.plot(run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=name)
+        ax.plot(run.t, run.e[:, output], color=colour, linestyle=style, linewidth=1.2, label=plain(name))
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     ax.set(title=f"tracking error of tank {tank + 1}", ylabel=f"h - r [{unit}]")
     return ax
@@ -157,7 +157,7 @@ def responses(loop, trajectories, title="", limits=None):
                 handles.setdefault(label, handle)
         across = len(handles) if len(handles) <= 6 else max(4, round(width / 2))  # entries beside each other
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=across)
-        figure.suptitle("\n".join(textwrap.fill(plain(line), int(12 * width)) for line in title.splitlines()), fontsize=10)
+        figure.suptitle("\n".join(plain(textwrap.fill(line, int(12 * width))) for line in title.splitlines()), fontsize=10)
     return figure
 
 
@@ -400,7 +400,7 @@ def violations(rows, samples):
         ends = np.array([r["interval95"] for r in rows])
         ax.barh(y, p, color="#56B4E9", height=0.6)
         ax.errorbar(p, y, xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]), fmt="none", ecolor="black", capsize=3)
-        ax.set_yticks(y, [f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")") for r in rows])
+        ax.set_yticks(y, [plain(f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")")) for r in rows])
         ax.invert_yaxis()
         ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
         ax.set_xlabel(f"probability of breaking the limit [-], {samples} draws")

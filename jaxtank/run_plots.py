@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.plotting import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
+from jaxtank.plotting import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240
 """Slices of time in the strips of `saturation`; each is as dark as the share of it that was spent at a limit."""
@@ -14,7 +14,7 @@ def phase(ax, trajectories, tanks, rims=None, unit="cm"):
     across, up = tanks
     for name, (run, colour, style) in trajectories.items():
         h = np.asarray(run.x)
-        ax.plot(h[:, across], h[:, up], color=colour, linestyle=style, linewidth=1.1, label=name)
+        ax.plot(h[:, across], h[:, up], color=colour, linestyle=style, linewidth=1.1, label=plain(name))
         ax.plot(h[0, across], h[0, up], "o", color=colour, markersize=4)
         ax.plot(h[-1, across], h[-1, up], "s", color=colour, markersize=4)
     for tank, span, side in ((across, ax.axvspan, 1), (up, ax.axhspan, 0)):
@@ -43,7 +43,7 @@ def saturation(ax, runs, low, high):
             asked, t = np.asarray(run.command)[:, j], np.asarray(run.t)
             over, under = asked > float(high[j]), asked < float(low[j])
             names.append(
-                f"pump {j + 1}{f', {name}' if len(runs) > 1 else ''}\n{_percent(over.mean())} up, {_percent(under.mean())} down"
+                f"pump {j + 1}{f', {plain(name)}' if len(runs) > 1 else ''}\n{_percent(over.mean())} up, {_percent(under.mean())} down"
             )
             ax.axhline(y, color="0.7", linewidth=0.8)
             for mask, sign, colour in ((over, 1, AFTER), (under, -1, BEFORE)):
@@ -105,7 +105,9 @@ def margins(ax, rows):
     ax.barh(y, [shares[i] for i in order], color=[FORBIDDEN if shares[i] < 0 else AFTER for i in order], height=0.62)
     met = [k for k, i in enumerate(order) if 0 <= shares[i] < 0.1]  # bars too short to be seen
     ax.plot(np.zeros(len(met)), met, "|", color=AFTER, markersize=11, markeredgewidth=3)
-    ax.set_yticks(y, [f"{rows[i]['name']}\n{rows[i]['value']:.5g} of {rows[i]['limit']:.5g} {rows[i]['unit']}" for i in order])
+    ax.set_yticks(
+        y, [f"{plain(rows[i]['name'])}\n{rows[i]['value']:.5g} of {rows[i]['limit']:.5g} {rows[i]['unit']}" for i in order]
+    )
     ax.invert_yaxis()
     ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
     ax.grid(False, axis="y")

@@ -5,7 +5,33 @@
 
 import re
 
+from jaxtank.errors import InputError
+
 DEFAULT = ("cm", "V")
+
+LONGEST = 40
+"""Characters of a unit at most."""
+
+
+def check_unit(where, text):
+    """Return `text` if it is a unit, such as "cm", "L/min", "m^3/s" or "cm^3/(s V)".
+
+    A unit is names joined by *, / or a space, each with ^ and a number where it has an exponent; a
+    product may stand in brackets. A name is letters, digits and _, and begins with a letter; "%", "1"
+    and "-" are units too. Raises InputError, with `where` for its name, for any other text.
+    """
+    name = r"(?:[^\W\d_]\w*|°[CF]|%|1)"
+    factor = rf"{name}(?:\^-?\d+(?:\.\d+)?)?"
+    joint = r"(?: ?[*/·] ?| )"
+    product = rf"{factor}(?:{joint}{factor})*"
+    term = rf"(?:{factor}|\({product}\)(?:\^-?\d+)?)"
+    if len(text) > LONGEST or not re.fullmatch(rf"-|{term}(?:{joint}{term})*", text):
+        shown = text if len(text) <= LONGEST else text[:LONGEST] + "..."
+        raise InputError(
+            f"{where} = {shown!r}: must be a unit of at most {LONGEST} characters, such as cm, L/min, m^3/s or "
+            "cm^3/(s V): names joined by *, / or a space, ^ before an exponent"
+        )
+    return text
 
 
 def local(unit, units=DEFAULT):

@@ -28,6 +28,7 @@ DRILLS = {
     "properties": ("random rigs, over all properties", "`pytest -m slow tests/test_properties.py`"),
     "stiff rigs": ("random stiff rigs with tanks that are drawn empty, against small steps", "`python tests/stiff_rigs.py`"),
     "kills": ("SIGKILLs of tune, uncertainty and identify", "`python tests/fault_drill.py 50`"),
+    "interrupts": ("cold SIGINT and SIGTERM, 0 to 5 s after the start of ten commands", "`python tests/interrupt_drill.py 200`"),
     "other faults": (
         "full disks, read-only folders, Ctrl-C, two runs in one folder",
         "`pytest -m 'slow or not slow' tests/test_faults.py`",
@@ -97,12 +98,14 @@ def run(name):
         record(name, count, f"of {len(sizes)} properties; {summed(found)}")
     elif name in ("long and large", "other faults", "supply"):
         home = {"long and large": "test_long_runs.py", "other faults": "test_faults.py", "supply": "test_supply.py"}[name]
-        found, _ = suite(f"tests/{home}", "-k", "not kills")  # which have a row of their own
+        found, _ = suite(f"tests/{home}", "-k", "not kills and not hundred")  # which have a row of their own
         record(name, len(found), summed(found))
     elif name == "kills":
         subprocess.run([sys.executable, HERE / "fault_drill.py", "50", "--record"])
     elif name == "stiff rigs":
         subprocess.run([sys.executable, HERE / "stiff_rigs.py", "--record"])
+    elif name == "interrupts":
+        subprocess.run([sys.executable, HERE / "interrupt_drill.py", "200", "--record"])
     elif name == "gradient audit":
         subprocess.run([sys.executable, HERE / "gradient_audit.py", "--record"])
     else:

@@ -522,6 +522,22 @@ def test_an_interrupted_search_ends_with_130_and_its_best_point_is_written(here,
     assert rig.load(here / "out" / "rig.toml").loop.controller.Tp == found["parameters"]["controller.Tp"]["after"]
 
 
+def test_a_trade_off_that_is_interrupted_costs_itself_and_not_the_answer(here, monkeypatch):
+    class Late(tune_command.Progress):
+        def __call__(self, event):
+            pass
+
+        def check(self, *_):  # called by what follows the search
+            self.stop = True
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune_command, "Progress", Late)
+    said = say("tune", "gouta2015/ngpc", *SHORT, *SEARCH, "--tradeoff", "max_level=24:26:2", "--json", "--out", "out")
+    assert said.code == 130
+    assert said.json["status"] != "interrupted" and (here / "out" / "rig.toml").exists()
+    assert said.json.get("tradeoff") is None
+
+
 def test_an_objective_that_no_run_can_give_is_told():
     said = say("tune", CASE, "--set", "clock.duration=10", "--dt", "0.1", *SEARCH, "--objective", "settling_time=1", "--quiet")
     assert said.code in (2, 3), said.err  # before 20 s nothing changes, so nothing settles: the objective is not a number anywhere

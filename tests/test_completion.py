@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from tuning import cli, completion
+from tuning.parser import parser
 
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}
 
@@ -22,7 +23,7 @@ def script(tmp_path_factory):
     """Path of the script of each shell."""
     folder = tmp_path_factory.mktemp("completion")
     for shell in completion.SHELLS:
-        (folder / shell).write_text(completion.script(shell, cli.parser()), encoding="utf-8")
+        (folder / shell).write_text(completion.script(shell, parser()), encoding="utf-8")
     return lambda shell: str(folder / shell)
 
 
@@ -75,10 +76,7 @@ def test_commands_options_cases_parameters_and_measures(script, shell, tmp_path)
     wanted = {f"gouta2015/backstepping-ff-table1{more}" for more in ("", "-slow", "-boxqp", "-boxqp-slow")}
     assert set(asked("jaxtank tune gouta2015/backstepping-ff-t")) - {"files"} == wanted
     assert set(asked("jaxtank tune calofir/backstepping --s")) == {
-        o
-        for a in cli.parser()._subparsers._group_actions[0].choices["tune"]._actions
-        for o in a.option_strings
-        if o.startswith("--s")
+        o for a in parser()._subparsers._group_actions[0].choices["tune"]._actions for o in a.option_strings if o.startswith("--s")
     }
     assert asked("jaxtank simulate calofir/backstepping --set plant.pump") == ["plant.pump_gain="]
     assert asked("jaxtank tune calofir/backstepping --limit max_l") == ["max_level="]
@@ -105,11 +103,11 @@ def test_it_knows_what_the_parser_and_the_library_have():
     assert completion.NAMES.read_text(encoding="utf-8") == completion.gather(), (
         "python -c 'from tuning.completion import refresh; refresh()'"
     )
-    found = completion.commands_of(cli.parser())
+    found = completion.commands_of(parser())
     assert set(found) - {""} == set(cli.COMMANDS) and all(c.help for n, c in found.items() if n)
     for (command, option), values in completion.FEW.items():
         assert any(option in o.flags and o.value == " ".join(values) for o in found[command].options)
-    for action in (a for p in cli.parser()._subparsers._group_actions[0].choices.values() for a in p._actions):
+    for action in (a for p in parser()._subparsers._group_actions[0].choices.values() for a in p._actions):
         if action.metavar and "=" in action.metavar:
             assert action.metavar in completion.KINDS, action.option_strings  # a new kind of option says what its names are
 

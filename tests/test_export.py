@@ -1,6 +1,7 @@
 """Exported laws, compiled by gcc, against the law in the loop they were made from: 10,000 samples of every law of every paper."""
 
 import ctypes
+import dataclasses
 import functools
 import math
 import re
@@ -12,9 +13,11 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import presets, rig
+from jaxtank import presets, rig, units
 from jaxtank.errors import InputError
 from jaxtank.export import export
+from jaxtank.plants.network import network
+from jaxtank.rig import words as rig_words
 from tuning import cli
 
 SAMPLES = 10_000
@@ -185,3 +188,106 @@ def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
     assert cli.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
     assert capsys.readouterr().out.startswith("function [u, s] = gouta2015_backstepping(")
     assert cli.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
+
+
+HOSTILE_RIG = """
+name = {name}
+units = ["cm", "V"]
+
+[[tank]]
+name = "t*/ int taken = 1; /*"
+area = 20.0
+rim = 40.0
+drain = 2.0
+
+[[pump]]
+name = "??/"
+gain = 5.0
+to = 1
+low = 0.0
+high = 12.0
+
+[plant]
+gravity = 0.5
+
+[law]
+kind = "pid"
+Kc = 1.6
+Ti = 10.0
+"""
+HOSTILE = [
+    "t*/ int taken(void) { return 1; } /*",
+    "t*\\/ int taken(void) { return 1; } /*",
+    "t**//* /*/ int taken(void) { return 1; } /*",
+    "t*??/",
+    "t ??/ ??( ??) \\",
+    "t %{ %} ... '' \" ??'",
+]
+
+
+def exported(folder, name, language):
+    """The text that `jaxtank export` writes of a rig with a hostile name."""
+    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_words.toml(name)))
+    words = ["export", str(folder / "rig.toml"), "--lang", language, "--name", "law", "--out", str(folder / "out"), "--quiet"]
+    assert cli.main(words) == 0
+    return (folder / "out" / f"law.{language}").read_text()
+
+
+@needs_gcc
+@pytest.mark.parametrize("standard", ["c99", "gnu99"])  # with trigraphs and without
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_stays_within_the_comment_of_c(name, standard, tmp_path):
+    text = exported(tmp_path, name, "c")
+    flags = [f"-std={standard}", "-pedantic", "-O1", "-Wall", "-Wextra", "-Werror", "-Wno-unused-function", "-Wno-unused-variable"]
+    (tmp_path / "law.c").write_text(text)
+    made = subprocess.run([GCC, *flags, "-c", "-o", tmp_path / "law.o", tmp_path / "law.c"], capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    symbols = subprocess.run(["nm", "-g", "--defined-only", tmp_path / "law.o"], capture_output=True, text=True, check=True)
+    assert {line.split()[-1] for line in symbols.stdout.splitlines()} == {"law_init", "law_step"}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_stays_within_the_comments_of_matlab_and_of_c(name, tmp_path):
+    """One comment, which ends in its last line, in C; every line before the first statement begins with % in MATLAB."""
+    text = exported(tmp_path, name, "c")
+    head, after = text.split("*/", 1)
+    assert head.startswith("/*") and "/*" not in head[2:] and after.startswith("\n#include <math.h>") and "taken" not in after
+    assert not re.search(r"\\|\?\?", text)
+    text = exported(tmp_path, name, "m")
+    body = [line for line in text.splitlines()[1:] if not line.startswith("% ") and line != "%"]
+    assert "taken" not in "\n".join(body) and body[0].strip() == "if isempty(s)"
+
+
+@pytest.mark.parametrize("separator", ["\n", "\r", "\v", "\f", "\x1c", "\x85", "\u2028", "\u2029", "\0", "\ud800"])
+def test_a_line_break_in_the_name_of_a_case_ends_no_comment(separator):
+    """A rig file may not hold one; a Case made in Python may."""
+    case = dataclasses.replace(presets.find("cascaded/pi"), name=f"t{separator}taken = 1;", title=f"t{separator}taken = 1; */")
+    for language, marks in (("c", (" *", "/*")), ("m", ("%",))):
+        lines = export(case, language, name="law").split("\n")
+        assert all(line.startswith(marks) for line in lines if "taken" in line)
+        assert len(lines) == len(export(presets.find("cascaded/pi"), language, name="law").split("\n"))
+        "\n".join(lines).encode()
+
+
+@pytest.mark.parametrize(
+    "unit", ["V*/ int taken; /*", "V\\\\", "??/", "$\\\\x{$", "cm, V", "<b>", "V\\u2028", "a" * 41, "^2", "V V V*"]
+)
+def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
+    text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
+    (tmp_path / "rig.toml").write_text(text)
+    assert cli.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "units: entry = " in said.err and not (tmp_path / "out").exists()
+
+
+def test_units_of_rigs_are_taken():
+    known = ["cm", "V", "U0", "m^3/s", "cm^3/(s V)", "L/min", "%", "-", "°C", "m³/s", "ml / s", "(m^3/s)^2", "m^0.5"]
+    assert [units.check_unit("unit", one) for one in known] == known
+    with pytest.raises(InputError, match=r"plant\.units: entry = 'cm\*/'"):
+        network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("cm*/", "V"))
+
+
+@pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])
+def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
+    assert cli.main(["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]) == (2 if name else 0)
+    assert (tmp_path / "out").exists() is not bool(name)

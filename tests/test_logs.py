@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 
 import numpy as np
 import pytest
@@ -317,6 +318,24 @@ def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path)
     assert told.count("\n") == 1 and told.endswith("\n") and told.startswith("jaxtank: log") and "log.csv" in told
     with pytest.raises(DataError, match=words):
         raise DataError(told.strip())
+
+
+@pytest.mark.parametrize(
+    ("header", "columns", "words"),
+    [
+        (HEADER.replace("pump2 [V]", "pump1 [V]"), ["pump2=h4 [cm];V"], r"line 1: columns 'pump1 \[V\]' and 'pump1 \[V\]'"),
+        (HEADER.replace("h2 [cm]", "h1 [cm]"), ["h1=h1 [cm]"], r"line 1: two columns are called 'h1 \[cm\]'"),
+        (HEADER.replace("h1 [cm],h2 [cm]", "level,level"), ["h1=level;cm"], r"line 1: two columns are called 'level'"),
+        (HEADER.replace("h1 [cm],h2 [cm]", "level, level "), ["h1=level;cm"], r"line 1: two columns are called 'level'"),
+        (HEADER.replace("h1 [cm]", "level"), ["h1=level;cm", "h2=level;cm"], r"line 1: column 'level' is given for h1 and for h2"),
+    ],
+)
+def test_a_log_with_a_column_twice_is_refused(header, columns, words, tmp_path):
+    (tmp_path / "log.csv").write_text(bad(header=header))
+    options = [word for column in columns for word in ("--column", column)]
+    code, said, told = command("identify", "mirakhorli/sfc", "--data", str(tmp_path / "log.csv"), *options, "--quiet")
+    assert code == 5 and said == "" and told.count("\n") == 1
+    assert re.search(words, told), told
 
 
 def test_no_file_and_a_folder(tmp_path):

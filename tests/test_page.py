@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import rig
-from tuning import cli, compare, page, tables
+from jaxtank import plotting, rig
+from tuning import cli, compare, page, pictures, tables
 from tuning.log_file import read_log
 
-NASTY = "a <b>\"rig\"</b> & $x$ 'y' </style><script>alert(1)</script>"
+NASTY = "a <b>\"rig\"</b> & $\\x{$ 'y' </style><script>alert(1)</script>"
 KINDS = ("tune", "uncertainty", "sensitivity", "identify", "compare")
 VOID = {"meta", "br", "img", "link", "hr", "input"}
 
@@ -72,7 +72,7 @@ def results(case, tmp_path_factory):
     t = np.arange(0.0, 60.0, 2.0)
     level = 5.0 + 2.0 * np.sin(t / 10.0)
     rows = [f"{a:g},3,3,{h:.3f},{h:.3f}" for a, h in zip(t, level)]
-    path = folder / 'log <i>&"$x$".csv'
+    path = folder / 'log <i>&"$_^{$".csv'
     path.write_text("t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm]\n" + "\n".join(rows) + "\n")
     record = read_log(path, case.loop, {}, ".")
     found = tuning.identify(case, [record], {"plant.pump_gain[0]": (1.0, 20.0)}, start="measured", starts=1, iterations=3)
@@ -141,9 +141,58 @@ def test_what_users_call_things_is_text_and_no_markup(folders, kind):
     assert f"jaxtank {kind} {NASTY}" in read.words  # the command
     assert not any(tag in ("b", "i", "sec") for tag, _ in read.tags)
     if kind == "identify":
-        assert 'log <i>&"$x$".csv, measured and simulated' in read.words  # in a picture, and not set as mathematics
+        assert 'log <i>&"$_^{$".csv, measured and simulated' in read.words  # in a picture, and not set as mathematics
     else:
         assert read.words.count("alert(1)") > 2
+
+
+@pytest.mark.parametrize(
+    "kind", ["tune", "sensitivity", "compare", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS[1::2])]
+)
+def test_a_picture_that_fails_costs_itself_and_not_the_answer(results, folders, kind, tmp_path, monkeypatch, capsys):
+    """A text that matplotlib cannot set, in one picture; then a function that cannot draw. Nothing of an earlier result stays."""
+    plot, name = (plotting, "panels") if kind == "sensitivity" else (pictures, "rig")
+    usual, (save, _) = getattr(plot, name), results[kind]
+    whole = {path.name for path in folders[kind].iterdir()}
+    shutil.copytree(folders[kind], tmp_path, dirs_exist_ok=True)
+
+    def unset(*args):
+        drawn = usual(*args)
+        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
+            figure.suptitle(r"$\x{$")
+        return drawn
+
+    def undrawn(*_):
+        plt.figure()
+        raise ZeroDivisionError
+
+    for fault in (unset, undrawn):
+        monkeypatch.setattr(plot, name, fault)
+        written = save(tmp_path, "")
+        (note,) = capsys.readouterr().err.splitlines()
+        assert note.startswith("jaxtank: note: ") and "could not be drawn" in note
+        left = {path.name for path in tmp_path.iterdir()}
+        assert left == {path.name for path in written} and {"result.json", "report.html"} <= left < whole
+        assert len(whole - left) == 1 or fault is undrawn
+        assert all(n.endswith(".png") for n in whole - left)
+        assert json.loads((tmp_path / "result.json").read_text())
+        assert not plt.get_fignums()
+
+
+def test_results_are_on_the_disk_before_any_picture_is_drawn(results, folders, tmp_path, monkeypatch):
+    """A program that ends while it draws, as by a second Ctrl-C, leaves the answer."""
+
+    class Ended(BaseException):
+        pass
+
+    def end(*_):
+        raise Ended
+
+    monkeypatch.setattr(plotting, "responses", end)
+    with pytest.raises(Ended):
+        results["tune"][0](tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"result.json", "rig.toml", "trajectory.csv", "before.csv"}
+    assert (tmp_path / "rig.toml").read_bytes() == (folders["tune"] / "rig.toml").read_bytes()
 
 
 def test_the_numbers_of_a_tuning_are_on_its_page(results, folders):

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tuning import cli, identify_command, tune_command
+from tuning.parser import parser
 
 README = Path(__file__).parent.parent / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="the README is not beside the tests")
@@ -37,7 +38,7 @@ def test_the_rig_it_shows_is_the_one_that_is_tested():
 def test_commands_parse():
     assert len(COMMANDS) >= 10
     for words in COMMANDS:
-        args, rest = cli.parser().parse_known_args(words)
+        args, rest = parser().parse_known_args(words)
         assert not rest and args.command in cli.COMMANDS
 
 

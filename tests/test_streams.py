@@ -54,7 +54,7 @@ def test_progress_that_cannot_be_told_ends_no_run():
 def test_ctrl_c_where_nobody_can_be_told_of_it():
     """The handler of the signal speaks, too."""
     code = (
-        "import os, signal, sys; from tuning import interrupts, streams; streams.guard(); found = interrupts.Interrupts()\n"
+        "import os, signal, sys; from tuning import interrupts, streams; streams.guard(); found = interrupts.Interrupts(); found.check()\n"
         "os.kill(os.getpid(), signal.SIGINT)\n"
         "print(found.stop)"
     )

@@ -54,6 +54,7 @@ READS = {
 MADE = {
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("tuning.cli", "_run", "import_module"): "modules of its own table of commands",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -73,6 +74,7 @@ READ = {
     ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.streams", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.holds", "_locked", "open"): "its own lock, of which 20 bytes are read",
+    ("tuning.holds", "release", "open"): "its own lock, of which nothing is read",
 }
 
 
@@ -171,6 +173,9 @@ HOSTILE = {
     "a batch twice": {"x.npy": ARRAY, "y.npy": ARRAY},
     "an array of 745 GiB": {"x.npy": header("(100000000000,)") + bytes(16)},
     "a header that is a program": {"x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"},
+    "a header of 9,000 brackets": {"x.npy": b"\x93NUMPY\x01\x00" + (9000).to_bytes(2, "little") + b"[" * 9000},
+    "a header of 9,000 signs": {"x.npy": b"\x93NUMPY\x01\x00" + (9001).to_bytes(2, "little") + b"-" * 9000 + b"1"},
+    "an array longer than a number can say": {"x.npy": header(f"({10**30},)")},
     "an object, pickled": {"x.npy": ARRAY.replace(b"<f8", b"|O ")},
     "nothing": {},
 }

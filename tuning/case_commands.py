@@ -27,9 +27,15 @@ def show(args):
 
         from tuning import page, pictures
 
-        drawn = pictures.rig(case.loop, None, case.name)
-        alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
-        written = saving.write_files(Path(args.out), alone | saving.pngs(drawn))
+        try:
+            drawn = pictures.rig(case.loop, None, case.name)
+            alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
+        except Exception as error:
+            pictures.failed("rig", error)
+            for name in ("rig.svg", "rig.png"):  # of another rig
+                Path(args.out, name).unlink(missing_ok=True)
+        else:
+            written = saving.write_files(Path(args.out), alone | saving.pngs(drawn))
     print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
     tell_written(written, args)
     return 0
@@ -51,11 +57,11 @@ def export_law(args):
     case = open_case(args)
     from pathlib import Path
 
-    from jaxtank.export import export
+    from jaxtank.export import export, function_name
     from tuning import saving, tables
 
     text = export(case, args.lang, args.precision, args.name)
-    name = args.name or case.name.replace("/", "_").replace("-", "_").replace(" ", "_")
+    name = args.name or function_name(case)
     if args.json:
         print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:

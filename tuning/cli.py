@@ -1,45 +1,54 @@
 """The command `jaxtank`. Results on stdout, progress and errors on stderr.
 
 Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing written), 3 not converged, 4 limits cannot
-be met, 5 bad data file, 130 interrupted (the best point so far is written and said). Nothing heavy is imported before the arguments are read.
+be met, 5 bad data file, 130 interrupted (the best point so far of a search is written and printed), 143 terminated. Nothing heavy is
+imported before the arguments are read.
 """
 
+import importlib
 import os
-import shlex
 import sys
-import warnings
 
-from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
-from tuning import batch_commands, case_commands, identify_command, streams, tune_command
-from tuning.arguments import folder_of
-from tuning.holds import hold
-from tuning.interrupts import listen
-from tuning.one_line import one_line
-from tuning.parser import parser
+from tuning import interrupts, streams
 
 COMMANDS = {
-    "list": case_commands.list_cases,
-    "show": case_commands.show,
-    "simulate": case_commands.simulate,
-    "tune": tune_command.tune,
-    "sensitivity": batch_commands.sensitivity,
-    "identify": identify_command.run_interruptibly,
-    "init": case_commands.init,
-    "export": case_commands.export_law,
-    "uncertainty": batch_commands.uncertainty,
-    "merge": batch_commands.merge,
-    "compare": case_commands.compare,
-    "completion": case_commands.completion,
-    "bench": case_commands.bench,
+    "list": "case_commands.list_cases",
+    "show": "case_commands.show",
+    "simulate": "case_commands.simulate",
+    "tune": "tune_command.tune",
+    "sensitivity": "batch_commands.sensitivity",
+    "identify": "identify_command.run_interruptibly",
+    "init": "case_commands.init",
+    "export": "case_commands.export_law",
+    "uncertainty": "batch_commands.uncertainty",
+    "merge": "batch_commands.merge",
+    "compare": "case_commands.compare",
+    "completion": "case_commands.completion",
+    "bench": "case_commands.bench",
 }
+"""{command: module and function that runs it}."""
 
 
 def main(argv=None):
-    """Run the command; returns the exit code."""
-    if argv is None:  # a program of its own
-        listen()
+    """Run the command; returns the exit code. argv None: a program of its own, by sys.argv."""
+    if argv is None:
         streams.guard()
-        # a note says so, once, where the case is opened
+        interrupts.listen()  # before anything that takes time is imported
+    return _run(argv)
+
+
+def _run(argv):
+    import shlex
+    import warnings
+
+    from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
+    from tuning.arguments import folder_of
+    from tuning.holds import hold
+    from tuning.one_line import one_line
+    from tuning.parser import parser
+
+    if argv is None:
+        # the note is printed once, where the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
     try:
         top = parser()
@@ -66,7 +75,8 @@ def main(argv=None):
         if getattr(args, "resume", None) and not os.path.isdir(folder):
             raise InputError(f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder")
         with hold(folder, shared=getattr(args, "shard", None) is not None):
-            code = COMMANDS[args.command](args)
+            module, name = COMMANDS[args.command].split(".")
+            code = getattr(importlib.import_module(f"tuning.{module}"), name)(args)
         sys.stdout.flush()
         return code
     except (InputError, NonFiniteError) as error:
@@ -74,8 +84,6 @@ def main(argv=None):
         return 5 if isinstance(error, DataError) else 2
     except KeyboardInterrupt:
         print("jaxtank: interrupted", file=sys.stderr, flush=True)
-        if argv is None:
-            os._exit(130)  # an interrupt inside jax leaves threads that cannot be wound up safely
         return 130
     except BrokenPipeError:  # the reader of our output has gone; nothing more to say
         _drop_output()

@@ -16,7 +16,7 @@ from jaxtank.presets.base import Claim
 from jaxtank.tree import get_value
 from tuning import pictures, saving, tables
 from tuning.manual import noisy
-from tuning.page import document, svg
+from tuning.page import document, drawings
 
 QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
 
@@ -135,34 +135,44 @@ def text(page):
 def save(pages, folder, command=None):
     """Write result.json and report.html of {paper: page}, and a picture of the rig of each paper, to `folder`; returns their paths."""
     check_folder(folder)
-    drawn, pictures_of = {}, []
-    for paper, found in pages.items():
-        seen = []
-        for name, case in presets.load(paper).cases.items():
-            plant = case.loop.plant
-            drawing = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs, np.asarray(plant.rim).tolist())
-            if drawing not in seen:  # cases of one paper share their rig, but for some
-                seen.append(drawing)
-                of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
-                drawn[of] = pictures.rig(case.loop, None, f"{paper}/{name}")["rig"]
-                pictures_of.append((of, svg(drawn[of], of), f"The rig of {paper}/{name}. {found['citation']}"))
+    captions = {}
+
+    def draw():
+        drawn = {}
+        for paper, found in pages.items():
+            seen = []
+            for name, case in presets.load(paper).cases.items():
+                plant = case.loop.plant
+                drawing = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs, np.asarray(plant.rim).tolist())
+                if drawing not in seen:  # cases of one paper share their rig, but for some
+                    seen.append(drawing)
+                    of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
+                    drawn[of] = pictures.rig(case.loop, None, f"{paper}/{name}")["rig"]
+                    captions[of] = f"The rig of {paper}/{name}. {found['citation']}"
+        return drawn
+
     rows = [row for found in pages.values() for row in found["rows"]]
     count = Counter(row["verdict"] for row in rows)
     parts = [part for found in pages.values() for part in (found["citation"], *_in_full(found))]
-    html = document(
-        f"{', '.join(pages)}: published and measured",
-        "What is printed beside what the same rigs and laws do here, and why they differ.",
-        f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured quantities and claims reproduced",
-        True,
-        [(word, str(n)) for word, n in count.most_common()],
-        [],
-        pictures_of,
-        parts,
-        command,
-        {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
-    )
+
+    def page_of(drawn):
+        return document(
+            f"{', '.join(pages)}: published and measured",
+            "What is printed beside what the same rigs and laws do here, and why they differ.",
+            f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured quantities and claims reproduced",
+            True,
+            [(word, str(n)) for word, n in count.most_common()],
+            [],
+            drawings(drawn, captions),
+            parts,
+            command,
+            {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
+        )
+
+    old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
+    stale = saving.earlier(folder, old)
     table = pages if len(pages) > 1 else next(iter(pages.values()))
-    return saving.write_files(Path(folder), {"result.json": tables.dumps(table) + "\n", "report.html": html, **saving.pngs(drawn)})
+    return saving.write_result(folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale)
 
 
 def _in_full(found):

@@ -211,7 +211,7 @@ def page_of(ensemble, drawn, command=None):
         status.startswith("no "),
         facts,
         said,
-        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        page.drawings(drawn, CAPTIONS),
         parts_of(ensemble),
         command,
         search.provenance(ensemble.case, ensemble.seed),
@@ -226,8 +226,9 @@ def save(ensemble, folder, command=None):
     check_folder(folder)
     folder = Path(folder)
     files = {"result.json": tables.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
-    drawn = figures(ensemble)
-    written = saving.write_files(folder, files | {"report.html": page_of(ensemble, drawn, command)} | saving.pngs(drawn))
+    written = saving.write_result(
+        folder, files, lambda: figures(ensemble), lambda drawn: page_of(ensemble, drawn, command), saving.earlier(folder, CAPTIONS)
+    )
     if (folder / parts.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):
             if parts.NAME.fullmatch(path.name):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from jaxtank.errors import InputError
 from jaxtank.files import LOCK, check_folder, sweep
+from tuning.interrupts import before_leaving
 
 try:
     import fcntl
@@ -31,26 +32,41 @@ def hold(folder, shared=False):
     check_folder(folder)
     folder = Path(folder)
     made = [p for p in (folder, *folder.parents) if not p.exists()]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = _locked(folder, shared)
-        try:
-            if not shared:
-                sweep(folder)
-            yield
-        finally:
-            _let_go(folder / LOCK, file)
-    finally:
+    opened, file = [], None
+
+    def release():
+        """What is done where a signal ends the process."""
+        if file is not None and not shared:
+            sweep(folder)
+        with contextlib.suppress(OSError):  # without one of ours, a file that was made and not yet locked
+            _let_go(folder / LOCK, *opened or [os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW)])
+        tidy()
+
+    def tidy():
         for path in made:  # the innermost first
             with contextlib.suppress(OSError):  # not empty
                 path.rmdir()
 
+    try:
+        with before_leaving(release):
+            folder.mkdir(parents=True, exist_ok=True)
+            file = _locked(folder, shared, opened)
+            try:
+                if not shared:
+                    sweep(folder)
+                yield
+            finally:
+                _let_go(folder / LOCK, file)
+    finally:
+        tidy()
 
-def _locked(folder, shared):
-    """The open lock file of a folder, None where there are no locks."""
+
+def _locked(folder, shared, opened):
+    """The open lock file of a folder, None where there are no locks; opened: list that holds what is open meanwhile."""
     path, kind, until = folder / LOCK, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        opened[:] = [file]
         try:
             fcntl.flock(file, kind | fcntl.LOCK_NB)
         except BlockingIOError:

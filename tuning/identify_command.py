@@ -98,6 +98,7 @@ def run(args):
         if not args.quiet:
             print(f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)} samples", file=sys.stderr, flush=True)
 
+    interrupts = Interrupts()
     found = identify(
         case,
         logs,
@@ -113,7 +114,7 @@ def run(args):
         gap=gap,
         folder=args.out,
         resume=args.resume is not None,
-        progress=Interrupts().check,  # between two searches
+        progress=interrupts.check,  # between two searches
         ready=ready,
         law=args.law,
     )
@@ -131,7 +132,7 @@ def run(args):
         print(f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written; {_advice(found, free)}", file=sys.stderr)
     elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
         print(_next(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
-    return STATUS[found.status]
+    return STATUS["interrupted" if interrupts.stop else found.status]
 
 
 def _next(found, file):
@@ -159,7 +160,9 @@ def _advice(found, free):
 def run_interruptibly(args):
     """`run`, with the handler of SIGINT put back afterwards."""
     with put_back():
-        return run(args)
+        code = run(args)
+        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
+        return code
 
 
 def _samples(text):

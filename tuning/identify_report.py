@@ -301,7 +301,7 @@ def page_of(found, drawn, command=None):
         found.status == "converged",
         facts,
         said.split("; "),
-        [(n, page.svg(f, n, captions[n]), captions[n]) for n, f in drawn.items()],
+        page.drawings(drawn, captions),
         [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
         command,
         search.provenance(found.case, found.seed),
@@ -318,14 +318,12 @@ def save(found, folder, command=None):
     files = {"result.json": tables.dumps(json_of(found)), "fit.csv": fit_csv(found)}
     if identifiable(found):
         files["rig.toml"] = rigs.dump(found.identified)
-    drawn = figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
-    files["report.html"] = page_of(found, drawn, command)
-    files |= saving.pngs(drawn)
-    stale = _left_over(Path(folder), files)
-    written = saving.write_files(Path(folder), files)
-    for path in stale:
-        path.unlink()
-    return written
+    stale = [*_left_over(Path(folder), files), *saving.earlier(folder, ["residuals", "rig"])]
+
+    def draw():
+        return figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
+
+    return saving.write_result(folder, files, draw, lambda drawn: page_of(found, drawn, command), stale)
 
 
 def _left_over(folder, files):

@@ -1,54 +1,157 @@
-"""Ctrl-C where nothing is half done: the first ends a search with the best point so far, the second ends the program."""
+"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`. It is imported before all else, so it imports
+only what is part of the interpreter; any module of `tuning` may import it.
 
-import contextlib
+The program ends at once, with exit code 130 or 143 and one line, wherever it is: in an import, in a
+compilation, in a run. Only a search that has found something (`Interrupts`) goes on after the first
+Ctrl-C, to report the best point so far.
+"""
+
+import _signal  # `signal` adds enumerations to it, whose import takes longer than all of this
+import _thread
+import atexit
 import os
-import signal
-import threading
+import time
 
-from tuning.streams import say_at_once
+SIGNALS = {_signal.SIGINT: b"interrupted", _signal.SIGTERM: b"terminated"}
 
-heard = []
-"""Holds something once Ctrl-C has come before anything ran."""
+_searches = []  # the Interrupts that takes SIGINT, if any
+_before = []  # what is called before the process ends
+_leaving = _thread.allocate_lock()
+_watched = []  # True once a thread answers signals
+_held = []  # True once the main thread waits for its end
 
 
 def listen():
-    """Remember a Ctrl-C, beside raising KeyboardInterrupt: one that comes while modules are imported may be lost in them."""
+    """Answer SIGINT and SIGTERM from now on: for a program of its own, never for a caller's process.
 
-    def early(*_):
-        heard.append(True)
-        raise KeyboardInterrupt
+    A thread answers them. The main thread cannot while it is in native code, which may compile for
+    minutes, and an exception raised in an import would leave a module half made.
+    """
+    if os.name == "posix":
+        read, write = os.pipe()
+        os.set_blocking(write, False)
+        _signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        try:
+            _thread.start_new_thread(_watch, (read,))
+            _watched.append(True)
+        except RuntimeError:  # no more threads for this user: the main thread answers when it can
+            _signal.set_wakeup_fd(-1)
+    for number in SIGNALS:
+        _signal.signal(number, _handler)
+    atexit.register(_end)  # the first to be registered is the last to be called
 
-    signal.signal(signal.SIGINT, early)
+
+def _end():
+    """Give the signals back to the system: the interpreter ends, and its threads with it."""
+    for number in SIGNALS:
+        _signal.signal(number, _signal.SIG_DFL)
+
+
+def _watch(pipe):
+    """Answer the signals whose numbers come through a pipe."""
+    while True:
+        for number in os.read(pipe, 64):
+            for _ in range(20):  # the main thread stops first, unless it is in native code
+                if _held or (number == _signal.SIGINT and _searches):
+                    break
+                time.sleep(0.005)
+            if number in SIGNALS:
+                _answer(number)
+
+
+def _handler(number, _):
+    """Hold the main thread while the watching thread ends the process."""
+    if not _watched:
+        _answer(number)
+    elif number != _signal.SIGINT or not _searches:
+        _held.append(True)
+        time.sleep(1.0)
+        leave(number)  # the thread is gone, for the interpreter is ending
+
+
+def _answer(number):
+    if number == _signal.SIGINT and _searches:
+        _searches[-1].interrupt()
+    else:
+        leave(number)
+
+
+def leave(number=_signal.SIGINT, words=None):
+    """End the process at once, with one line and exit code 128 + `number`."""
+    if not _leaving.acquire(False):  # another thread does it
+        time.sleep(5.0)
+        os._exit(128 + number)
+    for release in reversed(_before):
+        try:  # noqa: SIM105  (contextlib takes long to import)
+            release()
+        except Exception:
+            pass  # a folder that has gone
+    say(words or SIGNALS[number])
+    os._exit(128 + number)  # no finalizers: native threads may be at work
+
+
+def say(words):
+    """Write a line to stderr; what it does not take is let go."""
+    try:
+        fresh = b"\n" if os.isatty(2) else b""  # after ^C, or a line of progress
+        os.write(2, fresh + b"jaxtank: " + words + b"\n")
+    except OSError:
+        pass
+
+
+class before_leaving:
+    """Context in which `release` is called should a signal end the process."""
+
+    def __init__(self, release):
+        self.release = release
+
+    def __enter__(self):
+        _before.append(self.release)
+
+    def __exit__(self, *_):
+        _before.remove(self.release)
 
 
 class Interrupts:
-    """Takes SIGINT from now on: `check` raises KeyboardInterrupt once it has come, a second one ends the program at once."""
+    """Ctrl-C of a search: from the first `check` on, the first one lets it end with the best point so
+    far, the second ends the program at once. Before that there is nothing yet that could be lost.
+    """
 
     def __init__(self):
-        self.stop = bool(heard)
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self.interrupt)
+        self.stop = self.taken = False
 
     def interrupt(self, *_):
         """The handler of SIGINT."""
         if self.stop:
-            say_at_once(b"\njaxtank: stopped at once\n")
-            os._exit(130)
+            leave(words=b"stopped at once")
         self.stop = True
-        say_at_once(b"\njaxtank: interrupted, finishing with the best point so far (Ctrl-C again stops at once)\n")
+        say(b"interrupted, finishing with the best point so far (Ctrl-C again stops at once)")
 
     def check(self, *_):
-        """Raise KeyboardInterrupt if Ctrl-C was pressed."""
+        """Take SIGINT; raise KeyboardInterrupt once it has come."""
+        if not self.taken:
+            self.taken = True
+            if _signal.getsignal(_signal.SIGINT) is _handler:
+                _searches.append(self)
+            elif _in_main_thread():
+                _signal.signal(_signal.SIGINT, self.interrupt)
         if self.stop:
             raise KeyboardInterrupt
 
 
-@contextlib.contextmanager
-def put_back():
-    """The handler of SIGINT is afterwards what it was before."""
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, before)
+class put_back:
+    """Context after which SIGINT is handled as it was before."""
+
+    def __enter__(self):
+        self.handler, self.count = _signal.getsignal(_signal.SIGINT), len(_searches)
+
+    def __exit__(self, *_):
+        del _searches[self.count :]
+        if self.handler is not _handler and _in_main_thread():
+            _signal.signal(_signal.SIGINT, self.handler)
+
+
+def _in_main_thread():
+    import threading
+
+    return threading.current_thread() is threading.main_thread()

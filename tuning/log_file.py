@@ -180,7 +180,10 @@ def _columns(header, name, line, loop, given):
             continue
         if wanted not in header:
             raise DataError(f"{name}, line {line}: there is no column {wanted!r} for {slot}{nearest(wanted, header)}")
-        taken[slot] = (header.index(wanted), unit or split_header(wanted)[1])
+        index = header.index(wanted)
+        if other := next((known for known, (column, _) in taken.items() if column == index), None):
+            raise DataError(f"{name}, line {line}: column {wanted!r} is given for {other} and for {slot}: name one column for each")
+        taken[slot] = (index, unit or split_header(wanted)[1])
     used = {index for index, _ in taken.values()}
     for index, cell in enumerate(header):
         stem, unit = split_header(cell)

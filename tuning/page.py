@@ -7,6 +7,8 @@ import html
 import io
 import re
 
+from tuning.pictures import failed
+
 LARGEST = 500_000
 """Characters of one picture as lines, above which its dense lines become dots of a fixed number."""
 
@@ -175,6 +177,18 @@ def _table(head, rows):
 def identifier(name):
     """`name` as an id of HTML and SVG."""
     return re.sub(r"[^a-z0-9]+", "-", str(name).lower()).strip("-") or "picture"
+
+
+def drawings(drawn, captions):
+    """[(name, SVG, caption)] of {name: figure}; a figure that cannot be drawn is taken out of it, with a note on stderr."""
+    found = []
+    for name, figure in list(drawn.items()):
+        try:
+            found.append((name, svg(figure, name, captions[name]), captions[name]))
+        except Exception as error:
+            failed(name, error, figure)
+            del drawn[name]
+    return found
 
 
 def svg(figure, name, caption=""):

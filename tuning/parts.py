@@ -5,7 +5,6 @@ import io
 import json
 import re
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +106,8 @@ def read_part(path, names):
                 raise InputError(f"{path.name}: does not hold the measures of the manifest")
         with np.load(path, allow_pickle=False) as table:
             return {name: table[name] for name in names}
-    except (OSError, ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
+    except Exception as error:
+        # numpy evaluates the header as a Python literal: RecursionError, TokenError, OverflowError, ...
         raise InputError(f"{path.name}: is not a batch of this program ({' '.join(str(error).split())[:80]})") from None
 
 

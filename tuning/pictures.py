@@ -1,8 +1,20 @@
 """Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the limits. What says nothing is not drawn."""
 
+import sys
+
 import numpy as np
 
 from jaxtank.units import local
+from tuning.one_line import one_line
+
+
+def failed(name, error, *figures):
+    """Report on stderr that the picture `name` could not be made, and close its figures: the rest of a result is given without it."""
+    import matplotlib.pyplot as plt
+
+    for figure in figures:
+        plt.close(figure)
+    print(f"jaxtank: note: {name} could not be drawn ({type(error).__name__}: {one_line(error, 200)})", file=sys.stderr)
 
 
 def rig(loop, run=None, title=""):

@@ -11,6 +11,7 @@ from jaxtank.errors import InputError
 from jaxtank.files import check_folder, write_together
 from jaxtank.neighbours import columns
 from jaxtank.units import DEFAULT
+from tuning.pictures import failed
 from tuning.tables import dumps
 
 
@@ -44,8 +45,44 @@ def png(figure):
 
 
 def pngs(drawn):
-    """{file name: bytes} of {name: figure}; the figures are closed."""
-    return {f"{name}.png": png(figure) for name, figure in drawn.items()}
+    """{file name: bytes} of {name: figure}; the figures are closed. One that cannot be drawn is left out, with a note on stderr."""
+    found = {}
+    for name, figure in drawn.items():
+        try:
+            found[f"{name}.png"] = png(figure)
+        except Exception as error:
+            failed(name, error, figure)
+    return found
+
+
+def earlier(folder, names):
+    """Paths of report.html and of the pictures `names` that an earlier result left in `folder`; none where there is no report."""
+    page = Path(folder) / "report.html"
+    return [page, *(page.with_name(f"{name}.png") for name in names)] if page.is_file() else []
+
+
+def write_result(folder, files, draw, page=None, stale=()):
+    """Write `files` {name: text or bytes} of a result to `folder`, all or none, then its pictures, all or none; returns the paths.
+
+    draw: function that returns {name: figure}, called once the files are written; page: function of these that returns report.html;
+    stale: paths of an earlier result, removed between the two. What cannot be drawn is left out, with a note on stderr.
+    """
+    folder = Path(folder)
+    written = write_files(folder, files)
+    for path in stale:
+        path.unlink(missing_ok=True)
+    import matplotlib.pyplot as plt
+
+    drawn, more, open_before = {}, {}, plt.get_fignums()
+    try:
+        drawn = draw()
+    except Exception as error:
+        failed("the pictures", error, *(plt.figure(n) for n in plt.get_fignums() if n not in open_before))
+    try:
+        more = {} if page is None else {"report.html": page(drawn)}
+    except Exception as error:
+        failed("report.html", error)
+    return written + write_files(folder, more | pngs(drawn))
 
 
 def save_run(case, run, payload, folder, gif=False):
@@ -54,23 +91,23 @@ def save_run(case, run, payload, folder, gif=False):
     from jaxtank import plotting
 
     check_folder(folder)
-    picture = plotting.responses(case.loop, {case.name: run}, case.title)
-    files = {
-        "result.json": dumps(payload) + "\n",
-        "trajectory.csv": trajectory_csv(run, case.loop.units),
-        "responses.png": png(picture),
-    }
+    files = {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run, case.loop.units)}
+    # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
+    old = (Path(folder) / "trajectory.csv").exists()
+    stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
+    written = write_result(
+        folder, files, lambda: {"responses": plotting.responses(case.loop, {case.name: run}, case.title)}, stale=stale
+    )
     if gif:
         from jaxtank.animation import animate
 
-        with tempfile.TemporaryDirectory() as aside:
-            files["run.gif"] = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
-    # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
-    old = Path(folder) / "run.gif"
-    stale = not gif and (Path(folder) / "trajectory.csv").exists() and old.is_file()
-    written = write_files(Path(folder), files)
-    if stale:
-        old.unlink()
+        try:
+            with tempfile.TemporaryDirectory() as aside:
+                film = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
+        except Exception as error:
+            failed("run.gif", error)
+        else:
+            written += write_files(Path(folder), {"run.gif": film})
     return written
 
 

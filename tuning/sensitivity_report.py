@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import io
-from pathlib import Path
 
 import numpy as np
 
@@ -267,10 +266,7 @@ def page_of(result, drawn, command=None):
         not result.failed,
         facts,
         notes_of(result),
-        [
-            (n, page.svg(f, n, TITLES[result.method]), TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")
-            for n, f in drawn.items()
-        ],
+        page.drawings(drawn, dict.fromkeys(drawn, TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")),
         parts_of(result)[1:],
         command,
         search.provenance(result.case, result.seed),
@@ -284,5 +280,5 @@ def save(result, folder, command=None):
     """
     check_folder(folder)
     files = {"result.json": tables.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
-    drawn = figures(result)
-    return saving.write_files(Path(folder), files | {"report.html": page_of(result, drawn, command)} | saving.pngs(drawn))
+    stale = saving.earlier(folder, ["tornado", "sobol"])
+    return saving.write_result(folder, files, lambda: figures(result), lambda drawn: page_of(result, drawn, command), stale)

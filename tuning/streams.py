@@ -1,6 +1,5 @@
 """The three standard streams of a program: there when the shell has closed them, and none of its end when nobody takes what stderr says."""
 
-import contextlib
 import io
 import os
 import sys
@@ -51,9 +50,3 @@ def guard():
     sys.stderr = io.TextIOWrapper(
         io.BufferedWriter(raw), encoding=encoding, errors="backslashreplace", line_buffering=True, write_through=True
     )
-
-
-def say_at_once(data):
-    """Write bytes to stderr from a handler of a signal, where nothing may be raised."""
-    with contextlib.suppress(OSError):
-        os.write(2, data)

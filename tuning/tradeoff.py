@@ -28,6 +28,7 @@ def tradeoff(
     iterations=60,
     screening=64,
     start=None,
+    progress=None,
 ):
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
 
@@ -37,10 +38,11 @@ def tradeoff(
     that was evaluated for another value, keeps the limit at a lower objective, the search is begun
     again from it.
 
-    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit holds for every entry of the measure, the other
-    limits stay; start: {name: value} to begin at, the case's own where None. Returns {"measure", "points": [{"limit", "status" ("converged",
-    "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises InputError for an unknown measure and for values
-    that are not finite.
+    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit holds for every
+    entry of the measure, the other limits stay; start: {name: value} to begin at, the case's own where
+    None; progress: called after every evaluation. Returns {"measure", "points": [{"limit", "status"
+    ("converged", "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises
+    InputError for an unknown measure and for values that are not finite.
     """
     check_names([measure])
     values = [float(v) for v in values]
@@ -55,7 +57,7 @@ def tradeoff(
     found, begin, known = [], z, {}
 
     def solve(value, z):
-        answer = _solve(problem, {**others, measure: value}, z, iterations)
+        answer = _solve(problem, {**others, measure: value}, z, iterations, progress)
         known.update(answer.search.memory)
         return answer
 
@@ -113,10 +115,10 @@ def _better(one, other):
     return other if one.search.better(other.best, one.best) else one
 
 
-def _solve(problem, limits, z, iterations):
+def _solve(problem, limits, z, iterations, progress=None):
     """The _Answer of `problem` under `limits` {measure: value}, searched from z (P,)."""
     problem.limit(limits)
-    search = Search(problem, problem.point(problem.start()), lambda s: None)
+    search = Search(problem, problem.point(problem.start()), progress or (lambda search: None))
     converged = slsqp(search, z, iterations)
     if search.best is not None and search.violation(search.best) > 0:
         restore(search, search.best.z, iterations)

@@ -1,5 +1,6 @@
 """`jaxtank tune`."""
 
+import contextlib
 import functools
 import sys
 
@@ -15,7 +16,9 @@ EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 def tune(args):
     """`_tune`, with the handler of SIGINT put back afterwards."""
     with put_back():
-        return _tune(args)
+        code = _tune(args)
+        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
+        return code
 
 
 def _tune(args):
@@ -50,6 +53,7 @@ def _tune(args):
             back_off=number("--back-off", args.back_off or "0"),
         )
         scenarios, more = None, {}
+    progress = Progress(tables.objective_unit(objective or case.objective, case.loop.units), args.quiet)
     result = finder(
         case,
         method=args.method,
@@ -66,21 +70,22 @@ def _tune(args):
         seed=seed,
         screening=whole("--screening", args.screening, 1, 65536),
         iterations=whole("--iterations", args.iterations, 1, 100_000),
-        progress=Progress(tables.objective_unit(objective or case.objective, case.loop.units), args.quiet),
+        progress=progress,
     )
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
-    if sweep and result.status != "interrupted":
+    if sweep and not progress.stop and result.status != "interrupted":
         from tuning.tradeoff import tradeoff
 
         answer = {n: p["after"] for n, p in result.parameters.items()}
         options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}
         options["screening"] = whole("--screening", args.screening, 1, 65536)
-        result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, **options))
-    if args.bound and result.status != "interrupted":
+        with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
+            result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, progress=progress.check, **options))
+    if args.bound and not progress.stop and result.status != "interrupted":
         from tuning.bound import bound
 
-        result = result.replace(bound=bound(result.tuned, objective, limits))
+        result = result.replace(bound=bound(result.tuned, objective, limits, progress=progress.check))
     args.out = folder
     try:
         written = result.save(folder, args.line) if folder else []
@@ -94,18 +99,20 @@ def _tune(args):
     tell_unreachable(result.tuned, written, args)
     if not args.out and not args.json and not args.quiet:
         print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
-    return EXIT[result.status]
+    return EXIT["interrupted" if progress.stop else result.status]
 
 
 class Progress(Interrupts):
-    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations."""
+    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations, from the second on: the
+    first is of the values that the case has, and what follows it is compiled first."""
 
     def __init__(self, unit, quiet):
         super().__init__()
         self.unit, self.quiet, self.last, self.terminal = unit, quiet, None, sys.stderr.isatty()
 
     def __call__(self, event):
-        self.check()
+        if event["evaluations"] > 1:
+            self.check()
         if self.quiet or (not self.terminal and event["start"] == self.last):
             return
         self.last = event["start"]

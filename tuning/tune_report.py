@@ -10,7 +10,7 @@ from jaxtank import rig
 from jaxtank.errors import InputError
 from jaxtank.files import check_folder
 from tuning.report import json_of, parts_of, worst_of_scenarios
-from tuning.saving import pngs, run_for_people, trajectory_csv, write_files
+from tuning.saving import earlier, run_for_people, trajectory_csv, write_result
 from tuning.tables import dumps, number, objective_unit
 
 
@@ -114,7 +114,7 @@ def page_of(result, drawn, command=None):
         result.success,
         facts,
         result.message.split("; "),
-        [(n, page.svg(f, n, CAPTIONS[n]), CAPTIONS[n]) for n, f in drawn.items()],
+        page.drawings(drawn, CAPTIONS),
         parts_of(result)[1:],
         command,
         result.provenance,
@@ -200,7 +200,7 @@ def rig_of(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, rig.toml, trajectory.csv, PNG pictures and report.html to `folder`, each whole or not at all; returns their paths.
+    """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and report.html; returns their paths.
 
     command: the line that made the result, for the report, where there is one. A case that no rig file
     can describe (with a plant or a controller class of one's own) has no rig.toml: a UserWarning,
@@ -220,9 +220,7 @@ def save(result, folder, command=None):
         "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
         "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
-    drawn = figures(result, runs)
-    stale = not rig_text and (folder / "result.json").is_file()
-    written = write_files(folder, files | {"report.html": page_of(result, drawn, command)} | pngs(drawn))
-    if stale:  # of another result: its gains must not be taken for these
-        (folder / "rig.toml").unlink(missing_ok=True)
-    return written
+    stale = earlier(folder, CAPTIONS)
+    if not rig_text and (folder / "result.json").is_file():
+        stale.append(folder / "rig.toml")  # of another result: its gains must not be taken for these
+    return write_result(folder, files, lambda: figures(result, runs), lambda drawn: page_of(result, drawn, command), stale)

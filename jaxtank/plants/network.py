@@ -12,7 +12,7 @@ from jaxtank.numerics import at_least, clip, limited_flow, limited_root, root, s
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import efflux, usual_gravity, usual_knee
 from jaxtank.tree import check_value, component, leaf, number, static
-from jaxtank.units import DEFAULT
+from jaxtank.units import DEFAULT, check_unit
 
 
 @component
@@ -237,6 +237,8 @@ def network(
     links, pipes, spills: pairs (from, to), with one orifice, pipe, caught each. Units as in TankNetwork, or those of `units`.
     gravity, knee: 981 cm/s^2 and 0.01 cm where they are None, in the length of `units`; InputError for no gravity beside levels in volts.
     """
+    for unit in units:
+        check_unit("plant.units: entry", unit)
     gravity = usual_gravity(units[0]) if gravity is None else gravity
     knee = usual_knee(units[0]) if knee is None else knee
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)

@@ -17,7 +17,7 @@ from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, ramps
 from jaxtank.tree import _short, check_value, number
-from jaxtank.units import DEFAULT, local
+from jaxtank.units import DEFAULT, check_unit, local
 
 TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")
 TANK = {"name": "", "area": None, "rim": None, "drain": 0.0, "level": 0.0, "inflow": 0.0, "noise": 0.0}
@@ -194,7 +194,7 @@ def build(table):
 def _units(value):
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, str) and v for v in value)):
         raise InputError(f'units = {_short(value)}: must be [length, pump input], as ["cm", "V"]')
-    return tuple(name_of("units: entry", v) for v in value)
+    return tuple(check_unit("units: entry", name_of("units: entry", v)) for v in value)
 
 
 def _check_shares(overflows, written, spills):
