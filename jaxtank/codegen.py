@@ -285,6 +285,8 @@ def _elements(value):
 
 def _equation(writer, eqn, operands):
     name, params = eqn.primitive.name, eqn.params
+    if name in ("jit", "pjit") and params["name"] in NAMED:
+        return [NAMED[params["name"]](writer, *operands)]
     inner = next((params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in params and name != "scan"), None)
     if inner is not None and name != "custom_linear_solve":
         return _run(writer, getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
@@ -413,6 +415,26 @@ def _triangular(writer, a, b, params):
     forward = params["lower"] != params["transpose_a"]
     n, k = b.shape
     return writer.matrix("forward" if forward else "backward", (lower, b), (n, k), (n, k))
+
+
+def _cholesky(writer, a):
+    n = a.shape[0]
+    return writer.matrix("cholesky", (a,), (n,), (n, n)).T
+
+
+def _cholesky_solve(writer, upper, b):
+    n = len(b)
+    y = writer.matrix("forward", (upper.T, b), (n, 1), (n,))
+    return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
+
+
+def _weighted(writer, g, weight):
+    scaled = _each(lambda a, w: writer.define(REAL, "mul", a, w), g, np.broadcast_to(weight[:, None], g.shape))
+    return _product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
+
+
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
+"""Functions of `jaxtank.qp` whose loops go through arrays by an index: written as matrix operations."""
 
 
 def _scan(writer, eqn, operands):
