@@ -435,7 +435,9 @@ def _chosen(writer, index, values, kind):
     """values[i] where index is i (below 0 as 0, past the end as the last)."""
     out = values[0]
     for i, value in enumerate(values[1:], start=1):
-        out = _each(lambda n, no, yes, i=i: writer.define(kind, "select", writer.define(TRUTH, "ge", n, i), no, yes), index, out, value)
+        out = _each(
+            lambda n, no, yes, i=i: writer.define(kind, "select", writer.define(TRUTH, "ge", n, i), no, yes), index, out, value
+        )
     return out
 
 

@@ -116,7 +116,23 @@ C_CALLS = {
     "floor": "FLOOR",
     "pow": "POW",
 }
-SAME_NAME = ("erf", "erfc", "log1p", "expm1", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "asinh", "acosh", "atanh", "ceil")
+SAME_NAME = (
+    "erf",
+    "erfc",
+    "log1p",
+    "expm1",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "atan2",
+    "sinh",
+    "cosh",
+    "asinh",
+    "acosh",
+    "atanh",
+    "ceil",
+)
 """Functions that C and MATLAB have by the same name."""
 C_CALLS |= {name: name.upper() for name in (*SAME_NAME, "cbrt", "exp2")}
 C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT", "rem": "FMOD", "is_finite": "isfinite"}

@@ -120,9 +120,7 @@ def _implicit(point, data, moved):
     factor = _factor(jax.lax.stop_gradient(normal))
 
     def solved(right):
-        return jax.lax.custom_linear_solve(
-            lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True
-        )
+        return jax.lax.custom_linear_solve(lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True)
 
     def corrected(found, _):
         dx, v = found

@@ -160,7 +160,9 @@ def matlab(text):
         "true": True,
         "false": False,
     }
-    known |= {f: getattr(math, f) for f in ("erf", "erfc", "log1p", "expm1", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh")}
+    known |= {
+        f: getattr(math, f) for f in ("erf", "erfc", "log1p", "expm1", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh")
+    }
     known |= {f: getattr(math, f) for f in ("asinh", "acosh", "atanh", "ceil", "isfinite")}
     known |= {"rem": math.fmod, "fix": math.trunc, "round": round, "nthroot": lambda v, n: math.copysign(abs(v) ** (1 / n), v)}
     known |= {"sqrt": lambda v: math.sqrt(v) if v >= 0 else math.nan, "sign": np.sign, "Inf": math.inf, "NaN": math.nan}
@@ -187,21 +189,71 @@ def test_matlab_gives_the_inputs_of_the_loop(name):
 
 
 FUNCTIONS = (
-    jax.nn.sigmoid, jax.nn.softplus, jax.nn.relu, jax.nn.silu, jax.nn.gelu, jax.scipy.special.erf, jax.scipy.special.erfc,
-    jnp.tanh, jnp.exp, jnp.exp2, jnp.expm1, jnp.sinh, jnp.cosh, jnp.sin, jnp.cos, jnp.tan, jnp.arctan, jnp.arcsinh,
-    jnp.sign, jnp.floor, jnp.ceil, jnp.round, jnp.trunc, jnp.abs, jnp.square, jnp.cbrt, jnp.sinc, jnp.isfinite,
-    lambda x: jnp.log(jnp.abs(x)), lambda x: jnp.log1p(jnp.abs(x)), lambda x: jnp.log10(jnp.abs(x)), lambda x: jnp.sqrt(jnp.abs(x)),
-    lambda x: jnp.arcsin(0.4 * x), lambda x: jnp.arccos(0.4 * x), lambda x: jnp.arctanh(0.4 * x), lambda x: jnp.arccosh(1.0 + x * x),
-    lambda x: jnp.arctan2(x, -0.4), lambda x: jnp.arctan2(-0.3, x), lambda x: jnp.hypot(x, 0.4), lambda x: jnp.logaddexp(x, 0.4),
-    lambda x: jnp.fmod(x, 0.3), lambda x: jnp.mod(x, 0.3), lambda x: x // 0.3, lambda x: (x * 10).astype(int) % 3,
-    lambda x: (x * 10).astype(int) // 3, lambda x: jnp.abs(x) ** 1.7, lambda x: 2.0**x, lambda x: x**3, lambda x: x**-2,
-    lambda x: jnp.clip(x, -0.3, 0.9), lambda x: jnp.where(x > 0.5, x, 2 * x), lambda x: jnp.maximum(x, 0.3),
-    lambda x: jnp.where((x > 0.0) ^ (x > 1.0), 1.0, 2.0), lambda x: jnp.select([x > 1.0, x > 0.0], [x, 2 * x], 0.1),
-    lambda x: jnp.prod(jnp.stack([x, x + 1.0])), lambda x: jnp.cumsum(jnp.stack([x, x * x, 1.0])), lambda x: jnp.argmax(jnp.stack([0.2, x])),
-    lambda x: jnp.cumprod(jnp.stack([x, x + 1.0])), lambda x: jnp.mean(jnp.stack([x, x * x])), lambda x: jnp.argmin(jnp.stack([0.2, x])),
-    lambda x: jax.lax.cond(x > 0.5, lambda y: y, lambda y: 2 * y, x), lambda x: jnp.heaviside(x, 0.5), lambda x: jnp.linalg.norm(x * jnp.arange(3)),
+    jax.nn.sigmoid,
+    jax.nn.softplus,
+    jax.nn.relu,
+    jax.nn.silu,
+    jax.nn.gelu,
+    jax.scipy.special.erf,
+    jax.scipy.special.erfc,
+    jnp.tanh,
+    jnp.exp,
+    jnp.exp2,
+    jnp.expm1,
+    jnp.sinh,
+    jnp.cosh,
+    jnp.sin,
+    jnp.cos,
+    jnp.tan,
+    jnp.arctan,
+    jnp.arcsinh,
+    jnp.sign,
+    jnp.floor,
+    jnp.ceil,
+    jnp.round,
+    jnp.trunc,
+    jnp.abs,
+    jnp.square,
+    jnp.cbrt,
+    jnp.sinc,
+    jnp.isfinite,
+    lambda x: jnp.log(jnp.abs(x)),
+    lambda x: jnp.log1p(jnp.abs(x)),
+    lambda x: jnp.log10(jnp.abs(x)),
+    lambda x: jnp.sqrt(jnp.abs(x)),
+    lambda x: jnp.arcsin(0.4 * x),
+    lambda x: jnp.arccos(0.4 * x),
+    lambda x: jnp.arctanh(0.4 * x),
+    lambda x: jnp.arccosh(1.0 + x * x),
+    lambda x: jnp.arctan2(x, -0.4),
+    lambda x: jnp.arctan2(-0.3, x),
+    lambda x: jnp.hypot(x, 0.4),
+    lambda x: jnp.logaddexp(x, 0.4),
+    lambda x: jnp.fmod(x, 0.3),
+    lambda x: jnp.mod(x, 0.3),
+    lambda x: x // 0.3,
+    lambda x: (x * 10).astype(int) % 3,
+    lambda x: (x * 10).astype(int) // 3,
+    lambda x: jnp.abs(x) ** 1.7,
+    lambda x: 2.0**x,
+    lambda x: x**3,
+    lambda x: x**-2,
+    lambda x: jnp.clip(x, -0.3, 0.9),
+    lambda x: jnp.where(x > 0.5, x, 2 * x),
+    lambda x: jnp.maximum(x, 0.3),
+    lambda x: jnp.where((x > 0.0) ^ (x > 1.0), 1.0, 2.0),
+    lambda x: jnp.select([x > 1.0, x > 0.0], [x, 2 * x], 0.1),
+    lambda x: jnp.prod(jnp.stack([x, x + 1.0])),
+    lambda x: jnp.cumsum(jnp.stack([x, x * x, 1.0])),
+    lambda x: jnp.argmax(jnp.stack([0.2, x])),
+    lambda x: jnp.cumprod(jnp.stack([x, x + 1.0])),
+    lambda x: jnp.mean(jnp.stack([x, x * x])),
+    lambda x: jnp.argmin(jnp.stack([0.2, x])),
+    lambda x: jax.lax.cond(x > 0.5, lambda y: y, lambda y: 2 * y, x),
+    lambda x: jnp.heaviside(x, 0.5),
+    lambda x: jnp.linalg.norm(x * jnp.arange(3)),
     lambda x: jax.lax.switch((x > 0.0).astype(int) + (x > 1.0), [jnp.sin, jnp.cos, jnp.square], x),
-)  # fmt: skip
+)
 """Of one number: what a controller of one's own may use."""
 
 
@@ -236,9 +288,7 @@ def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
     for error in errors:
         y, zero, u = np.array([error + 3.0, 1.0]), np.zeros(1), np.zeros(1)
         code.library.law_init(code.pointer(code.state), code.pointer(y), code.pointer(u))
-        code.library.law_step(
-            code.pointer(code.state), code.real(0.0), *map(code.pointer, (y, np.array([3.0]), zero, zero, u))
-        )
+        code.library.law_step(code.pointer(code.state), code.real(0.0), *map(code.pointer, (y, np.array([3.0]), zero, zero, u)))
         np.testing.assert_allclose(code.state, expected(y[0] - 3.0), rtol=1e-12, atol=1e-15)
 
 

@@ -71,6 +71,9 @@ changes = [[20.0, 1, 4.0], [20.0, 2, 3.5]]
 ramp = 30.0
 """
 
+GPC = {"kind": "gpc", "operating_point": [4.0, 3.0, 2.0, 2.0], "q": 1.0, "du_limit": 1.0}
+GPC |= {"u_low": 0.0, "u_high": 10.0}
+
 
 def table(text=FOUR, **changes):
     return {**tomllib.loads(text), **changes}
@@ -154,7 +157,7 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"law": {"kind": "pid", "Kc": 1.0, "Ti": 1.0, "K": 2.0}}, "unknown key of \\[law\\] 'K'"),
         ({"law": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "law.Kc = 'much'"),
         (
-            {"law": {"kind": "gpc", "operating_point": [4.0, 3.0, 2.0, 2.0], "r_w": [0.1, 0.2], "q": 1.0, "du_limit": 1.0, "u_low": 0.0, "u_high": 10.0}},
+            {"law": {**GPC, "r_w": [0.1, 0.2]}},
             r"controller.r_w = \[0.1, 0.2\]: must be one number, the weight of the increments of all inputs",
         ),
         (
