@@ -316,3 +316,16 @@ def test_200_batches_on_two_devices_return():
     """The time limit is there to end a run that would never end: it takes 15 s."""
     done = subprocess.run([sys.executable, "-c", BATCHES], capture_output=True, text=True, timeout=400)
     assert done.returncode == 0 and done.stdout.strip() == "True", done.stderr[-2000:]
+
+
+def test_the_loop_of_a_large_programme_is_one_compiled_function():
+    """LAPACK in it, or any other call, would keep XLA from that; in front of the loop, where the rig is
+    discretised, there is some."""
+    from jaxtank import loop, presets, rig
+    from tuning.bench import is_one_function
+
+    case = presets.find("khalid/gpc-nc30-constrained")
+    changes = {"controller.Nc": 44, "controller.Np": 50, "clock.duration": 80 * case.clock.dt}
+    case = rig.set_values(case, changes)
+    program = loop._evaluate.lower(case.loop, case.clock, ("rms_error_total",), None, False)
+    assert is_one_function(program.compile().as_text(), case.clock.samples)
