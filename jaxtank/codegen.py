@@ -5,6 +5,7 @@ depends on constants alone is computed here, and what nobody uses is left out. L
 products of large matrices too.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -117,8 +118,33 @@ PLAIN = {
     "or": "or",
     "not": "not",
     "sign": "sign",
+    "is_finite": "is_finite",
 }
-TRUTHS = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not"}
+FUNCTIONS = {
+    "logistic": lambda a: 1.0 / (1.0 + np.exp(-a)),
+    "erf": math.erf,
+    "erfc": math.erfc,
+    "log1p": np.log1p,
+    "expm1": np.expm1,
+    "exp2": np.exp2,
+    "cbrt": np.cbrt,
+    "ceil": np.ceil,
+    "rem": np.fmod,
+    "tan": np.tan,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "atan2": np.arctan2,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "asinh": np.arcsinh,
+    "acosh": np.arccosh,
+    "atanh": np.arctanh,
+}
+"""Functions of real numbers that keep their names, and what they are of numbers."""
+PLAIN |= {name: name for name in FUNCTIONS}
+TRUTHS = {"lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"}
+WHOLES = {"div": "quotient", "rem": "remainder"}  # of whole numbers, rounded towards zero
 
 
 def kind_of(dtype):
@@ -231,11 +257,14 @@ def _compute(op, args):
         "and": lambda a, b: a and b,
         "or": lambda a, b: a or b,
         "not": lambda a: not a,
+        "is_finite": np.isfinite,
+        "quotient": lambda a, b: int(a / b),
+        "remainder": math.fmod,
         "real": float,
         "whole": int,
         "truth": bool,
-    }[op]
-    return f(*args)
+    }.get(op)
+    return f(*args) if f is not None else float(FUNCTIONS[op](*args))
 
 
 def function(f, *shapes):
@@ -285,6 +314,8 @@ def _elements(value):
 
 def _equation(writer, eqn, operands):
     name, params = eqn.primitive.name, eqn.params
+    if name in ("jit", "pjit") and params["name"] in NAMED:
+        return [NAMED[params["name"]](writer, *operands)]
     inner = next((params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in params and name != "scan"), None)
     if inner is not None and name != "custom_linear_solve":
         return _run(writer, getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
@@ -298,6 +329,10 @@ def _equation(writer, eqn, operands):
     if name == "convert_element_type":
         source = kind_of(eqn.invars[0].aval.dtype)
         return [_each(lambda a: a if source == kind else writer.define(kind, kind, a), operands[0])]
+    if name == "xor" and kind == TRUTH:
+        return [_each(lambda a, b: writer.define(TRUTH, "ne", a, b), *np.broadcast_arrays(*operands))]
+    if kind == WHOLE and name in WHOLES:
+        return [_each(lambda a, b: writer.define(WHOLE, WHOLES[name], a, b), *np.broadcast_arrays(*operands))]
     if name in PLAIN:
         out = TRUTH if PLAIN[name] in TRUTHS else kind
         return [_each(lambda *a: writer.define(out, PLAIN[name], *a), *np.broadcast_arrays(*operands))]
@@ -308,8 +343,19 @@ def _equation(writer, eqn, operands):
         return [_each(lambda a, b, c: writer.define(REAL, "min", writer.define(REAL, "max", b, a), c), low, x, high)]
     if name == "select_n" and len(operands) == 3:
         return [_each(lambda c, no, yes: writer.define(kind, "select", c, no, yes), *np.broadcast_arrays(*operands))]
-    if name in ("reduce_sum", "reduce_max", "reduce_min", "reduce_and", "reduce_or"):
-        return [_reduced(writer, operands[0], params["axes"], {"sum": "add"}.get(name[7:], name[7:]), kind)]
+    if name == "select_n":
+        index, *values = np.broadcast_arrays(*operands)
+        return [_chosen(writer, index, values, kind)]
+    if name == "cond":  # every branch is computed: none has an effect
+        branches = [_run(writer, b.jaxpr, b.consts, operands[1:]) for b in params["branches"]]
+        chosen = zip(*branches), (kind_of(v.aval.dtype) for v in eqn.outvars)
+        return [_chosen(writer, np.broadcast_to(operands[0], v[0].shape), v, k) for v, k in zip(*chosen)]
+    if name in ("reduce_sum", "reduce_prod", "reduce_max", "reduce_min", "reduce_and", "reduce_or"):
+        return [_reduced(writer, operands[0], params["axes"], SUMS.get(name[7:], name[7:]), kind)]
+    if name in ("argmax", "argmin"):
+        return [_place(writer, operands[0], params["axes"][0], name == "argmax", kind_of(eqn.invars[0].aval.dtype))]
+    if name in ("cumsum", "cumprod", "cummax", "cummin"):
+        return [_running(writer, operands[0], params["axis"], params["reverse"], SUMS.get(name[3:], name[3:]), kind)]
     if name == "dot_general":
         return [_product(writer, *operands, params["dimension_numbers"])]
     if name == "scan":
@@ -382,6 +428,47 @@ def _reduced(writer, array, axes, op, kind):
     return out
 
 
+SUMS = {"sum": "add", "prod": "mul"}
+
+
+def _chosen(writer, index, values, kind):
+    """values[i] where index is i (below 0 as 0, past the end as the last)."""
+    out = values[0]
+    for i, value in enumerate(values[1:], start=1):
+        out = _each(
+            lambda n, no, yes, i=i: writer.define(kind, "select", writer.define(TRUTH, "ge", n, i), no, yes), index, out, value
+        )
+    return out
+
+
+def _place(writer, array, axis, largest, kind):
+    """The first place along an axis at which the largest (smallest) element is."""
+    rows = np.moveaxis(array, axis, -1)
+    out = np.empty(rows.shape[:-1], dtype=object)
+    for i in np.ndindex(out.shape):
+        best, place = rows[i][0], 0
+        for k, e in enumerate(rows[i][1:], start=1):
+            if kind == TRUTH:
+                pair = (e, best) if largest else (best, e)
+                better = writer.define(TRUTH, "and", pair[0], writer.define(TRUTH, "not", pair[1]))
+            else:
+                better = writer.define(TRUTH, "gt" if largest else "lt", e, best)
+            place = writer.define(WHOLE, "select", better, place, k)
+            best = writer.define(kind, "select", better, best, e)
+        out[i] = place
+    return out
+
+
+def _running(writer, array, axis, reverse, op, kind):
+    """Running sums, products, largest or smallest elements along an axis."""
+    out = np.moveaxis(array.copy(), axis, -1)
+    rows = out[..., ::-1] if reverse else out
+    for i in np.ndindex(rows.shape):
+        if i[-1] > 0:
+            rows[i] = writer.define(kind, op, rows[(*i[:-1], i[-1] - 1)], rows[i])
+    return np.moveaxis(out, -1, axis)
+
+
 def _product(writer, a, b, dimensions):
     (left, right), (batch_a, batch_b) = dimensions
     if batch_a or batch_b:
@@ -413,6 +500,26 @@ def _triangular(writer, a, b, params):
     forward = params["lower"] != params["transpose_a"]
     n, k = b.shape
     return writer.matrix("forward" if forward else "backward", (lower, b), (n, k), (n, k))
+
+
+def _cholesky(writer, a):
+    n = a.shape[0]
+    return writer.matrix("cholesky", (a,), (n,), (n, n)).T
+
+
+def _cholesky_solve(writer, upper, b):
+    n = len(b)
+    y = writer.matrix("forward", (upper.T, b), (n, 1), (n,))
+    return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
+
+
+def _weighted(writer, g, weight):
+    scaled = _each(lambda a, w: writer.define(REAL, "mul", a, w), g, np.broadcast_to(weight[:, None], g.shape))
+    return _product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
+
+
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
+"""Functions of `jaxtank.qp` whose loops go through arrays by an index: written as matrix operations."""
 
 
 def _scan(writer, eqn, operands):

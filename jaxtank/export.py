@@ -131,7 +131,26 @@ C_CALLS = {
     "floor": "FLOOR",
     "pow": "POW",
 }
-C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT"}
+SAME_NAME = (
+    "erf",
+    "erfc",
+    "log1p",
+    "expm1",
+    "tan",
+    "asin",
+    "acos",
+    "atan",
+    "atan2",
+    "sinh",
+    "cosh",
+    "asinh",
+    "acosh",
+    "atanh",
+    "ceil",
+)
+"""Functions that C and MATLAB have by the same name."""
+C_CALLS |= {name: name.upper() for name in (*SAME_NAME, "cbrt", "exp2")}
+C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT", "rem": "FMOD", "is_finite": "isfinite"}
 C_TYPES = {cg.REAL: "real", cg.WHOLE: "int", cg.TRUTH: "int"}
 
 
@@ -168,6 +187,9 @@ class C:
             "or": "{0} || {1}",
             "square": "{0} * {0}",
             "rsqrt": "R(1.0) / SQRT({0})",
+            "logistic": "R(1.0) / (R(1.0) + EXP(-{0}))",
+            "quotient": "{0} / {1}",
+            "remainder": "{0} % {1}",
             "sign": "(real)(({0} > R(0.0)) - ({0} < R(0.0)))",
             "select": "{0} ? {2} : {1}",
             "real": "(real){0}",
@@ -252,7 +274,7 @@ static void backward(int n, int k, const real *a, const real *b, real *out)
         }
 }
 """
-MATHS = ("sqrt", "fabs", "exp", "log", "tanh", "sin", "cos", "floor", "pow", "rint")
+MATHS = ("sqrt", "fabs", "exp", "log", "tanh", "sin", "cos", "floor", "pow", "rint", "fmod", "cbrt", "exp2", *SAME_NAME)
 
 
 def _about(law, case, mark, name, begin):
@@ -364,7 +386,7 @@ class Matlab(C):
         a = [self.value(v) for v in args]
         if op in INFIX:
             return f"{a[0]} {INFIX[op]} {a[1]}"
-        if op in ("sqrt", "abs", "exp", "log", "tanh", "sin", "cos", "floor", "max", "min", "sign"):
+        if op in ("sqrt", "abs", "exp", "log", "tanh", "sin", "cos", "floor", "max", "min", "sign", *SAME_NAME):
             return f"{op}({', '.join(a)})"
         return {
             "neg": "-{0}",
@@ -374,6 +396,13 @@ class Matlab(C):
             "or": "{0} || {1}",
             "square": "{0} * {0}",
             "rsqrt": "1 / sqrt({0})",
+            "logistic": "1 / (1 + exp(-{0}))",
+            "exp2": "2 ^ {0}",
+            "cbrt": "nthroot({0}, 3)",
+            "rem": "rem({0}, {1})",
+            "is_finite": "isfinite({0})",
+            "quotient": "fix({0} / {1})",
+            "remainder": "rem({0}, {1})",
             "pow": "{0} ^ {1}",
             "round": "round({0})",
             "select": "pick({0}, {2}, {1})",

@@ -9,6 +9,7 @@ not pay for them.
 """
 
 import functools
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -30,6 +31,7 @@ ones, khalid spec C.1; 15 left a pump at 0.003 V that belonged at 0)."""
 
 CORRECTIONS = 4  # of a derivative
 UNROLLED = 40  # variables up to which the elimination is written out
+STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variables, 8 as much as 4
 BACK = 0.99  # share of the way to the nearest bound that a step may go
 
 
@@ -102,8 +104,7 @@ def _implicit(point, data, moved):
 
     of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that every entry is of the order of 1. The matrix
     H + A' D^-1 A that v leaves for dx (`_normal`) loses four to ten digits of H in the shadow of binding rows; corrections by what the two
-    equations above leave bring them back. (LAPACK's elimination of both at once is as good, and slower; called for many lanes at once by
-    jax 0.10 on few processors it sometimes never returns.)"""
+    equations above leave bring them back. The elimination itself is not differentiated: second derivatives are those of a linear system."""
     H, _, G, _, _ = data
     x, su, sl, lu, ll = point
     up, low = lu / su, ll / sl
@@ -115,12 +116,16 @@ def _implicit(point, data, moved):
         return H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)
 
     a, b = (-r for r in jax.jvp(residual, tuple(data), tuple(moved))[1])
-    factor = _factor(_normal(H, G, point))
+    normal = _normal(H, G, point)
+    factor = _factor(jax.lax.stop_gradient(normal))
+
+    def solved(right):
+        return jax.lax.custom_linear_solve(lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True)
 
     def corrected(found, _):
         dx, v = found
         left, over = a - H @ dx - A.T @ v, b - A @ dx + D * v
-        step = _substitute(factor, left + A.T @ (over / D))
+        step = solved(left + A.T @ (over / D))
         return (dx + step, v + (A @ step - over) / D), None
 
     return jax.lax.scan(corrected, (jnp.zeros_like(a), jnp.zeros_like(b)), None, length=1 + CORRECTIONS)[0][0]
@@ -177,7 +182,24 @@ def interior_point(H, f, G, l, u, iterations=MOST):
 
 def _normal(H, G, p):
     """H + G' diag(lu/su + ll/sl) G."""
-    return H + (G.T * (p.lu / p.su + p.ll / p.sl)) @ G
+    weight = p.lu / p.su + p.ll / p.sl
+    return H + (_weighted(G, weight) if H.shape[0] > UNROLLED else (G.T * weight) @ G)
+
+
+@jax.jit
+def _weighted(G, weight):
+    """Return G' diag(weight) G (n, n) for G (rows, n), row by row.
+
+    Inside a loop that is one compiled function XLA writes the product of a vector and a matrix for
+    the processor's vector unit, and that of two matrices as three plain loops.
+    """
+    product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
+
+    def row(j, product):
+        new = (_entry(G, j, axis=1) * weight) @ G
+        return jax.lax.dynamic_update_index_in_dim(product, new, j, 0)
+
+    return jax.lax.fori_loop(0, G.shape[1], row, product)
 
 
 def _reach(p, step, back):
@@ -187,13 +209,15 @@ def _reach(p, step, back):
 
 
 def _factor(A):
-    """A factor of A (n, n) symmetric positive definite, for `_substitute`: [(column of L, pivot), ...] of A = L D L' where A is small.
+    """Return a factor of A (n, n) symmetric positive definite, for `_substitute`.
 
-    Written out column by column, for calls of LAPACK take longer than the work on so small a matrix: measured, a closed loop runs 3 to 5
-    times as fast with 4 or 10 variables, as fast with 20, 0.4 times as fast with 30; but a batch of calls sometimes never returns (jax 0.10).
+    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by column.
+    Above: `_cholesky`. No LAPACK in either. Its call takes longer than the work on so small a matrix,
+    and in jaxlib 0.10 a batched call divides its work among the threads on which it runs itself: as
+    many such calls at once as there are threads wait for each other for ever.
     """
     if A.shape[0] > UNROLLED:
-        return jax.scipy.linalg.cho_factor(A, lower=True)
+        return _cholesky(A)
     columns = []
     for j in range(A.shape[0]):
         columns.append((A[:, j] / A[j, j], A[j, j]))
@@ -201,14 +225,64 @@ def _factor(A):
     return columns
 
 
-def _substitute(columns, b):
-    """A^-1 b for the `_factor` of A; b: (n,)."""
-    if isinstance(columns, tuple):
-        return jax.scipy.linalg.cho_solve(columns, b)
-    index = np.arange(len(columns))
-    for j, (column, _) in enumerate(columns):
+def _substitute(factor, b):
+    """Return A^-1 b for the `_factor` of A; b: (n,)."""
+    if not isinstance(factor, list):
+        return _cholesky_solve(factor, b)
+    index = np.arange(len(factor))
+    for j, (column, _) in enumerate(factor):
         b = b - jnp.where(index > j, column, 0.0) * b[j]
-    b = b / jnp.stack([pivot for _, pivot in columns])
-    for j, (column, _) in reversed(list(enumerate(columns))):
+    b = b / jnp.stack([pivot for _, pivot in factor])
+    for j, (column, _) in reversed(list(enumerate(factor))):
         b = jnp.where(index == j, b - jnp.sum(jnp.where(index > j, column * b, 0.0)), b)
     return b
+
+
+@jax.jit
+def _cholesky(A):
+    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is not).
+
+    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts of
+    fixed shape, so that little of a product is spent on entries that are zero. `codegen` writes this
+    function and `_cholesky_solve` as loops of its own: it knows them by their names.
+    """
+    n = A.shape[0]
+    ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
+    U = jnp.zeros((0, n), A.dtype)
+    for first, end in itertools.pairwise(ends):
+        index, left = np.arange(n - first), A[first:, first:]
+
+        def row(j, rows, first=first, index=index, left=left):
+            column = _entry(rows, j, axis=1)
+            new = _entry(left, j) - column @ rows
+            new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(_entry(new, j)))
+            return jax.lax.dynamic_update_index_in_dim(rows, new, first + j, 0)
+
+        rows = jnp.concatenate([U[:, first:], jnp.zeros((end - first, n - first), A.dtype)])
+        rows = jax.lax.fori_loop(0, end - first, row, rows)
+        U = jnp.concatenate([U, jnp.pad(rows[first:], ((0, 0), (first, 0)))])
+    return U
+
+
+@jax.jit
+def _cholesky_solve(U, b):
+    """Return x (n,) of U'U x = b; U (n, n) as `_cholesky` returns it; b: (n,)."""
+    n = b.shape[0]
+    index = np.arange(n)
+
+    def forward(j, b):
+        row = _entry(U, j)
+        y = _entry(b, j) / _entry(row, j)
+        return jnp.where(index < j, b, jnp.where(index == j, y, b - row * y))
+
+    def backward(k, x):
+        j = n - 1 - k
+        row = _entry(U, j)
+        y = (_entry(x, j) - jnp.sum(jnp.where(index > j, row * x, 0.0))) / _entry(row, j)
+        return jax.lax.dynamic_update_index_in_dim(x, y, j, 0)
+
+    return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, b))
+
+
+def _entry(array, j, axis=0):
+    return jax.lax.dynamic_index_in_dim(array, j, axis, keepdims=False)

@@ -143,7 +143,7 @@ def keyed(loop, key):
 
 def step(loop, clock, state, now):
     """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
-    t = state.k.astype(state.x[0].dtype) * clock.dt
+    t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y = loop.sensor.read(state.x, now.xi)
     estimate, observer = loop.observer.step(state.observer, tick, y)
@@ -152,9 +152,7 @@ def step(loop, clock, state, now):
     applied = loop.actuator.limit(command, metric)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
-    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
-    plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
+    moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
         t=t,
@@ -170,7 +168,23 @@ def step(loop, clock, state, now):
         spilled=spilled,
         shortfall=shortfall,
     )
-    return State(state.k + 1, x, observer, controller, actuator, excess), sample
+    return moved._replace(observer=observer, controller=controller), sample
+
+
+def move(loop, clock, state, applied, now):
+    """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim [cm^3], (n) volume that a negative
+    inflow could not take [cm^3]) for inputs `applied` (m) [V] within the limits: pumps, faults and plant. Observer and controller
+    of the state stay as they are."""
+    t = time_of(state, clock)
+    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
+    plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
+    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
+    return state._replace(k=state.k + 1, x=x, actuator=actuator, excess=excess), u, spilled, shortfall
+
+
+def time_of(state, clock):
+    """t [s] of a state."""
+    return state.k.astype(state.x[0].dtype) * clock.dt
 
 
 def commanded(loop, state, tick, estimate):

@@ -1,5 +1,6 @@
 """Doors to other libraries: python-control, tables, Gymnasium."""
 
+import dataclasses
 import subprocess
 import sys
 
@@ -98,6 +99,61 @@ def test_the_environment_plays_the_case():
         -np.sum(np.mean((run.e[1:] / 30.0) ** 2, axis=1)) - 100 * np.sum(np.maximum(run.x[1:] - 30, 0) ** 2 / 900), rel=1e-6
     )
     check_env(TankEnv(case), skip_render_check=True)
+
+
+EPISODES = {
+    "calofir/backstepping-perturbed": {"clock.duration": 1050.0},  # an outlet that closes, a leak, an orifice that is another one
+    "gouta2022/chadpc": {"clock.dt": 0.2, "clock.duration": 500.0},  # a weak pump, inflows, an ADC, a dead zone
+    "gouta2015/backstepping-boxqp": {"clock.dt": 0.5, "clock.duration": 150.0},
+    "mirakhorli/hybrid": {"clock.duration": 100.0, "actuator.delay": 0.0},
+    "cascaded/pi": {"plant.rim[1]": 6.0},
+    "khalid/laguerre-constrained": {"clock.duration": 60.0},
+}
+
+
+def pumps_and_sensors(case):
+    """The case with all that stands between an action and a reading, in units of the rig."""
+    actuator, sensor, plant = case.loop.actuator, case.loop.sensor, case.loop.plant
+    reach, rim = np.asarray(actuator.high) - np.asarray(actuator.low), np.asarray(plant.rim)
+    pumps = dataclasses.replace(actuator, lag=np.full(len(reach), 2.5 * case.clock.dt), delay=3 * case.clock.dt)
+    gauges = dataclasses.replace(
+        sensor, noise=0.01 * rim, offset=0.02 * rim * (-1.0) ** np.arange(len(rim)), gain=rim / 5.0, bits=12, full_scale=5.0
+    )
+    return case.replace(loop=dataclasses.replace(case.loop, actuator=pumps, sensor=gauges))
+
+
+@pytest.mark.parametrize("change", [lambda case: case, pumps_and_sensors], ids=["own", "lag-delay-noise-offset-adc"])
+@pytest.mark.parametrize("name", EPISODES)
+def test_an_episode_is_the_run_of_the_rig(name, change):
+    """Levels, readings, inputs and what is lost over the rims, with the controller's inputs as actions and the seed of the run."""
+    gymnasium = pytest.importorskip("gymnasium")
+    from jaxtank.environment import TankEnv
+
+    case = change(rig.set_values(presets.find(name), EPISODES[name]))
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(5)))
+    low, high = np.asarray(case.loop.actuator.low), np.asarray(case.loop.actuator.high)
+    env = gymnasium.wrappers.OrderEnforcing(TankEnv(case))
+    seen, info = env.reset(seed=5)
+    rows, k, ended = [(seen[: run.x.shape[1]] * np.max(case.loop.plant.rim), info)], 0, False
+    while not ended:
+        seen, _, broken, ended, info = env.step(2 * (run.applied[k] - low) / (high - low) - 1)
+        rows.append((seen[: run.x.shape[1]] * np.max(case.loop.plant.rim), info))
+        assert not broken
+        k += 1
+    assert len(rows) == case.clock.samples
+    size = float(np.max(np.asarray(case.loop.plant.rim)))
+    found = {field: np.array([info[field] for _, info in rows]) for field in ("t", "x", "y", "u", "e", "spilled")}
+    np.testing.assert_allclose(found["x"], run.x, atol=1e-10 * size)
+    np.testing.assert_allclose(found["e"], run.e, atol=1e-10 * size)
+    np.testing.assert_allclose(found["t"], run.t)
+    np.testing.assert_allclose(found["y"], run.y, atol=1e-10 * size)
+    np.testing.assert_allclose([y for y, _ in rows], run.y, atol=1e-10 * size)
+    np.testing.assert_allclose(found["u"][1:], run.u[:-1], atol=1e-10 * float(np.max(np.abs(high))))
+    np.testing.assert_allclose(found["spilled"], run.spilled, atol=1e-8 * max(1.0, run.spilled.max()))
+    if name == "cascaded/pi":
+        assert run.spilled.max() > 0.0
+    if change is pumps_and_sensors:
+        assert np.abs(run.y - run.x).max() > 0.01 * size
 
 
 def test_noise_of_the_environment_follows_its_seed():

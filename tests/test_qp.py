@@ -5,6 +5,8 @@ Slopes: a step of 1e-6 leaves 1e-10 of truncation and 1e-9 of round-off; the com
 """
 
 import itertools
+import subprocess
+import sys
 
 import jax
 import jax.flatten_util
@@ -240,3 +242,90 @@ def test_slopes_on_a_corner_are_those_that_differences_see():
         differences = (jax.vmap(answer)(points + e) - jax.vmap(answer)(points - e)) / (2 * h)
         np.testing.assert_allclose(slopes[:, :, i], differences, atol=2e-4)
     assert np.ptp(slopes[:, 1, 1]) > 0.8  # from bound to free
+
+
+def test_a_large_programme_meets_its_optimality_conditions():
+    """Stationary with multipliers of the right sign on the rows that bind: enough for a convex one."""
+    H, f, G, l, u = problem(60, 100, 7, tight=2.0)
+    x = np.asarray(solve(H, f, G, l, u))
+    up, low = u - G @ x, G @ x - l
+    assert min(up.min(), low.min()) > -1e-8
+    binding = np.flatnonzero(np.minimum(up, low) < 1e-6)
+    sides = np.where(up[binding] < low[binding], 1.0, -1.0)[:, None] * G[binding]
+    slope = H @ x + f
+    multipliers = np.linalg.lstsq(sides.T, -slope, rcond=None)[0]
+    assert 5 <= len(binding) < 60 and multipliers.min() > 0.0
+    np.testing.assert_allclose(sides.T @ multipliers, -slope, atol=1e-6 * np.abs(slope).max())
+
+
+def along(n=48):
+    """A function of t, by which all data of a programme of n variables move."""
+    data, there = problem(n, n + 12, 3, tight=2.0), problem(n, n + 12, 4, tight=2.0)
+    weight = np.linspace(-1.0, 1.0, n)
+
+    def value(t):
+        x = qp.solve(*(a + 0.1 * t * b for a, b in zip(data, there)))
+        return weight @ x + 0.5 * x @ x
+
+    return value
+
+
+def test_derivatives_of_a_large_programme_against_differences():
+    value, h = along(), 1e-5
+    run = jax.jit(value)
+    central = (run(h) - run(-h)) / (2 * h)
+    forward = jax.jit(jax.jacfwd(value))(0.0)
+    assert float(forward) == pytest.approx(float(central), rel=2e-5)
+    assert float(jax.jit(jax.grad(value))(0.0)) == pytest.approx(float(forward), rel=1e-9)
+
+
+@pytest.mark.parametrize("outer, inner", [(jax.jacfwd, jax.jacfwd), (jax.jacfwd, jax.grad), (jax.grad, jax.grad)])
+def test_second_derivatives_of_a_large_programme_against_differences(outer, inner):
+    value, h = along(), 1e-5
+    first = jax.jit(jax.jacfwd(value))
+    central = (first(h) - first(-h)) / (2 * h)
+    assert float(jax.jit(outer(inner(value)))(0.0)) == pytest.approx(float(central), rel=1e-4)
+
+
+@pytest.mark.parametrize("n", [48, 100])
+@pytest.mark.parametrize("way", [lambda f: f, jax.jacfwd, jax.jacrev], ids=["run", "forward", "reverse"])
+def test_no_programme_calls_lapack(n, way):
+    """A batched call of it, in jaxlib 0.10, waits for ever where as many are under way as there are threads."""
+    H, _, G, l, u = problem(n, n + 10, 1)
+    batch = jax.jit(jax.vmap(way(lambda f: qp.solve(H, f, G, l, u))))
+    assert "lapack" not in batch.lower(np.ones((16, n))).as_text()
+
+
+BATCHES = """
+import os
+os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+import jax, numpy as np
+import jaxtank
+from jaxtank import qp
+jax.config.update("jax_enable_x64", True)
+n = 48
+root, limit = np.random.default_rng(0).normal(size=(n, n)), np.full(n, 0.5)
+H = root @ root.T / n + 0.1 * np.eye(n)
+run = jax.pmap(jax.vmap(lambda f: qp.solve(H, f, np.eye(n), -limit, limit)))
+f = np.random.default_rng(1).normal(size=(2, 8, n))
+print(all(np.isfinite(run(k / 100 * f)).all() for k in range(1, 201)))
+"""
+
+
+def test_200_batches_on_two_devices_return():
+    """The time limit is there to end a run that would never end: it takes 15 s."""
+    done = subprocess.run([sys.executable, "-c", BATCHES], capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0 and done.stdout.strip() == "True", done.stderr[-2000:]
+
+
+def test_the_loop_of_a_large_programme_is_one_compiled_function():
+    """LAPACK in it, or any other call, would keep XLA from that; in front of the loop, where the rig is
+    discretised, there is some."""
+    from jaxtank import loop, presets, rig
+    from tuning.bench import is_one_function
+
+    case = presets.find("khalid/gpc-nc30-constrained")
+    changes = {"controller.Nc": 44, "controller.Np": 50, "clock.duration": 80 * case.clock.dt}
+    case = rig.set_values(case, changes)
+    program = loop._evaluate.lower(case.loop, case.clock, ("rms_error_total",), None, False)
+    assert is_one_function(program.compile().as_text(), case.clock.samples)

@@ -71,6 +71,9 @@ changes = [[20.0, 1, 4.0], [20.0, 2, 3.5]]
 ramp = 30.0
 """
 
+GPC = {"kind": "gpc", "operating_point": [4.0, 3.0, 2.0, 2.0], "q": 1.0, "du_limit": 1.0}
+GPC |= {"u_low": 0.0, "u_high": 10.0}
+
 
 def table(text=FOUR, **changes):
     return {**tomllib.loads(text), **changes}
@@ -153,6 +156,14 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"law": {"kind": "pid", "Kc": 1.0}}, "needs Ti \\[s\\]"),
         ({"law": {"kind": "pid", "Kc": 1.0, "Ti": 1.0, "K": 2.0}}, "unknown key of \\[law\\] 'K'"),
         ({"law": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "law.Kc = 'much'"),
+        (
+            {"law": {**GPC, "r_w": [0.1, 0.2]}},
+            r"controller.r_w = \[0.1, 0.2\]: must be one number, the weight of the increments of all inputs",
+        ),
+        (
+            {"law": {"kind": "sliding-mode", "surface": 0.1, "ks": [0.1, 0.2], "phi": 0.1}},
+            r"law.ks = \[0.1, 0.2\]: must be one number",
+        ),
         ({"law": {"kind": "pid", "Kc": -1.0, "Ti": 1.0}}, "controller.Kc\\[0\\] = -1"),
         ({"plant": {"outputs": [1]}}, "list of 1"),
         ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),

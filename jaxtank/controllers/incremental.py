@@ -161,5 +161,9 @@ class LinearPredictive(Controller):
         for name, size in (("du_limit", m), ("u_low", m), ("u_high", m), ("q", len(self.model.outputs))):
             if np.shape(getattr(self, name)) != (size,):
                 raise InputError(f"controller.{name} has shape {np.shape(getattr(self, name))}: must be ({size},)")
+        if np.ndim(self.r_w) != 0:
+            raise InputError(
+                f"controller.r_w = {np.asarray(self.r_w).tolist()}: must be one number, the weight of the increments of all inputs"
+            )
         if not np.all(np.asarray(self.u_low) < np.asarray(self.u_high)):
             raise InputError(f"controller.u_low = {self.u_low}: must be below controller.u_high = {self.u_high}")

@@ -86,7 +86,10 @@ def component(kind, table, known, plant, offered):
 
 def _value(name, value, field, plant):
     if field.metadata.get("kind") == "leaf":
-        return _shaped(name, value, field.metadata, plant)
+        array = _shaped(name, value, field.metadata, plant)
+        if field.type is float and array.ndim:
+            raise InputError(f"{name} = {_short(value)}: must be one number")
+        return array
     if field.type is tuple:  # tanks, counted from 1 in a file
         if not (isinstance(value, list) and all(isinstance(i, int) and not isinstance(i, bool) for i in value)):
             raise InputError(f"{name} = {_short(value)}: must be a list of tanks, counted from 1")
