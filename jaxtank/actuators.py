@@ -30,7 +30,7 @@ class PumpBank:
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
        best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
     2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset": the flow grows from zero at the dead
-       zone, as that of u - dead_zone (gouta2022, spec 1.2). "hysteresis": a pump that turns stops
+       zone, as that of u - dead_zone (gouta2022 notes S2.3). "hysteresis": a pump that turns stops
        below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
        volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
     3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. What the plant is given over a sample is the
@@ -135,7 +135,7 @@ def allocate(command, metric, low, high):
     """The voltages in the box that are best by the law's cost: argmin over w in [low, high]^2 of (w - u)' G (w - u).
 
     command: u (2) [V]; metric: (g11, g12, g22), G positive definite; low, high: (2,) [V]. For the predictive law of gouta2015
-    G = b'b makes this the exact constrained minimiser of its cost (eq. 21; spec 5.4). Solved by trying the four faces of the
+    G = b'b makes this the exact constrained minimiser of its cost (eq. 21; gouta2015 notes S4.5). Solved by trying the four faces of the
     box and keeping the cheapest; a command inside the box is kept. Raises ValueError for other than two pumps.
     """
     if len(command) != 2:

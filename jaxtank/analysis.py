@@ -78,7 +78,7 @@ def steady_levels(plant, u):
 
 
 def equilibrium(plant, y):
-    """Steady levels and voltages for outputs y: x' = 0 with h_outputs = y (gouta2015: spec 2.1).
+    """Steady levels and voltages for outputs y: x' = 0 with h_outputs = y (gouta2015 notes S2.3).
 
     plant: TankNetwork; y: (outputs,) levels [cm]. Returns (levels (n) [cm], voltages (m) [V]) as host arrays.
     Raises EquilibriumError, naming the tank or the pump, where a steady state would need a negative flow.

@@ -95,7 +95,7 @@ def _excess(run, command):
 
 
 def _saturation_excess(run, sample):
-    # x/(1+x) of x = excess / span: spec 10 of gouta2015; bounded, so that one wild sample does not rule a cost
+    # x/(1+x) of x = excess / span: gouta2015 notes S10; bounded, so that one wild sample does not rule a cost
     span = tuple(high - low for low, high in zip(run.low, run.high))
     return tuple(x / (s + x) for x, s in zip(_excess(run, sample.command), span))
 

@@ -47,7 +47,7 @@ def signed_root(x, knee=ROOT_KNEE):
 
     x: (...) [cm]; returns (...) [cm^0.5].
 
-        s(x) = x / (x^2 + knee^2)^(1/4)          (gouta2022, spec 8)
+        s(x) = x / (x^2 + knee^2)^(1/4)          (gouta2022 notes S2.1)
 
     Odd; slope knee^-1/2 at 0, where sign(x) sqrt(|x|) has none (a NaN gradient at equal levels). Below the exact root in size, by at
     most 0.255 sqrt(knee) (at 0.28 knee) and by 0.25 % of it at 10 knee: a pipe between nearly equal levels flows laminar.

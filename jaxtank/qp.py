@@ -4,7 +4,7 @@
 
 Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl the slacks of the two sides), which
 ends when it has arrived. Its derivatives are those of the optimality conditions: the implicit function theorem at the solution, in forward
-and in reverse mode, under vmap and of any order, without a tape of the iterations (khalid spec C.3). A run that is not differentiated does
+and in reverse mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A run that is not differentiated does
 not pay for them.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 MU_MIN = 1e-12
 """Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a closed loop by percents, 1e-13 loses
-digits in the normal matrix (khalid spec C.3)."""
+digits in the normal matrix (khalid notes S4.5)."""
 
 OFF = 1e-4
 """How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not their mean: the derivatives are those of
@@ -27,7 +27,7 @@ NEAR = 100.0  # largest complementarity, in MU_MIN, from which on plain Newton s
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
 MOST = 40
 """Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to 20 (8 leave 3e-7 of the answer in easy
-ones, khalid spec C.1; 15 left a pump at 0.003 V that belonged at 0)."""
+ones, khalid notes S4.5; 15 left a pump at 0.003 V that belonged at 0)."""
 
 CORRECTIONS = 4  # of a derivative
 UNROLLED = 40  # variables up to which the elimination is written out

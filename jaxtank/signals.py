@@ -212,7 +212,7 @@ class Sum(Signal):
 
 @component
 class Pours(Signal):
-    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; spec 2). An inflow per tank [cm^3/s].
+    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; gouta2022 notes S3.2). An inflow per tank [cm^3/s].
 
     What a sample is given is the mean over that sample, so that the whole volume arrives whatever the sampling period.
     """

@@ -172,7 +172,7 @@ def test_what_it_refuses(climb, arguments, words):
         bound(climb, **arguments)
 
 
-FOUR_TANK = [  # plant, ramp [s], total RMS error [cm] (spec 10)
+FOUR_TANK = [  # plant, ramp [s], total RMS error [cm] (gouta2015 notes S10)
     ("", 60, 0.0307),
     ("", 0, 0.462),
     ("", 100, 0.012),
@@ -187,14 +187,14 @@ FOUR_TANK = [  # plant, ramp [s], total RMS error [cm] (spec 10)
 @pytest.mark.slow
 @pytest.mark.parametrize("plant, ramp, best", FOUR_TANK)
 def test_bounds_of_the_four_tank(gouta, plant, ramp, best):
-    """Levels held to 1e-3 cm, against an independent search whose limit was soft (spec 10): 2 %, or half a unit of the last digit."""
+    """Levels held to 1e-3 cm, against an independent search whose limit was soft (gouta2015 notes S10): 2 %, or half a unit of the last digit."""
     found = bound(gouta(f"backstepping{plant}", {"reference.ramp": float(ramp)}))
     assert found.holds and max(c["value"] for c in found.constraints) <= 30.001
     digit = 0.5 * 10.0 ** -len(str(best).split(".")[1])
     assert found.cost <= best + max(0.02 * best, digit)
 
 
-MIRAKHORLI = [  # upper limit, start, J*, least ISE: multiple shooting with 1 s intervals, trapezoids (spec 10)
+MIRAKHORLI = [  # upper limit, start, J*, least ISE: multiple shooting with 1 s intervals, trapezoids (mirakhorli notes S10)
     (5.0, "", 4512.7, 3898.2),
     (6.0, "", 4179.5, 3203.3),
     (4.0, "", 5450.9, 5174.0),

@@ -1,4 +1,4 @@
-"""calofir: two coupled tanks in metres against the specification's part A, the matrix exponential and another form of the law."""
+"""calofir: two coupled tanks in metres against notes/calofir.md, the matrix exponential and another form of the law."""
 
 import dataclasses
 
@@ -49,7 +49,7 @@ def open_loop(loop):
 @pytest.mark.parametrize("h1, h3, z3, u", [(0.48, 0.1237217, 0.5968905, 0.6068586), (0.30, 0.0773260, 0.4718834, 0.4797638),
                                            (0.60, 0.1546521, 0.6673439, 0.6784886)])  # fmt: skip
 def test_equilibria(h1, h3, z3, u):
-    """Spec A.2, by the law's own plan and by the balance of the network."""
+    """Notes S2.2, by the law's own plan and by the balance of the network."""
     law = CASES["backstepping"].loop.controller
     h3r, flow = law.prepare((jnp.array([h1]),), None, None)
     np.testing.assert_allclose([h3r[0], np.sqrt(h1 - h3r[0]), flow[0] / 1e-4], [h3, z3, u], atol=5.1e-8)
@@ -68,7 +68,7 @@ LEVELS = st.tuples(st.floats(0.01, 0.6), st.floats(0.02, 0.95), st.floats(0.05, 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(LEVELS)
 def test_the_law_is_a_feedback_linearisation_and_the_papers_form(point):
-    """Spec A.4: with sigma, pi; and eqs. (16)-(21) as mended in A.3, with z0 and Q0. Both to round-off of the largest term."""
+    """Notes S4.2: with sigma, pi; and eqs. (16)-(21) as mended in notes S4.1, with z0 and Q0. Both to round-off of the largest term."""
     h1, share, r, K_phi, K_y = point
     h3 = share * h1
     law = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
@@ -93,7 +93,7 @@ def test_the_law_is_a_feedback_linearisation_and_the_papers_form(point):
 
 @pytest.mark.parametrize("K_phi, K_y", [(0.02, 0.1), (0.02, 0.02), (0.05, 0.4)])
 def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
-    """e' = -K_phi e + a Y, Y' = -a e - K_y Y (spec A.3), the plant integrated by scipy at 1e-13 with a knee of 1e-12 m."""
+    """e' = -K_phi e + a Y, Y' = -a e - K_y Y (notes S4.1), the plant integrated by scipy at 1e-13 with a knee of 1e-12 m."""
     plant = rig.set_values(CASES["backstepping"], {"plant.knee": 1e-12}).loop.plant
     law = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
     r, h3r = 0.30, calofir.KAPPA * 0.30
@@ -109,7 +109,7 @@ def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
         np.testing.assert_allclose(errors(x), expm(matrix * t) @ errors(found.y[:, 0]), atol=1e-12)
 
 
-TABLE = [  # spec A.6: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, saturated, TV
+TABLE = [  # notes S7.1: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, saturated, TV
     ("backstepping", (0.01, 0.01), 0.11096, 1.22, 1.08, 271, 286, 5.725e-5, 0.0, 1.03e-4),
     ("backstepping", (0.02, 0.02), 0.08147, 0.12, 0.03, 179, 185, 5.898e-5, 0.0592, 1.775e-4),
     ("backstepping", (0.02, 0.1), 0.07718, 0.0, 0.0, 139, 146, 5.953e-5, 0.1250, 1.480e-4),
@@ -122,7 +122,7 @@ TABLE = [  # spec A.6: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, saturate
 
 @pytest.mark.parametrize("name, K, rmse, over, under, up, down, rms_q, saturated, travel", TABLE)
 def test_acceptance_table(name, K, rmse, over, under, up, down, rms_q, saturated, travel):
-    """Tolerances of spec A.6: RMSE 1e-4 m, overshoots 0.1 points, times 2 s, saturation 0.003; RMS and travel of the flow, for which
+    """Tolerances of notes S7.1: RMSE 1e-4 m, overshoots 0.1 points, times 2 s, saturation 0.003; RMS and travel of the flow, for which
     it states none, to half a unit of the last digit printed (1.03e-4 has three digits, the others four)."""
     case, t = run(name, gains(*K))
     e, u = t.e[:, 0], t.u[:, 0]
@@ -165,7 +165,7 @@ FAULTS = {
     "c1*0.75": ("plant.pipe[0]", 0.75),
     "leak": None,
 }
-OFFSETS = [  # spec A.7: fault, h1r, offset at (.01,.01), (.02,.02), (.02,.1), (.05,.05), (.1,.1), with u_s alone
+OFFSETS = [  # notes S7.2: fault, h1r, offset at (.01,.01), (.02,.02), (.02,.1), (.05,.05), (.1,.1), with u_s alone
     ("c2*0.75", 0.48, (-0.331, -0.012, -0.001, -0.065, -0.107, 0.096)),
     ("c2*0.75", 0.30, (-0.300, -0.015, 0.025, -0.028, -0.059, 0.060)),
     ("c2*1.25", 0.48, (0.120, 0.027, -0.010, 0.055, 0.111, -0.045)),
@@ -177,7 +177,7 @@ OFFSET_GAINS = [(0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.05, 0.05), (0.1, 0.1
 
 @pytest.mark.parametrize("fault, r, offsets", OFFSETS)
 def test_permanent_faults(fault, r, offsets):
-    """h1 - h1r after 6000 s (spec A.7), to half a unit of the last digit; the constant flow without a rim, as the spec has it."""
+    """h1 - h1r after 6000 s (notes S7.2), to half a unit of the last digit; the constant flow without a rim, as the prototype has it."""
     case = rig.set_values(CASES["backstepping"], {"clock.duration": 6000.0})
     plant = case.loop.plant
     values = {"plant.drain[0]": 0.2 * plant.pipe[0]} if FAULTS[fault] is None else {}
@@ -195,9 +195,10 @@ def test_permanent_faults(fault, r, offsets):
 @pytest.mark.parametrize("K, printed, rest, near", [((0.02, 0.1), -0.003, -0.0024795, [0.478, 0.08]),
                                                     ((0.05, 0.05), 0.082, 0.0814987, [0.56, 0.09])])  # fmt: skip
 def test_offsets_of_a_narrowed_pipe(K, printed, rest, near):
-    """The two numbers of A.7 whose last digit is not ours: the balance at rest (scipy, exact roots, the law as in A.4) gives others.
+    """The two numbers of notes S7.2 where the prototype's last digit is not ours: the balance at rest (scipy, exact roots, the law as in
+    notes S4.2) gives others.
 
-    They round to -0.002 and 0.081. The spec's own smoothed plant, at 1e-4 m and 1e-6 m, rests within 1e-7 m of the same.
+    They round to -0.002 and 0.081. The prototype's own smoothed plant, at 1e-4 m and 1e-6 m, rests within 1e-7 m of the same.
     """
     h3r = calofir.KAPPA * 0.48
 
@@ -214,9 +215,9 @@ def test_offsets_of_a_narrowed_pipe(K, printed, rest, near):
 
 
 def test_slopes_of_the_mean_square_error():
-    """Spec A.8, RMSE^2 by the logarithms of the gains.
+    """Notes S10, RMSE^2 by the logarithms of the gains.
 
-    The spec smooths both roots over 1e-4 m; our outlet's is exact above it. Measured: with both smoothed the slopes are 4.2e-6 and
+    The prototype smooths both roots over 1e-4 m; our outlet's is exact above it. Measured: with both smoothed the slopes are 4.2e-6 and
     4.5e-6 (relative) from ours; ours are within 1e-6 of the digits printed.
     """
     case = CASES["backstepping"]
@@ -225,13 +226,13 @@ def test_slopes_of_the_mean_square_error():
 
 
 def test_the_landscape_is_symmetric():
-    """Spec A.8: J(K_phi, K_y) = J(K_y, K_phi) over a grid of gains, and it is not flat."""
+    """Notes S10: J(K_phi, K_y) = J(K_y, K_phi) over a grid of gains, and it is not flat."""
     case = CASES["backstepping"]
     grid = jnp.logspace(-2, 0, 5)
     f = lambda K_phi, K_y: jaxtank.evaluate(with_values(case.loop, gains(K_phi, K_y)), case.clock, "rms_error")["rms_error"][0]
     found = np.asarray(jax.jit(jax.vmap(jax.vmap(f, (None, 0)), (0, None)))(grid, grid))
     np.testing.assert_allclose(found, found.T, atol=1e-10)
-    assert np.ptp(found) > 0.02 and found.min() > 0.07705  # the spec's bound of every gain (A.6)
+    assert np.ptp(found) > 0.02 and found.min() > 0.07705  # the prototype's bound of every gain (notes S7.1)
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -253,7 +254,7 @@ def test_exchanging_the_gains_changes_nothing():
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(st.floats(0.0, 0.6), st.floats(0.0, 1.0), st.lists(st.floats(0.0, 1e-4), min_size=5, max_size=5), st.floats(0.0, 1.0))
 def test_the_first_tank_is_never_below_the_second(h1, share, flows, leak):
-    """Spec A.2, by trial: five flows of 10 s each and a leak up to c2; h1 - h3 above -1e-6 m after every step of 0.25 s."""
+    """Notes S2.2, by trial: five flows of 10 s each and a leak up to c2; h1 - h3 above -1e-6 m after every step of 0.25 s."""
     plant = with_values(calofir.rig(), {"drain[0]": leak * calofir.C2 / calofir.SPEED})
     x = (jnp.float64(h1), jnp.float64(h1 * share))
     for q in flows:
@@ -266,7 +267,7 @@ INTEGRATE = jax.jit(lambda plant, x, q: integrate(plant, "rk4", 0.0, x, (q,), No
 
 
 def test_empty_tanks_fill_with_floors_and_never_without():
-    """Spec A.10: RMS error 0.0890 m and 147 s with the floors; without the one under h1 - h3 no flow at all, 0.400 m."""
+    """Notes H1: RMS error 0.0890 m and 147 s with the floors; without the one under h1 - h3 no flow at all, 0.400 m."""
     _, t = run("backstepping", {"x0": [0.0, 0.0]})
     assert abs(np.sqrt(np.mean(t.e**2)) - 0.0890) <= 1e-4
     assert abs(np.nonzero(np.abs(t.e[:600, 0]) > 0.02 * 0.48)[0][-1] + 1 - 147) <= 2
@@ -293,7 +294,7 @@ def test_the_loop_compiles_to_one_function(name):
 
 
 def test_the_rig_in_centimetres():
-    """The plant is the same; the law is too where its a^2, which carries a length, is taken out of K_phi K_y (spec A.4)."""
+    """The plant is the same; the law is too where its a^2, which carries a length, is taken out of K_phi K_y (notes S4.2)."""
     case = CASES["backstepping"]
     m = case.loop.plant
     cm = dataclasses.replace(m, area=m.area * 1e4, drain=m.drain * 1e4, pipe=m.pipe * 1e4, gravity=m.gravity * 100, rim=m.rim * 100,
@@ -342,11 +343,11 @@ def test_what_is_measured():
         if wanted.tolerance is not None:
             np.testing.assert_allclose(found[name], wanted.value, rtol=wanted.tolerance)
     assert [v[0] for v in found.values() if hasattr(v, "verdict")] == [*["reproduced"] * 3, "partly", "not reproduced"]
-    assert "-0.0395 and -0.0490 m" in found["some steady state errors"].text  # the constant flow of spec A.6, measured
+    assert "-0.0395 and -0.0490 m" in found["some steady state errors"].text  # the constant flow of notes S7.1, measured
 
 
 @pytest.mark.parametrize("always, instead, changed", [
-    (gains(0.1, 0.1), None, {"reacts": "not reproduced"}),  # spec A.7: the offset by a closed outlet grows to -0.107 m
+    (gains(0.1, 0.1), None, {"reacts": "not reproduced"}),  # notes S7.2: the offset by a closed outlet grows to -0.107 m
     (gains(0.004, 0.004), None, {"steady state": "not reproduced", "reacts": "not reproduced", "same performance": "reproduced"}),
     ({"controller.model.drain": [0.0, 0.9 * calofir.C2 / calofir.SPEED]}, None,
      {"steady state": "not reproduced", "same performance": "not reproduced"}),

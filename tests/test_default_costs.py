@@ -10,9 +10,9 @@ from tuning.objective import Problem
 QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")  # the others compile for long
 ROUGH = {
     # why the slope is only good to this share of the largest one
-    "mirakhorli/smc-printed": (np.inf, "the law switches at every sample: its cost is a staircase in the gains (spec 4.2)"),
-    "khalid/*-constrained": (1e-3, "rows of the programme come and go, and its interior point stops at 1e-6 (spec C.2)"),
-    "gouta2015/*-table1": (1e-3, "saturated for 98 % of the run (spec 9.1)"),
+    "mirakhorli/smc-printed": (np.inf, "the law switches at every sample: a staircase in the gains (mirakhorli notes S4.2)"),
+    "khalid/*-constrained": (1e-3, "rows of the programme come and go, and its interior point stops at 1e-6 (khalid notes S4.5)"),
+    "gouta2015/*-table1": (1e-3, "saturated for 98 % of the run (gouta2015 notes S9.1)"),
 }
 SHORT = {"clock.duration": 200.0}  # of 900 and 1200 s: saturated starts, both setpoints, the first pours left to their own tests
 

@@ -302,7 +302,7 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
 
 
 def test_plateaus_without_a_steady_state_are_counted(gouta):
-    """Spec 11: c1 0.9 % above its value alone makes (16, 10) cm need more than 30 cm."""
+    """gouta2015 notes S11: c1 0.9 % above its value alone makes (16, 10) cm need more than 30 cm."""
     case = gouta("ngpc", {"clock.dt": 0.5})
     found = tuning.ensemble(
         case, {"plant.drain": tuning.Discrete(values=(0.180956 * 1.008, 0.180956 * 1.010), tied=True)}, samples=32, fan=False

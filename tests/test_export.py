@@ -110,7 +110,7 @@ def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, mo
     np.testing.assert_allclose(told, run.applied, atol=1e-9 * float(np.abs(run.applied).max()), rtol=0)
 
 
-TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # spec 7 of gouta2022
+TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # gouta2022 notes S10
 
 
 @needs_gcc

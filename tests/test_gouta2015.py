@@ -257,7 +257,7 @@ def test_unit_vectors_of_the_box_qp(kind, which):
 
 
 def test_latch_up_is_removed_by_the_box_qp():
-    """Both outputs too high: clipping still runs pump 2 at 12 V, the constrained minimiser stops both (plant A, spec 5.4)."""
+    """Both outputs too high: clipping still runs pump 2 at 12 V, the constrained minimiser stops both (plant A, notes S4.5)."""
     controller, u = command("ngpc", PRINTED_AREA, SECOND)
     metric = controller.input_metric(Estimate(x=tuple(map(float, SECOND[0]))))
     np.testing.assert_array_equal(np.clip(u, 0, 12), (0, 12))
@@ -312,7 +312,7 @@ def test_error_of_ngpc_follows_its_second_order_equation(gouta):
 
 
 def plateau_error(kind, nominal, true, r):
-    """The steady error under mismatch, by the fixed point of spec 7.4.4 (c of the law, c' of the plant)."""
+    """The steady error under mismatch, by the fixed point of notes S7.4 (c of the law, c' of the plant)."""
     c, p = (np.array([float(v) for v in coefficients(m)]) for m in (nominal, true))
     b = np.array([[c[1], c[2]], [c[4], c[5]]])
     b_true = np.array([[p[1], p[2]], [p[4], p[5]]])
@@ -356,7 +356,7 @@ def test_plateau_error_under_mismatch(gouta, kind, change, expected):
 
 
 def test_lyapunov_function_of_backstepping_never_grows(gouta):
-    """W = F + |Z2|^2/2 of spec 5.1, along an unsaturated run with constant setpoint."""
+    """W = F + |Z2|^2/2 of notes S4.3, along an unsaturated run with constant setpoint."""
     case = gouta("backstepping")
     c, k1, r = coefficients(case.loop.plant), 0.088, np.array([8.0, 8.0])
     x0, _ = equilibrium(case.loop.plant, r)
@@ -425,7 +425,7 @@ def test_hysteresis_and_lag_stall_channel_1():
 
 
 def test_sampling_period_changes_little():
-    """Spec 2.2: dt = 0.05 changes the RMS by at most 0.2 %, 0.1 by 0.4 %, 0.2 by 0.7 %."""
+    """Notes S2.4: dt = 0.05 changes the RMS by at most 0.2 %, 0.1 by 0.4 %, 0.2 by 0.7 %."""
     fine = measured("ngpc")["rms_error_total"]
     for dt, share in ((0.05, 2e-3), (0.1, 4e-3), (0.2, 7e-3)):
         np.testing.assert_allclose(measured("ngpc", clock__dt=dt)["rms_error_total"], fine, rtol=share)

@@ -1,4 +1,4 @@
-"""gouta2022: spec 5.1 and 6, the structure of CHADPC, and gradients of every case."""
+"""gouta2022: notes S7.1 to S7.3, the structure of CHADPC, and gradients of every case."""
 
 import dataclasses
 import functools
@@ -44,7 +44,7 @@ def constant_inflow(loop):
     return dataclasses.replace(loop, plant=plant, disturbance=Sum(first=loop.disturbance, second=loss))
 
 
-# Spec 5.1: RMS u, RMS e, ts, tr, mean d^. Tolerances as stated there: e 1e-3 cm, u 0.01 V, times 0.03 s.
+# Notes S7.1: RMS u, RMS e, ts, tr, mean d^. Tolerances as stated there: e 1e-3 cm, u 0.01 V, times 0.03 s.
 ROWS = {
     "V0 E": ("enmpc", {**PRINTED, **NO_DEAD_ZONE}, None, (11.93315, 12.0), (9.280399, 8.546027), None, None, (-0.0001, 0.0001)),
     "d=0 E": ("enmpc", NO_DEAD_ZONE, None, (4.00985, 3.55466), (0.254478, 0.456462), (2.52, 7.45), (1.75, 2.56), (0, 0)),
@@ -83,7 +83,7 @@ def test_acceptance_table(name):
 
 @pytest.mark.parametrize(("name", "u", "e"), [("enmpc", (7.01, 7.72), (0.298, 0.671)), ("chadpc", (7.21, 7.54), (0.309, 0.673))])
 def test_limit_cycles_of_a_short_delay(name, u, e):
-    """Bounded, within the 2 % of spec 5.1."""
+    """Bounded, within the 2 % of notes S7.2."""
     found = paper.figures(run(name, {"actuator.delay": 0.2}))
     np.testing.assert_allclose(found["voltage"], u, rtol=0.02)
     np.testing.assert_allclose(found["error"], e, rtol=0.02)
@@ -108,7 +108,7 @@ def test_spot_levels():
     ],
 )
 def test_steady_offsets_of_the_four_compensations(values, offset):
-    """E: d/k; S: 0; A: -d/k; C: d/(2k) (spec 3.3)."""
+    """E: d/k; S: 0; A: -d/k; C: d/(2k) (notes S4.3)."""
     r = run("chadpc", values)
     np.testing.assert_allclose(r.e[paper.quiet(r.t)].mean(axis=0), offset, atol=2e-4)
 
@@ -123,14 +123,14 @@ def test_steady_offsets_of_the_four_compensations(values, offset):
     ],
 )
 def test_offsets_of_a_plant_that_is_not_the_model(values, offset):
-    """|mean e| of E to the digits printed, and none of S (spec 5.1, last line)."""
+    """|mean e| of E to the digits printed, and none of S (notes S7.1)."""
     e, s = (run(name, {**NO_DEAD_ZONE, **values}) for name in ("enmpc", "chadpc"))
     np.testing.assert_allclose(np.abs(e.e[paper.quiet(e.t)].mean(axis=0)), offset, atol=6e-5)
     np.testing.assert_allclose(s.e[paper.quiet(s.t)].mean(axis=0), 0.0, atol=1e-5)
 
 
 def test_steady_voltages():
-    """Spec 1.1, V1: and (14, 8) cm has no steady state."""
+    """Notes S2.2: and (14, 8) cm has no steady state."""
     for h, u in (((8, 10), (1.185, 4.819)), ((10, 10), (3.169, 3.169)), ((12, 10), (5.121, 1.519)), ((14, 14), (3.749, 3.749))):
         np.testing.assert_allclose(equilibrium(paper.rig(), h)[1], u, atol=5e-4)
         np.testing.assert_allclose(equilibrium(paper.rig(paper.PRINTED_GAIN), h)[1], 10 * np.array(u), atol=5e-3)
@@ -162,13 +162,13 @@ def test_a_pour_arrives_whole_and_lifts_the_tank_by_what_the_paper_reports():
 
 
 def test_trapezoid_with_a_plateau_that_has_no_steady_state():
-    """Tank 2 stands at 14 c12^2/(c1^2 + c12^2) = 8.0556 cm when pump 2 stays off (spec 2)."""
+    """Tank 2 stands at 14 c12^2/(c1^2 + c12^2) = 8.0556 cm when pump 2 stays off (notes S3.3)."""
     r = run("chadpc-trapezoid", NO_DEAD_ZONE)
     np.testing.assert_allclose(r.x[55900], (14.0, 8.0556), atol=2e-4)
 
 
 def test_pump_fault():
-    """Pump 1 at 60 % from 300 to 400 s: mean e1 -0.149 (E) and -0.085 cm (S), mean d^1 -0.82 cm/s (spec 2)."""
+    """Pump 1 at 60 % from 300 to 400 s: mean e1 -0.149 (E) and -0.085 cm (S), mean d^1 -0.82 cm/s (notes S3.4)."""
     from jaxtank.plants.faults import faults
 
     broken = lambda loop: dataclasses.replace(loop, faults=faults(loop.plant, [("pump_gain[0]", 300, 400, 0.6, 0.0)]))
@@ -192,7 +192,7 @@ def held_at(level):
 
 
 def test_chadpc_is_a_pi_on_the_linearised_plant():
-    """d^ = l e + k l dt sum e + const, so c2 u + f = r' - (k + l) e - k l int e (spec 3.4), to 1e-10 while no pump is at its limit."""
+    """d^ = l e + k l dt sum e + const, so c2 u + f = r' - (k + l) e - k l int e (notes S4.4), to 1e-10 while no pump is at its limit."""
     r = run("chadpc", NO_DEAD_ZONE, held_at((12.0, 10.0)), duration=20.0)
     assert np.array_equal(r.command, r.applied)
     k, l, dt = 1.5 / 0.13, 10.0, 0.01
@@ -212,7 +212,7 @@ def paper_drift(x):
 
 
 def test_literal_double_compensation_is_a_single_one_with_twice_the_gain():
-    """To 1e-14 cm, everywhere; the estimate reads half (spec 3.3, which measured 7e-15 cm, and 2e-13 cm/s between 60 and 499 s)."""
+    """To 1e-14 cm, everywhere; the estimate reads half (notes S4.3; the prototype measured 7e-15 cm, and 2e-13 cm/s between 60 and 499 s)."""
     double = {"controller.compensation": "double", "observer.before_compensation": True}
     b, s = run("chadpc", double), run("chadpc", {"observer.l": 20.0})
     np.testing.assert_allclose(b.x, s.x, rtol=0, atol=1e-14)
@@ -221,7 +221,7 @@ def test_literal_double_compensation_is_a_single_one_with_twice_the_gain():
 
 
 def test_k_and_l_are_interchangeable_in_the_loop():
-    """The response to a disturbance is the same with k and l exchanged (spec 3.4), by a run and its mirror."""
+    """The response to a disturbance is the same with k and l exchanged (notes S4.4), by a run and its mirror."""
     one = run("chadpc", {**NO_DEAD_ZONE, "controller.Tp": 1.5, "observer.l": 4.0}, quietly)
     two = run("chadpc", {**NO_DEAD_ZONE, "controller.Tp": 1.5 / 4.0, "observer.l": 1.0}, quietly)
     np.testing.assert_allclose(one.e, two.e, atol=1e-12)
@@ -240,7 +240,7 @@ def quietly(loop):
 
 
 def test_an_observer_fed_the_unlimited_command_winds_up():
-    """Spec 3.3: S overshoots to 15.79 cm in tank 2, B to 15.83 and tank 1 to 12.11 cm."""
+    """Notes S4.2: S overshoots to 15.79 cm in tank 2, B to 15.83 and tank 1 to 12.11 cm."""
     s = run("chadpc", {"observer.fed": "command"}, duration=400.0)
     np.testing.assert_allclose(s.x[:, 1].max(), 15.79, atol=0.02)
     double = {"controller.compensation": "double", "observer.before_compensation": True, "observer.fed": "command"}
@@ -249,7 +249,7 @@ def test_an_observer_fed_the_unlimited_command_winds_up():
 
 
 def test_printed_sign_leaves_its_offset():
-    """Offset 2 f/k, which the observer does not remove (spec 4)."""
+    """Offset 2 f/k, which the observer does not remove (notes E2)."""
     for name in ("enmpc-printed", "chadpc-printed"):
         r = run(name, NO_DEAD_ZONE)
         np.testing.assert_allclose(r.e[paper.quiet(r.t)].mean(axis=0), (-0.095, -0.076), atol=1e-3)
@@ -257,7 +257,7 @@ def test_printed_sign_leaves_its_offset():
 
 @pytest.mark.parametrize(("tau", "limit"), [(0.13, 0.05), (1.3, 0.12)])
 def test_delay_margin(tau, limit):
-    """The largest stable delay of S at l = 10 (spec 5.2): a kick dies out at it and does not two samples later."""
+    """The largest stable delay of S at l = 10 (notes S7.2): a kick dies out at it and does not two samples later."""
     quiet = lambda loop: dataclasses.replace(quietly(loop), x0=np.array([12.0 + 1e-3, 10.0]), disturbance=None)
     for delay, stable in ((limit, True), (limit + 0.02, False)):
         values = {
@@ -271,7 +271,7 @@ def test_delay_margin(tau, limit):
         assert late < 1e-5 if stable else late > 2e-3
 
 
-TABLE6 = {  # spec 6, delay 0.5 s: RMS u, RMS e, ts, tr as printed there
+TABLE6 = {  # notes S7.3, delay 0.5 s: RMS u, RMS e, ts, tr as printed there
     "pi": ((6.508, 7.570), (0.3249, 0.7590), (13.2, 37.8), (2.5, 7.5)),
     "pi-ff": ((6.508, 7.571), (0.3143, 0.7507), (4.7, 37.6), (2.4, 3.0)),
     "pid": ((6.507, 7.570), (0.3239, 0.7609), (14.2, 37.8), (2.3, 2.8)),
@@ -288,7 +288,7 @@ def test_baselines(name):
 
 
 def test_predictive_laws_beside_the_baselines():
-    """Spec 6: limit cycles of the printed gains at 0.5 s (2 %), and S tuned for it."""
+    """Notes S7.3: limit cycles of the printed gains at 0.5 s (2 %), and S tuned for it."""
     for name, u, e in (("enmpc", (7.19, 7.52), (0.364, 0.711)), ("chadpc", (7.30, 7.51), (0.398, 0.721))):
         found = paper.figures(run(name, {"actuator.delay": 0.5}))
         np.testing.assert_allclose(found["voltage"], u, rtol=0.02)
@@ -298,10 +298,10 @@ def test_predictive_laws_beside_the_baselines():
     np.testing.assert_allclose(found["settling"], (4.9, 16.3), atol=0.06)
 
 
-J_OF_NOISE = [  # spec 6: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
+J_OF_NOISE = [  # notes S7.3: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
     ("pi", {}, 0.6830, 1e-3), ("pi-ff", {}, 0.6635, 1e-3), ("pid", {}, 0.8057, 1e-3), ("pid-ff", {}, 0.7861, 1e-3),
     ("fopi", {}, 0.6568, 1e-3), ("chadpc", STEADY, 0.5791, 1e-3),
-    ("enmpc", {}, 0.7417, 0.02), ("chadpc", {}, 0.8128, 0.02),  # limit cycles: the 2 % of spec 5.1
+    ("enmpc", {}, 0.7417, 0.02), ("chadpc", {}, 0.8128, 0.02),  # limit cycles: the 2 % of notes S7.3
 ]  # fmt: skip
 
 
@@ -314,7 +314,7 @@ def test_cost_with_noise(name, values, cost, share):
 
 
 def test_oustaloup_filter():
-    """s^g within 0.007 dB and 1.1 degrees on 0.01 .. 10 rad/s for lambda = 0.8 (spec 6); a fractional PI of order 1 is a PI."""
+    """s^g within 0.007 dB and 1.1 degrees on 0.01 .. 10 rad/s for lambda = 0.8 (notes S4.5); a fractional PI of order 1 is a PI."""
     gain, poles, residues = (np.asarray(v) for v in oustaloup(0.2))
     w = np.geomspace(0.01, 10, 200)
     ratio = (gain + (residues / (1j * w[:, None] + poles)).sum(axis=1)) / (1j * w) ** 0.2
@@ -336,12 +336,12 @@ def test_measures_tell_what_the_figures_tell():
 
 
 def test_gain_of_noise_to_voltage():
-    """(k + l)/c2 for S, k/c2 for E: 139.6 and 74.8 V/cm; measured 0.729 and 0.383 V at 0.005 cm (spec 3.4)."""
+    """(k + l)/c2 for S, k/c2 for E: 139.6 and 74.8 V/cm; measured 0.729 and 0.383 V at 0.005 cm (notes S4.4)."""
     for name, expected in (("enmpc", 0.383), ("chadpc", 0.729)):
         r = run(name, {**NO_DEAD_ZONE, "sensor.noise": 0.005}, quietly, duration=200.0)
         np.testing.assert_allclose(
             r.command[2000:].std(axis=0), expected, rtol=0.03
-        )  # 18,000 samples: 0.5 % and spec's own rounding
+        )  # 18,000 samples: 0.5 % and the rounding of the notes
 
 
 def test_permuted_tanks_give_permuted_answers():
@@ -463,7 +463,7 @@ def test_verdicts_follow_the_numbers():
 
 
 def test_the_rig_that_was_fitted_to_the_paper():
-    """Spec 5.3, means over nine draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9, 34.2 s (E), tolerances as in 5.1 with
+    """Notes S8, means over nine draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9, 34.2 s (E), tolerances as in S7.1 with
     what so many draws leave open. The dead zone comes before the lag: rectified after it, noise costs another 0.4 V."""
     case = rig.set_values(CASES["enmpc"], paper.PAPER_LIKE)
     found = [

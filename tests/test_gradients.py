@@ -60,7 +60,7 @@ def test_published_gains_in_plant_b(gouta, name, names, ramp):
     agree(gouta(name, {"reference.ramp": ramp}), names)
 
 
-REFERENCE_SLOPES = [  # case, D, free, d RMS_tot / d ln p (spec 9.1)
+REFERENCE_SLOPES = [  # case, D, free, d RMS_tot / d ln p (gouta2015 notes S9.1)
     ("ngpc", 30.0, {"controller.Tp": 11.0}, (0.0927,)),
     ("ngpc", 30.0, {"controller.Tp": 7.0}, (-0.1226,)),
     ("ngpc", 30.0, {"controller.Tp": 20.0}, (0.472,)),

@@ -1,4 +1,4 @@
-"""Identification: mirakhorli's spec 9, an independent fit, derivatives, what the data leave open, the chain to a tuned rig."""
+"""Identification: mirakhorli notes S11, an independent fit, derivatives, what the data leave open, the chain to a tuned rig."""
 
 import contextlib
 import csv
@@ -59,7 +59,7 @@ def played(case, t, u, x0, substeps=4, channels=None):
 
 @pytest.fixture(scope="module")
 def clean(case):
-    """Experiment A of spec 9 without noise: both pumps step from empty."""
+    """Experiment A of mirakhorli notes S11 without noise: both pumps step from empty."""
     u = np.tile(VOLTAGE, (301, 1))
     return tuning.log(t=T, u=u, y=played(case, T, u, np.zeros(4)))
 
@@ -79,12 +79,12 @@ def truth(case, names):
     return np.array([float(get_value(case.loop, n)) for n in names])
 
 
-# Spec 9: the table of standard deviations
+# mirakhorli notes S11: the table of standard deviations
 
 
 def experiments(case):
-    """Spec 9's A to E, {letter: (t, u, levels at the start)}: D lifts pump 1 over 0 .. 200 s and pump 2 over 100 .. 300 s; E's bits are those of
-    the generator that made the paper's row, numpy's default_rng(3).choice([-1, 1], (20, 2)). Both were found by trying: the spec says only
+    """A to E, {letter: (t, u, levels at the start)}; A to C as in mirakhorli notes S11. D lifts pump 1 over 0 .. 200 s and pump 2 over 100 ..
+    300 s; E's bits are those of numpy's default_rng(3).choice([-1, 1], (20, 2)). Both were found by trying: the prototype's table has only
     "staggered +-0.5 V" and "PRBS +-0.5 V, 15 s bits"."""
     empty, rest = np.zeros(4), settled(case.loop.plant, VOLTAGE)
     bits = np.random.default_rng(3).choice([-1, 1], (20, 2))[np.minimum(T / 15, 19).astype(int)]
@@ -108,7 +108,7 @@ TABLE = {  # sd of gamma1, gamma2, k1, k2 and condition: all four levels, then h
 
 
 @pytest.mark.parametrize("levels", [None, (0, 1)], ids=["four levels", "h1 and h2"])
-def test_standard_deviations_of_spec_9(case, levels):
+def test_standard_deviations_of_the_notes(case, levels):
     """The printed digits bound how near one can come: 0.00028 is 0.000275 to 0.000285, 2 %."""
     found = compare_experiments(case, WIDE, noise=0.1, duration=300, dt=1.0, levels=levels, inputs=experiments(case))
     for letter, row in TABLE.items():
@@ -118,7 +118,7 @@ def test_standard_deviations_of_spec_9(case, levels):
         assert found[letter]["open"] == []
 
 
-def test_the_candidates_are_those_of_spec_9(case):
+def test_the_candidates_are_those_of_the_notes(case):
     made = candidates(case.loop, duration=300, dt=1.0, voltage=VOLTAGE, size=0.5)
     wanted = experiments(case)
     names = list(made)
@@ -139,11 +139,11 @@ def test_candidates_stay_within_the_pumps(case):
         assert u.min() >= 0 and u.max() <= 5
 
 
-# Spec 9: the fits
+# mirakhorli notes S11: the fits
 
 
 def test_recovery_without_noise(case, away, clean):
-    """Acceptance of spec 9: 1e-9 in at most 12 iterations from (0.5, 0.5, 20, 20)."""
+    """Acceptance of mirakhorli notes S11: 1e-9 in at most 12 iterations from (0.5, 0.5, 20, 20)."""
     found = tuning.identify(away, clean, WIDE, start="case", starts=1, hold_back=0, noise=0.1, substeps=4)
     np.testing.assert_allclose([found.parameters[n]["value"] for n in SPLITS], truth(case, SPLITS), rtol=1e-9)
     assert found.status == "converged" and found.starts[0]["evaluations"] <= 12
@@ -161,7 +161,7 @@ def hundred(case, away, clean):
 
 
 def test_coverage_of_the_intervals(case, hundred):
-    """Of 400 intervals 95 % +- 2.2 % hold the truth (spec: between 0.90 and 0.98); scatter within 15 %, 2 standard errors of that of 100."""
+    """Of 400 intervals 95 % +- 2.2 % hold the truth (asked: 0.90 to 0.98); scatter within 15 %, 2 standard errors of that of 100."""
     true = truth(case, hundred.names)
     inside = (hundred.interval95[..., 0] <= true) & (true <= hundred.interval95[..., 1])
     assert hundred.converged.all() and 0.90 <= inside.mean() <= 0.98
@@ -256,7 +256,8 @@ def resting(case):
 
 
 def test_one_steady_state_of_two_levels_is_refused(resting):
-    """Spec 9: two equations for four unknowns. Along each combination that is named, the steady levels do not move (Bernoulli, by hand)."""
+    """Two equations for four unknowns (mirakhorli notes S11). Along each combination that is named, the steady levels do not move
+    (Bernoulli, by hand)."""
     warm, log = resting
     found = tuning.identify(warm, log, WIDE, starts=1, hold_back=0, noise=0.1)
     assert found.status == "not_identifiable" and len(found.directions) == 2
@@ -516,7 +517,7 @@ def test_what_an_earlier_run_left_goes(tmp_path, resting, case, away, clean):
 
 
 def test_a_dead_zone_needs_two_voltages():
-    """gouta2022, spec 9's warning: with one voltage a pump's gain takes up the dead zone; with two both are told."""
+    """gouta2022, and the warning of mirakhorli notes S11: with one voltage a pump's gain takes up the dead zone; with two both are told."""
     base = presets.load("gouta2022").cases["pi"]
     t, true = np.arange(120.0), truth(base, ("plant.pump_gain[0]", "actuator.dead_zone[0]"))
     free = {"plant.pump_gain[0]": (10.0, 100.0), "actuator.dead_zone[0]": (0.5, 6.0)}
@@ -826,7 +827,7 @@ def test_the_plan(tmp_path):
     code, out, _ = command(*words, "--json")
     rows = json.loads(out)["experiments"]
     sd = {words: row["sd"]["plant.split[0]"] for words, row in rows.items()}
-    assert min(sd, key=sd.get) == "steps one pump after the other, from empty"  # spec 9: B tells 4.6 times more than A
+    assert min(sd, key=sd.get) == "steps one pump after the other, from empty"  # mirakhorli notes S11: 4.6 times more than A
     assert sd["step of every pump at once, from empty"] / sd["steps one pump after the other, from empty"] == pytest.approx(
         4.6, rel=0.15
     )

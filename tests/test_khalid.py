@@ -1,6 +1,6 @@
 """The acceptance values of the re-derived khalid: linearisation, Laguerre functions, gains, tables of closed loops, cross-checks.
 
-The tables (spec B.9, B.10) were made by an independent prototype and checked with solve_ivp and qpOASES. Tolerances are theirs: RMS error
+The tables (notes S7.2, S7.3) were made by an independent prototype and checked with solve_ivp and qpOASES. Tolerances are theirs: RMS error
 1e-4 m, overshoot 0.15 points, settling 4 s, travel 1 % (2 % where tanks run empty), saturation 0.01.
 """
 
@@ -59,7 +59,7 @@ def summary(kind, *setting, **more):
     }
 
 
-# B.3: the linear model
+# S2.3: the linear model
 
 
 def test_linear_model_with_one_pump():
@@ -131,7 +131,7 @@ def test_incremental_model_predicts_the_plain_one():
         np.testing.assert_allclose(x[:2], after - now, atol=1e-12)
 
 
-# B.5, B.6: Laguerre functions and the cost
+# S4.2, S4.3: Laguerre functions and the cost
 
 
 def test_laguerre_functions():
@@ -173,7 +173,7 @@ def test_cost_of_the_laguerre_law():
 
 @pytest.mark.parametrize("kind", ["laguerre", "laguerre-mimo", "gpc", "gpc-mimo"])
 def test_cost_equals_brute_force(kind):
-    """The closed form against the sum over a simulated horizon; the spec's 6153.648319620 does not name its x_e and eta (B.6)."""
+    """The closed form against the sum over a simulated horizon; the prototype's 6153.648319620 does not name its x_e and eta."""
     rng = np.random.default_rng(1)
     part = law(kind)
     A, B, C = (np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT))
@@ -215,7 +215,7 @@ def test_laguerre_with_pole_0_is_gpc(kind, N):
         np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-14)
 
 
-GAINS = [  # K in the order [dH1, dH2, H2 - r], spectral radius of the closed loop, condition of Omega (spec B.6)
+GAINS = [  # K in the order [dH1, dH2, H2 - r], spectral radius of the closed loop, condition of Omega (notes S7.1)
     ("gpc-nc2", [[23.71115, 44.216947, 8.986818]], 0.91980, 24.4),
     ("gpc", [[10.789869, 39.860804, 9.59925]], 0.89069, 89.4),
     ("gpc-nc30", [[10.335214, 36.536922, 8.888984]], 0.89580, 127.2),
@@ -237,7 +237,7 @@ def test_gains(kind, printed, radius, condition):
 
 
 def test_gains_with_other_horizons():
-    """Spec E.6: with few functions the gain depends on the horizon, with eight it does not; the condition of Omega grows."""
+    """Notes H6: with few functions the gain depends on the horizon, with eight it does not; the condition of Omega grows."""
     short, long = (law("laguerre", Np=n) for n in (40, 800))
     assert float(short.gain(DT)[0, 2]) == pytest.approx(9.76, abs=5e-3)
     assert np.linalg.cond(np.asarray(law("laguerre", Np=100).design(DT)[0])) == pytest.approx(820, rel=0.02)
@@ -246,7 +246,7 @@ def test_gains_with_other_horizons():
     assert float(law("laguerre", N=8).gain(DT)[0, 2]) == pytest.approx(8.96, abs=0.1)
 
 
-# B.9: one pump
+# S7.2: one pump
 
 LATER = pytest.mark.slow
 UNC, CLIP, QP = "unconstrained", "clipped", "constrained"
@@ -338,7 +338,7 @@ def test_four_variables_come_within_five_percent_of_the_ten_of_gpc():
     assert law("laguerre").design(DT)[0].shape == (4, 4) and law("gpc").design(DT)[0].shape == (10, 10)
 
 
-# B.10: two pumps
+# S7.3: two pumps
 
 TWO_PUMPS = [  # scenario, law, mode, r_w, RMSE, OS, US, TV; None: not printed
     ("M1", "laguerre-mimo", UNC, 1e-2, (0.01556, 0.01969), (4.59, 3.92), (0, 0), (8.37, 10.53)),
@@ -380,8 +380,8 @@ def test_rows_with_two_pumps(row):
     ],
 )
 def test_costs_from_which_two_pumps_are_tuned(where, mode, start):
-    """J of spec D over 300 samples, travel as a mean over both pumps. For M3 with the programme it prints 14.40, which its own RMS errors
-    (B.10: .02444, .02290 m, of which the first 300 samples have no less than half) rule out at r_w = 0.01; we get 11.319 there, and its
+    """J of notes S10 over 300 samples, travel as a mean over both pumps. For M3 with the programme it prints 14.40, which its own RMS errors
+    (notes S7.3: .02444, .02290 m, of which the first 300 samples have no less than half) rule out at r_w = 0.01; we get 11.319 there, and its
     tuned 11.12 at its tuned values."""
     _, run = closed("laguerre-mimo", where, mode)
     e, moved = run.e[:300], np.diff(run.u[:300], axis=0)  # the change at t = 0 is not in it
@@ -399,7 +399,7 @@ def short_gpc(where, mode, r_w):
 
 @LATER
 def test_the_programme_matters_where_clipping_couples_the_channels():
-    """Spec B.10, the last line: GPC 2 with two pumps."""
+    """Notes S7.3: GPC 2 with two pumps."""
     assert short_gpc("M1", CLIP, 1e-3)[1][0] == pytest.approx(9.6, abs=0.15)
     assert short_gpc("M1", QP, 1e-3)[1][0] == pytest.approx(1.7, abs=0.15)
     rmse, over = short_gpc("M3", CLIP, 1e-2)
@@ -418,7 +418,7 @@ def exact(x):
 
 
 def regular(x, eps=1e-4):
-    """The root of the prototype (spec B.2), in pipes and outlets alike; ours is exact in an outlet above the knee."""
+    """The root of the prototype, in pipes and outlets alike; ours is exact in an outlet above the knee."""
     return x / (x * x + eps * eps) ** 0.25
 
 
@@ -473,7 +473,7 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
 
 
 def test_against_a_loop_of_numpy_and_solve_ivp():
-    """The first pulse and the fall after it. The regularised roots move levels by less than 1e-6 m here (spec E.2)."""
+    """The first pulse and the fall after it. The regularised roots move levels by less than 1e-6 m here (notes H2)."""
     _, run = closed("laguerre")
     levels, inputs = own_loop("laguerre", "S2", 200, limited=False)
     np.testing.assert_allclose(run.x[:200], levels[:200], atol=2e-6)
@@ -491,12 +491,12 @@ def test_against_a_loop_with_slsqp():
 def test_against_a_loop_with_slsqp_and_two_pumps():
     _, run = closed("laguerre-mimo", "M2", QP)
     levels, inputs = own_loop("laguerre-mimo", "M2", 25, limited=True)
-    np.testing.assert_allclose(run.x[:25], levels[:25], atol=5e-5)  # H1 - H2 passes through the knee of 1e-4 m (spec E.2)
+    np.testing.assert_allclose(run.x[:25], levels[:25], atol=5e-5)  # H1 - H2 passes through the knee of 1e-4 m (notes H2)
     np.testing.assert_allclose(run.u[:25], inputs, atol=1e-3)
 
 
 def test_numbers_of_the_independent_check():
-    """Spec B.9, last lines: numpy, exact roots, solve_ivp, qpOASES."""
+    """The prototype, checked with numpy, exact roots, solve_ivp, qpOASES."""
     got = summary("laguerre", "S2", QP, du=0.1)
     np.testing.assert_allclose(got["rmse"], 0.043140, atol=2e-6)
     np.testing.assert_allclose(got["over"], 5.007, atol=5e-3)
@@ -594,7 +594,7 @@ def test_a_steady_state_stays():
         np.testing.assert_allclose(run.x, np.broadcast_to(x0, run.x.shape), atol=1e-7)
 
 
-def test_inputs_before_the_start_are_those_of_the_spec():
+def test_inputs_before_the_start_are_those_of_the_notes():
     assert khalid.steady_input(1, (0.15, 0.03))[0] == pytest.approx(0.60194709, abs=5e-9)
     assert khalid.steady_input(1, (0.60, 0.12))[0] == pytest.approx(1.2039, abs=5e-5)
     np.testing.assert_allclose(khalid.steady_input(2, (0.12, 0.15)), (0.90292, 1.6470), atol=5e-5)
@@ -649,7 +649,7 @@ def test_slopes_of_the_default_cost(name, names):
 @LATER
 @pytest.mark.parametrize("samples", [150])
 def test_slopes_of_the_prototype_through_150_programmes(samples):
-    """Spec C.2, one pump: J = 1e4 mean(e^2) + 0.1 mean(du^2), S2, du 0.5, by (log r_w, logit a): (.1438265, -.0759848).
+    """Notes S7.4, one pump: J = 1e4 mean(e^2) + 0.1 mean(du^2), S2, du 0.5, by (log r_w, logit a): (.1438265, -.0759848).
 
     The weight and that the first change of u is left out are not written there; they are found by its figures, seven digits of both.
     """
@@ -667,7 +667,7 @@ def test_slopes_of_the_prototype_through_150_programmes(samples):
 
 @LATER
 def test_slopes_of_the_prototype_with_two_pumps():
-    """Spec C.2, two pumps, by (log r_w, logit a1, logit a2, log q2): (.01710786, .0284815, .00051297, .8263606).
+    """Notes S7.4, two pumps, by (log r_w, logit a1, logit a2, log q2): (.01710786, .0284815, .00051297, .8263606).
 
     Found by its figures as for one pump: M3, du 0.5, r_w 1e-3, J = 1e4 mean |e|^2 + 0.1 mean(du^2), Runge-Kutta steps of 0.5 s. To 1e-3: M3
     stands on its limits half of the time and H1 - H2 passes through the knee, where steps of 0.25 s alone move the first slope by 8 %.
@@ -781,7 +781,7 @@ def test_control_horizon_within_the_prediction_horizon():
 
 @LATER
 def test_published_claims_are_measured():
-    """Spec B.11."""
+    """Notes S8."""
 
     def run(name, values=None, save_every=1):
         case = rig.set_values(PRESET.cases[name], values or {})

@@ -10,7 +10,7 @@ from scipy import linalg
 from jaxtank.linear import discrete_lyapunov, discrete_riccati, lqr, lyapunov, riccati, zero_order_hold
 
 RICCATI, LQR, DISCRETE_RICCATI = jax.jit(riccati), jax.jit(lqr), jax.jit(discrete_riccati)
-QUADRUPLE = (  # mirakhorli at 12/12: spec 1
+QUADRUPLE = (  # mirakhorli at 12/12: mirakhorli notes S2.3
     np.array([[-0.0231362, 0, 0.0525823, 0], [0, -0.0231362, 0, 0.0299175], [0, 0, -0.0525823, 0], [0, 0, 0, -0.0299175]]),
     np.array([[0.0829417, 0], [0, 0.0478546], [0, 0.0928942], [0.1145385, 0]]),
 )

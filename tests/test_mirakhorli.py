@@ -1,7 +1,7 @@
 """The acceptance values of the re-derived mirakhorli: rig, laws, runs, and what the paper's own law does on the paper's own model.
 
-The tables were made by an independent prototype (JAX and numba, RK4 at 0.1 s); sections are those of the spec. Tolerances (7.1): overshoot
-0.05 percentage points, times 0.2 s, ISE 0.3 %, input effort 0.5 %; discontinuous laws 1 point and 3 % (7.2); steady errors 0.01 cm (8).
+The tables were made by an independent prototype (JAX and numba, RK4 at 0.1 s); sections are those of the notes. Tolerances (S7.1): overshoot
+0.05 percentage points, times 0.2 s, ISE 0.3 %, input effort 0.5 %; discontinuous laws 1 point and 3 % (S7.2); steady errors 0.01 cm (S7.3).
 """
 
 import dataclasses
@@ -64,12 +64,12 @@ def ise(trajectory):
     return np.trapezoid(trajectory.e**2, trajectory.t, axis=0)
 
 
-# 1: the rig
+# S2: the rig
 
 
 @pytest.mark.parametrize(
     "r, split, u, upper",
-    [  # to the digits that the spec gives
+    [  # to the digits of the notes
         ((12, 12), None, (3.74902849, 2.63007293), (2.32320000, 7.17653333)),
         ((12, 12), UNROUNDED_SPLIT, (3.68398958, 2.72132701), (2.476670, 7.013580)),
         ((6, 6), None, (2.6510, 1.8597), (1.16160, 3.58827)),
@@ -171,7 +171,7 @@ def test_outputs_first_move_the_wrong_way(target, falls, least, rises, most):
     np.testing.assert_allclose(trajectory.x[:, rises].max(), most, atol=0.01)
 
 
-# 2: what of the paper's equations is code
+# S5: what of the paper's equations is code
 
 
 def test_f_and_g_of_equation_4_against_derivatives():
@@ -201,7 +201,7 @@ def test_f_and_g_of_the_printed_law_at_the_set_point():
 
 @pytest.mark.parametrize("surface", [0.01, 0.05, 3.0])
 def test_the_rate_of_the_corrected_surface_is_exact(surface):
-    """s' = f + M u along the plant, and M = G + surface diag(gamma k / A) (spec 4.2), with nothing left of u'."""
+    """s' = f + M u along the plant, and M = G + surface diag(gamma k / A) (notes S4.3), with nothing left of u'."""
     x, u = jnp.array([9.0, 14.0, 3.0, 6.0]), (2.0, 3.5)
     s = lambda x: surface * x[:2] + jnp.stack(lower_tanks(SHARP, tuple(x)).drift)
     rate = jax.jvp(s, (x,), (jnp.stack(SHARP.derivative(0.0, tuple(x), u, None)),))[1]
@@ -223,7 +223,7 @@ def test_signed_root_slope_is_the_slope():
     np.testing.assert_allclose(signed_root_slope(0.0), 10.0, rtol=1e-12)
 
 
-# 3: state feedback
+# S4.1: state feedback
 
 
 def designed(split):
@@ -241,7 +241,7 @@ def test_the_printed_gain_is_linear_quadratic():
 
 
 def test_no_other_split_of_four_digits_gives_the_printed_gain():
-    """Spec 3: among its neighbours on a grid of 1e-4 (0.4165, 0.3414) is the only node within the rounding of all eight entries."""
+    """Notes S4.1: among its neighbours on a grid of 1e-4 (0.4165, 0.3414) is the only node within the rounding of all eight entries."""
     nodes = [(0.4165 + 1e-4 * i, 0.3414 + 1e-4 * j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     near = [n for n in nodes if np.abs(designed(n) - np.array(GAIN)).max() <= 5e-5]
     np.testing.assert_allclose(near, [UNROUNDED_SPLIT], rtol=1e-12)
@@ -288,7 +288,7 @@ def test_steady_states_along_a_reference_are_those_of_every_sample():
     assert np.isfinite(slope)
 
 
-# 4.2: where a sliding mode exists
+# S4.3: where a sliding mode exists
 
 
 def test_the_bounds_of_the_sliding_surface():
@@ -329,7 +329,7 @@ def test_poles_of_the_sliding_motion_in_closed_form():
     np.testing.assert_allclose(np.sort_complex(zero_dynamics(surface)), np.sort_complex(closed), rtol=1e-9)
 
 
-# 5: memberships
+# S4.5: memberships
 
 
 def test_memberships():
@@ -368,17 +368,17 @@ def test_the_blend_rests_where_its_laws_rest():
 
 
 def test_the_first_command_from_empty_tanks():
-    """Spec 11.11: at h = 0 the smooth root makes the law ask for (.38, .53) V only, with phi 0.02."""
+    """Notes H5: at h = 0 the smooth root makes the law ask for (.38, .53) V only, with phi 0.02."""
     law = dataclasses.replace(mirakhorli.sliding(PLANT), phi=number(0.02))
     np.testing.assert_allclose(command(law, (0.0,) * 4, SETPOINT), (0.38, 0.53), atol=6e-3)
 
 
-# 7.1: reference runs
+# S7.1: reference runs
 
 
 @component
 class SmoothRoots(TankNetwork):
-    """The quadruple tank with the root of the spec, h / (h^2 + knee^2)^(1/4), in place of ours, which is exact above the knee."""
+    """The quadruple tank with the root of the prototype, h / (h^2 + knee^2)^(1/4), in place of ours, which is exact above the knee."""
 
     def derivative(self, t, x, u, d):
         w, k, g = jnp.sqrt(2.0 * self.gravity), self.pump_gain, self.split
@@ -393,7 +393,7 @@ def smooth(rig_):
     return SmoothRoots(**{f.name: getattr(rig_, f.name) for f in dataclasses.fields(rig_)})
 
 
-OPEN = [  # start [cm], time [s], levels [cm]; the table is of the exact root, and that of the spec's code is 3e-4 off on the way from empty
+OPEN = [  # start [cm], time [s], levels [cm]; the table is of the exact root, and that of the prototype is 3e-4 off on the way from empty
     (0.0, 10, (2.1923, 1.5769, 1.2742, 1.8564)),
     (0.0, 50, (7.1137, 5.8463, 2.4665, 4.0582)),
     (0.0, 100, (9.2235, 7.9497, 2.6192, 4.5146)),
@@ -404,8 +404,8 @@ OPEN = [  # start [cm], time [s], levels [cm]; the table is of the exact root, a
 
 
 @functools.cache
-def open_loop(start, dt, seconds, spec_root=False):
-    rig_ = smooth(PLANT) if spec_root else PLANT
+def open_loop(start, dt, seconds, prototype_root=False):
+    rig_ = smooth(PLANT) if prototype_root else PLANT
     zero = tuple(jnp.float64(start) for _ in range(4))
     step = lambda _, x: integrate(rig_, "rk4", 0.0, x, OPEN_LOOP, None, dt)
     return np.array(jax.jit(lambda x: jax.lax.fori_loop(0, round(seconds / dt), step, x))(zero))
@@ -424,7 +424,7 @@ def exact(start, seconds):
 
 
 def test_error_of_the_integrator():
-    """RK4 from empty tanks loses its order to the root; the error at 100 s of the spec's root is the spec's, to its two digits."""
+    """RK4 from empty tanks loses its order to the root; the error at 100 s of the prototype's root is the prototype's, to its two digits."""
     end = exact(0.0, 100.0)
     for dt, error in ((0.1, 3.3e-7), (0.5, 4.2e-5), (1.0, 1.5e-4), (2.0, 4.6e-4), (5.0, 2.2e-3)):
         found = np.abs(open_loop(0.0, dt, 100.0, True) - end).max()
@@ -493,13 +493,13 @@ COSTS = {  # J = ISE + 3 |u - u*|^2, left Riemann sums over 400 s, phi 0.02: val
 
 
 @pytest.mark.parametrize("kind", COSTS)
-@pytest.mark.parametrize("spec_root", [True, False], ids=["spec-root", "our-root"])
-def test_cost_and_its_slopes(kind, spec_root):
-    """To every digit with the root of the spec. Ours leaves the smooth law's first samples from empty tanks another way: 0.13 % of J,
+@pytest.mark.parametrize("prototype_root", [True, False], ids=["prototype-root", "our-root"])
+def test_cost_and_its_slopes(kind, prototype_root):
+    """To every digit with the root of the prototype. Ours leaves the smooth law's first samples from empty tanks another way: 0.13 % of J,
     3 to 6 % of the slopes along the surface and ks, 16 % of that along phi."""
     case = load("mirakhorli").cases[kind]
     loop = case.loop if kind == "sfc" else with_values(case.loop, {"controller.phi": 0.02})
-    if spec_root:
+    if prototype_root:
         loop = dataclasses.replace(loop, plant=smooth(loop.plant))
     expected, slopes = COSTS[kind]
 
@@ -509,7 +509,7 @@ def test_cost_and_its_slopes(kind, spec_root):
 
     point = jnp.array([float(jaxtank.tree.get_value(loop, n)) for n in slopes])
     found, forward = jax.jit(lambda p: (cost(p), jax.jacfwd(cost)(p)))(point)
-    if spec_root:
+    if prototype_root:
         np.testing.assert_allclose(found, expected, atol=1e-4)
         for slope, printed in zip(forward, slopes.values()):
             assert abs(slope - printed) <= 0.51 * 10.0 ** -len(str(printed).split(".")[1])  # half a unit of its last digit
@@ -518,7 +518,7 @@ def test_cost_and_its_slopes(kind, spec_root):
         np.testing.assert_allclose(forward, list(slopes.values()), rtol=0.17)
 
 
-# 4.1 and 7.2: the law as printed, and as a relay
+# S4.2 and S7.2: the law as printed, and as a relay
 
 
 def test_the_printed_law_never_arrives():
@@ -591,7 +591,7 @@ def test_rows_beside_table_3_of_the_paper(row):
         assert name == "sfc" or found["overshoot"] > (3.0 if high < 4 else 9.0)
 
 
-# 4.3, 5 and 10: switching, pairing, and what the laws cost from other starts
+# S4.4, S4.5 and S10: switching, pairing, and what the laws cost from other starts
 
 
 @pytest.mark.parametrize("dt, travel", [(0.01, 693.0), (0.1, 69.0), (1.0, 7.0)])
@@ -643,7 +643,7 @@ def test_costs_of_the_untuned_laws(high, start, target, costs):
         np.testing.assert_allclose(found, cost, rtol=3e-3)
 
 
-# 8: an outlet changes by 30 %
+# S7.3: an outlet changes by 30 %
 
 
 SHARE = 0.42

@@ -14,7 +14,7 @@ from jaxtank.errors import InputError
 
 
 def test_python_control_sees_the_linearised_rig():
-    """mirakhorli at 12/12: zeros and steady gain of spec 1; poles from the printed time constants."""
+    """mirakhorli at 12/12: zeros and steady gain of mirakhorli notes S2.3; poles from the printed time constants."""
     control = pytest.importorskip("control")
     plant = presets.find("mirakhorli/sfc").loop.plant
     system = neighbours.to_control(plant, setpoints=(12.0, 12.0))

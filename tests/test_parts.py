@@ -166,8 +166,8 @@ def test_pumps_that_make_no_sense_are_refused(gouta, values, words):
         jaxtank.evaluate(case.loop, case.clock, "rms_error")
 
 
-def test_noise_makes_the_voltage_travel_as_the_spec_says(gouta):
-    """5 mV on each sensor: travel of pump 1 is about 19,400 V with NGPC and 11,100 V with backstepping (spec 8.1)."""
+def test_noise_makes_the_voltage_travel_as_the_notes_say(gouta):
+    """5 mV on each sensor: travel of pump 1 is about 19,400 V with NGPC and 11,100 V with backstepping (gouta2015 notes S8.1)."""
     noise = [0.005 * a for a in (9.4458, 8.7106, 8.5106, 9.3458)]
     for name, travel in (("ngpc", 19_400), ("backstepping", 11_100)):
         case = gouta(name, {"sensor.noise": noise})

@@ -109,7 +109,7 @@ def test_smooth_root_moves_the_benchmark_by_less_than_its_promise(gouta, ramp, l
     assert difference <= moved and (difference > 1e-5) == (ramp == 30.0)
 
 
-EQUILIBRIA = [  # spec 2.1
+EQUILIBRIA = [  # gouta2015 notes S2.3
     ((3, 3), (2.75332, 2.75332), (1.80603, 1.80603)),
     ((8, 8), (7.34218, 7.34218), (2.94924, 2.94924)),
     ((8, 14), (0.93885, 28.35800), (1.05462, 5.79609)),
@@ -133,7 +133,7 @@ def test_no_equilibrium_is_told_with_the_tank(r, tank):
         equilibrium(state_coupled_four_tank(FAST_AREA), r)
 
 
-def test_equilibria_exist_between_the_ratios_of_the_spec():
+def test_equilibria_exist_between_the_ratios_of_the_notes():
     plant = state_coupled_four_tank(FAST_AREA)
     for ratio, exists in ((0.442, False), (0.444, True), (2.257, True), (2.259, False)):
         if exists:

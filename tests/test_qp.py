@@ -1,7 +1,7 @@
 """The small quadratic programme: against enumeration of active sets and SciPy, and its slopes against central differences.
 
 Slopes: a step of 1e-6 leaves 1e-10 of truncation and 1e-9 of round-off; the complementarity of 1e-12 at which the solver stops leaves
-1e-5 where rows bind (khalid spec C.3), which is the tolerance.
+1e-5 where rows bind (khalid notes S4.5), which is the tolerance.
 """
 
 import itertools
@@ -126,7 +126,7 @@ def slopes(data, weight):
 
 @pytest.mark.parametrize("n, rows, seed", [(2, 4, 0), (4, 12, 4), (4, 12, 3)])
 def test_slopes_by_every_argument_where_rows_bind(n, rows, seed):
-    """G included, whose slope a published solver has wrong by 25 % on such a problem (khalid spec C.2)."""
+    """G included, whose slope a published solver has wrong by 25 % on such a problem (khalid notes S4.5)."""
     data = problem(n, rows, seed, tight=1.0 if rows == 4 else 2.0)
     assert 1 <= len(enumerated(*data)[1]) < n  # at a corner H and f would not matter
     forward, reverse, central, build = slopes(data, np.arange(1.0, n + 1))

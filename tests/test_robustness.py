@@ -1,4 +1,4 @@
-"""gouta2015 sec. 5.3: what the laws make of coefficients that are off (spec 11), with intervals."""
+"""gouta2015 sec. 5.3: what the laws make of coefficients that are off (gouta2015 notes S11), with intervals."""
 
 import sys
 from pathlib import Path
@@ -62,7 +62,7 @@ def test_backstepping_degrades_relatively_less_and_predictive_control_is_better(
         assert np.quantile(ratio, 0.025) > 0.0
         gain = (far[picks] - near[picks]).mean(axis=1)
         assert np.quantile(gain, 0.025) > 0.0
-        assert np.sum(far < near) <= 8  # spec: 0 to 3 of 200
+        assert np.sum(far < near) <= 8  # the prototype: 0 to 3 of 200
 
 
 def test_runs_of_the_table_are_those_of_the_library(everything):

@@ -395,7 +395,7 @@ def test_mirror_images_are_named_and_counted_once():
     assert result.mirrored["values"] == {"controller.K_phi": b, "controller.K_y": a}
     assert result.mirrored["objective"] == pytest.approx(result.objective["after"], rel=1e-6)
     assert "K_phi and K_y exchange roles" in result.message and "the same objective" in result.message
-    # spec A.8: the ridge of least error
+    # calofir notes S10: the ridge of least error
     assert 0.0205 <= min(a, b) <= 0.024 and max(a, b) >= 0.1
     # an image outside the ranges, and a case without one
     assert evidence.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0}) is None

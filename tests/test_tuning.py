@@ -121,7 +121,7 @@ PENALISED = {"rms_error_total": 1.0, "rms_over_rim": 1.0, "saturation_excess": 0
 
 @pytest.mark.parametrize("Tp", [pytest.param(3.0, marks=pytest.mark.slow), 46.0])
 def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
-    """D = 30 s, penalised cost of spec 10: minima at 7.33 s (1.796) and 46 s (2.257), a ridge near 24 s between."""
+    """D = 30 s, penalised cost of gouta2015 notes S10: minima at 7.33 s (1.796) and 46 s (2.257), a ridge near 24 s between."""
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
     result = tuning.tune(case, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4)
     np.testing.assert_allclose(result.parameters["controller.Tp"]["after"], 7.33, atol=0.15)

@@ -52,7 +52,8 @@ SLOW = pytest.mark.slow
 
 @SLOW
 def test_calofir_ends_on_the_ridge():
-    """Spec A.8: the error is least for the smaller gain between 0.0205 and 0.024 1/s and the larger at or above 0.1; which is which is free."""
+    """The error is least for the smaller gain between 0.0205 and 0.024 1/s and the larger at or above 0.1 (calofir notes S10); which is
+    which is free."""
     result = tuned("calofir-backstepping")
     small, large = sorted(p["after"] for p in result.parameters.values())
     # overshoot and travel have kinks on which no search settles (its status says so), but all eight end in one place
@@ -98,7 +99,7 @@ def _bound(name):
     return tuning.bound(case_of(BOUNDS[name]), BOUNDS[name].objective, BOUNDS[name].limits)
 
 
-# published over tuned, spec 7 of gouta2022: 1.602/.505, .885/.534, .815/.579, 1.105/.657; noise is another draw: 1 %
+# published over tuned, gouta2022 notes S10: 1.602/.505, .885/.534, .815/.579, 1.105/.657; noise is another draw: 1 %
 @SLOW
 @pytest.mark.parametrize("delay, ratio", [("0", 3.172), ("0.2", 1.657), ("0.5", 1.408), ("1", 1.682)])
 def test_chadpc_with_a_delay(delay, ratio):
@@ -109,17 +110,17 @@ def test_chadpc_with_a_delay(delay, ratio):
 
 @SLOW
 def test_state_feedback_is_better_by_a_fifth_on_plants_and_seeds_unseen():
-    """Spec 10 of mirakhorli: 10846 to 8566 in sum over nine plants at twice the step; the published K costs the same to 2 % here."""
+    """mirakhorli notes S10: 10846 to 8566 in sum over nine plants at twice the step; the published K costs the same to 2 % here."""
     found = tuning_table.held_out(ROWS["mirakhorli-sfc"], tuned("mirakhorli-sfc"))
     assert found["runs"] == 27 and found["after"] <= 0.8 * found["before"]
     np.testing.assert_allclose(9 * found["before"], 10846.2, rtol=0.02)
 
 
 def test_on_the_nominal_run_there_is_nothing_to_gain():
-    """Spec 10: the published K is the linear-quadratic gain, 0.03 % above the best; and no law could do better, by another search."""
+    """mirakhorli notes S10: the printed K is the linear-quadratic gain, 0.03 % above the best; and no law could do better, by another search."""
     result = tuned("mirakhorli-sfc-nominal")
     assert result.success and held(result) and 0.0 <= gain("mirakhorli-sfc-nominal") < 0.1
-    # without the price of travel, left sum of 0.1 s: spec 10 has 4512.7 by trapezoids, and 14.4 for the first half sample
+    # without the price of travel, left sum of 0.1 s: the notes have 4512.7 by trapezoids, and 14.4 for the first half sample
     cost = result.measures["after"]["ise"].sum() + 3.0 * result.measures["after"]["input_deviation"].sum()
     np.testing.assert_allclose(cost - 14.4, 4512.7, rtol=1e-3)
 
@@ -132,14 +133,14 @@ def test_the_hybrid_is_not_worse_than_the_published_state_feedback(name):
 
 @SLOW
 def test_integral_action_beats_tuned_state_feedback_before_it_is_tuned():
-    """On runs unseen, spec 10: 6801 against 8566 in sum."""
+    """On runs unseen, mirakhorli notes S10: 6801 against 8566 in sum."""
     integral = tuning_table.held_out(ROWS["mirakhorli-lqi"], tuned("mirakhorli-lqi"))
     proportional = tuning_table.held_out(ROWS["mirakhorli-sfc"], tuned("mirakhorli-sfc"))
     assert integral["before"] < proportional["after"]
 
 
-# least gains of spec D [%]: without limits, and with the price of overshoot that makes the rest felt. Spec D prices the first rise
-# alone and has 6.3 % there; here the falls are priced too
+# least gains of khalid notes S10 [%]: without limits, and with the price of overshoot that makes the rest felt. The prototype prices the
+# first rise alone and has 6.3 % there; here the falls are priced too
 @SLOW
 @pytest.mark.parametrize(
     "name, least",
@@ -149,7 +150,7 @@ def test_integral_action_beats_tuned_state_feedback_before_it_is_tuned():
         ("khalid-constrained-priced", 6.1),
         ("khalid-mimo", 31.0),
         ("khalid-mimo-constrained", 1.5),
-        # spec D has 23 %, from a first value of 14.40 that its own table rules out (test_khalid.py); its last value is met by `test_target`
+        # prototype: 23 %, from a first value of 14.40 that its own table rules out (test_khalid.py); its last value is met by `test_target`
         ("khalid-mimo-constrained-M3", 1.7),
     ],
 )

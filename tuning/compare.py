@@ -80,7 +80,7 @@ def measure(paper):
                 "reason": reason,
             }
         )
-    return {"paper": paper, "citation": preset.citation, "rows": rows}
+    return {"paper": paper, "citation": preset.citation, "notes": str(preset.notes), "rows": rows}
 
 
 def _set_in(preset, name):
@@ -124,7 +124,12 @@ def text(page):
     """The page of `jaxtank compare PAPER`."""
     rows = [[r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]] for r in page["rows"]]
     wrapped = [[row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]] for row in rows]
-    lines = [page["citation"], "", tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"])]
+    lines = [
+        page["citation"],
+        f"notes: {presets.load(page['paper']).notes}",
+        "",
+        tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"]),
+    ]
     for row, cells in zip(page["rows"], rows):
         note = "; ".join(filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]]))
         if note:

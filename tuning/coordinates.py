@@ -14,7 +14,7 @@ class Coordinates:
 
     items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low + p (high - low); ("branch", gain, split,
     (low, high) of both branches): p = (log c1, log c2), c1 = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows
-    are linear (mirakhorli, spec 9), gain k = c1 + c2, split s = c1 / (c1 + c2).
+    are linear (mirakhorli notes S11), gain k = c1 + c2, split s = c1 / (c1 + c2).
     """
 
     items: tuple

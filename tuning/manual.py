@@ -59,6 +59,7 @@ def json_of(case):
         "case": case.name,
         "title": case.title,
         "citation": preset.citation if preset else None,
+        "notes": str(preset.notes) if preset else None,
         "plant": type(case.loop.plant).__name__,
         "names": {kind: list(names) for kind, names in case.names.items()},
         "equations": equations(case.loop.plant, case.loop.disturbance is not None),
@@ -83,6 +84,7 @@ def text(case):
     """The page of `jaxtank show`."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
+    parts += [f"notes: {page['notes']}"] if preset else []
     outputs = ", ".join(f"h{i + 1}{manual_parts.own_name(case, 'tank', i)}" for i in loop.plant.outputs)
     parts += _chapter(f"The rig: {_count(loop.plant.tanks, 'tank')}, {_count(loop.plant.pumps, 'pump')}; controlled: {outputs}")
     parts += [

@@ -15,7 +15,7 @@ class Backstepping(Controller):
         v_i = -(k + k1) (z_i - c_i sqrt(r_i) + k1 (h_i - r_i)),     z = inflow of the lower tanks, c_i sqrt(r_i): their outflow at r
 
     followed by the inversion of `decoupling.decouple`. The printed law knows no rates of the reference and lags behind ramps;
-    with `reference_rates` it carries the missing terms (spec 5.3; not in the paper):
+    with `reference_rates` it carries the missing terms (gouta2015 notes S4.4; not in the paper):
 
         v_i = r''_i + c_i r'_i / (2 sqrt(r_i)) - (k + k1) (z_i - c_i sqrt(r_i) - r'_i + k1 (h_i - r_i))
 

@@ -12,7 +12,7 @@ from jaxtank.signals import Constant, Ramps
 
 
 class Coefficients(NamedTuple):
-    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (spec E1) [cm^0.5/s]; c8, c10 [cm/(V s)]."""
+    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (gouta2015 notes E1) [cm^0.5/s]; c8, c10 [cm/(V s)]."""
 
     c1: Any
     c2: Any
@@ -53,7 +53,7 @@ def coefficients(model):
 def floored_roots(levels, floor):
     """sqrt(max(h, floor)) of each level. The floor keeps roots and their inverses finite where a tank is dry or noise makes a
     level negative. The law multiplies by the roots of the upper levels, so with a dry tank its command is zero and stays so: a
-    floor of about 1 cm lets it restart (spec 9)."""
+    floor of about 1 cm lets it restart (gouta2015 notes H3)."""
     return tuple(floored_root(h, floor) for h in levels)
 
 
@@ -72,7 +72,7 @@ def decouple(c, s3, s4, v1, v2, scale=1.0):
 
 
 def input_metric(c, s3, s4):
-    """(g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10) (gouta2015 eq. 26; spec 5.4)."""
+    """(g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10) (gouta2015 eq. 26; gouta2015 notes S4.5)."""
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
     return p * p * (c.c2**2 + c.c5**2), p * q * (c.c2 * c.c3 + c.c5 * c.c6), q * q * (c.c3**2 + c.c6**2)
 

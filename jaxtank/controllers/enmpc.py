@@ -11,13 +11,13 @@ DRIFTS = ("derived", "printed")
 
 @component
 class ENMPC(Controller):
-    """The minimiser of J = 1/2 int_0^Tp |y - r|^2 with a first-order Taylor prediction (gouta2022 eqs. 9-12; spec 3.1):
+    """The minimiser of J = 1/2 int_0^Tp |y - r|^2 with a first-order Taylor prediction (gouta2022 eqs. 9-12; gouta2022 notes S4.1):
 
         u_i = -(1/c2) (k e_i + f_i(h) - r'_i + d_i),   e = h - r,  k = 3/(2 Tp)
 
     Unsaturated and with an exact model the loop is e' = -k e. `compensation`: "none" leaves d out (ENMPC); "single" takes the observer's
-    estimate once (CHADPC as it must be read, spec 3.3); "double" subtracts it twice, as eqs. (27) and (28) do together.
-    `drift`: "printed" has f with the sign of eqs. (12) and (27), which is not the minimiser and leaves an offset 2 f/k (spec 4).
+    estimate once (CHADPC as it must be read, gouta2022 notes S4.3); "double" subtracts it twice, as eqs. (27) and (28) do together.
+    `drift`: "printed" has f with the sign of eqs. (12) and (27), which is not the minimiser and leaves an offset 2 f/k (gouta2022 notes E2).
     """
 
     model: Plant

@@ -17,7 +17,9 @@ PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 
 
 def membership(size, b, w):
-    """Membership of a size |e| [cm] in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep 3x^2 - 2x^3 between (spec 5). "Low" is 1 less this.
+    """Membership of a size |e| [cm] in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep 3x^2 - 2x^3 between.
+
+    "Low" is 1 less this (mirakhorli notes S4.5).
 
     b: where it is 1/2 [cm]; w: half width [cm], taken as at most b, so that it is exactly 0 at no error.
     """

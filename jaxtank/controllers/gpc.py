@@ -13,7 +13,7 @@ from jaxtank.tree import component, leaf, static
 class GPC(LinearPredictive):
     """The next Nc increments of every pump are free, and later ones are zero.
 
-        Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)   (khalid eqs. 21-22, spec B.5)
+        Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)   (khalid eqs. 21-22, khalid notes S4.2)
 
     The first of them is applied. Modes and constraints as in `LinearPredictive`; with "constrained" they are imposed on the Nc samples.
     """

@@ -27,7 +27,7 @@ class Memory(NamedTuple):
 
 
 def incremental_model(model, operating_point, dt):
-    """(A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid eqs. 16-17, spec B.4; C_m for C_m^T).
+    """(A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
 
         A = [[Am, 0], [Cm Am, I]],   B = [Bm; Cm Bm],   C = [0, I]
 
@@ -43,12 +43,12 @@ def incremental_model(model, operating_point, dt):
 
 
 def quadratic_cost(A, B, C, q, r_w, basis):
-    """(Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) = basis(m) eta (khalid eqs. 29-31, spec B.6).
+    """(Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) = basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
 
         phi(m)' = A phi(m-1)' + B basis(m-1),   Omega = sum_m phi(m) Q phi(m)' + r_w I,   Psi = sum_m phi(m) Q A^m,   m = 1 .. Np
 
     with Q = C' diag(q) C and x_e = [dx_m; y - r]. A, B, C: `incremental_model`; q: (outputs,) [-]; r_w [cm^2/V^2];
-    basis: (Np, m, variables). The sums go to Np, not to the number of terms as printed (spec B.13).
+    basis: (Np, m, variables). The sums go to Np, not to the number of terms as printed (khalid notes E10).
     """
     n, variables = A.shape[0], basis.shape[2]
 
@@ -67,7 +67,7 @@ class LinearPredictive(Controller):
 
     Fields of every such law: model, operating_point, r_w, q, du_limit, u_low, u_high, Np, mode. `mode`: "unconstrained" is the linear
     law du = -K x_e, which knows no limits; "clipped" holds its du within du_limit and then u within [u_low, u_high]; "constrained" solves
-    the quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, spec B.7). u(k-1) is what the
+    the quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes S4.4). u(k-1) is what the
     pumps' limits let through, which is all the anti-windup there is.
     """
 
@@ -156,7 +156,7 @@ class LinearPredictive(Controller):
             if not abs(point[one] - point[other]) > 10 * self.model.knee:
                 raise InputError(
                     f"controller.operating_point = {point} {length}: levels joined by a pipe must differ by more than "
-                    f"{10 * self.model.knee:g} {length}, the model has no slope where they are equal (khalid spec E.4)"
+                    f"{10 * self.model.knee:g} {length}, the model has no slope where they are equal (khalid notes H4)"
                 )
         for name, size in (("du_limit", m), ("u_low", m), ("u_high", m), ("q", len(self.model.outputs))):
             if np.shape(getattr(self, name)) != (size,):

@@ -11,12 +11,12 @@ from jaxtank.tree import component, leaf, static
 
 
 def laguerre_functions(a, N, samples):
-    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, spec B.6).
+    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, khalid notes S4.3).
 
         L(0) = sqrt(1 - a^2) [1, -a, a^2, ...]',   L(k+1) = A_l L(k)
 
     A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. a: pole, 0 <= a < 1 [-]. With a = 0 they are unit
-    pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a) [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (spec B.13).
+    pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a) [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (khalid notes E7).
     """
     beta = 1.0 - a * a
     power = [jnp.ones_like(a)]  # products, not powers: 0^0 has no slope
@@ -30,12 +30,12 @@ def laguerre_functions(a, N, samples):
 
 @component
 class Laguerre(LinearPredictive):
-    """The increments of pump i over the horizon are N Laguerre functions, du_i(k+m) = L_i(m)' eta_i (khalid eqs. 26-31, spec B.6).
+    """The increments of pump i over the horizon are N Laguerre functions, du_i(k+m) = L_i(m)' eta_i (khalid eqs. 26-31, khalid notes S4.3).
 
         J = eta' Omega eta + 2 eta' Psi x_e,   eta = -Omega^-1 Psi x_e,   du_i(k) = L_i(0)' eta_i
 
     N numbers per pump do what takes GPC ten or more. With a = 0 it is GPC with Nc = N. Modes and constraints as in `LinearPredictive`;
-    with "constrained" they are imposed on the next `rows` samples: 5 are enough, 15 those of the spec's tables (B.7).
+    with "constrained" they are imposed on the next `rows` samples: 5 are enough, 15 those of the tables in khalid notes S7.2.
     """
 
     model: TankNetwork

@@ -1,4 +1,4 @@
-"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (the rivals of gouta2022, Table 4; spec 6)."""
+"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4; gouta2022 notes S4.5)."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class Memory(NamedTuple):
 def oustaloup(g):
     """(direct gain, poles (2N+1), residues (2N+1)) of s^g on [1e-3, 1e2] rad/s: s^g ~ direct + sum residue/(s + pole).
 
-    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g (Oustaloup 2000; spec 6). g [-].
+    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g (Oustaloup 2000; gouta2022 notes S4.5). g [-].
     """
     j = np.arange(2 * SECTIONS + 1)
     at = lambda shift: LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))

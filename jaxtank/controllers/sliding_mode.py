@@ -14,7 +14,7 @@ from jaxtank.tree import component, leaf, static
 
 SWITCHES = {"tanh": jnp.tanh, "clip": lambda x: clip(x, -1.0, 1.0), "sign": jnp.sign}
 FORMS = ("corrected", "printed")
-SMALLEST = 1e-3  # least size of the determinant, as a share of its antidiagonal part: at the design -0.83 (spec 4.2)
+SMALLEST = 1e-3  # least size of the determinant, as a share of its antidiagonal part: at the design -0.83 (mirakhorli notes S4.3)
 
 
 class LowerTanks(NamedTuple):
@@ -59,7 +59,7 @@ class Acceleration(NamedTuple):
 
 def acceleration(tanks, damping):
     """f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i. damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which are
-    right except that gamma_i k_i u_i'/A_i is missing from it (spec E2)."""
+    right except that gamma_i k_i u_i'/A_i is missing from it (mirakhorli notes E2)."""
     net = tuple(damping - d for d in tanks.slope)
     return Acceleration(
         f=tuple(n * p - c * a for n, p, c, a in zip(net, tanks.drift, tanks.cross, tanks.above)),
@@ -101,14 +101,14 @@ def check_quadruple(model):
 class SlidingMode(Controller):
     """Sliding-mode law for the quadruple tank: M u = -f - ks sw(s / phi), sw one of tanh, clip to [-1, 1], sign.
 
-    "corrected" (spec 4.3): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i, whose rate f + M u is exact in u and needs no u'.
+    "corrected" (mirakhorli notes S4.4): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i, whose rate f + M u is exact in u and needs no u'.
     The surface is zero at the steady state of the setpoint. A sliding mode exists and is stable for surfaces between two bounds: 0.0088
-    and 0.088 1/s for the paper's rig at 12 cm (spec 4.2). Setpoints that are held: their rates are not used.
+    and 0.088 1/s for the paper's rig at 12 cm (mirakhorli notes S4.3). Setpoints that are held: their rates are not used.
 
     "printed" (mirakhorli eq. 10): s_i = surface e_i + h_i', f and M without the surface, and surface h_i' subtracted; h_i' from the full
-    model with the voltages applied in the last sample (the paper does not say how h_i' is had: reading (a) of spec 4.1).
+    model with the voltages applied in the last sample (the paper does not say how h_i' is had: reading (a) of mirakhorli notes S4.2).
 
-    Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and they grow without bound (spec 11.3).
+    Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and they grow without bound (mirakhorli notes H2).
     With sign, phi has no effect and the other derivatives miss the jumps.
     """
 

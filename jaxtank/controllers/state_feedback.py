@@ -15,7 +15,8 @@ from jaxtank.tree import component, leaf
 def feedback(K, x, h0, u0):
     """u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and the steady state h0 (n) [cm], u0 (m) [V].
 
-    mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and without u0 the pumps stand (spec E11).
+    mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and without u0 the pumps stand
+    (mirakhorli notes E11).
     """
     away = [h - h_s for h, h_s in zip(x, h0)]
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
@@ -33,7 +34,7 @@ def check_free_outlets(model):
 class StateFeedback(Controller):
     """u = u0(r) - K (h - h0(r)), with levels h0 and voltages u0 at which the model stands still at the setpoint (mirakhorli sec. 4.2).
 
-    No integral action: the steady error is zero only if the model is exact (spec E21).
+    No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21).
     """
 
     model: Plant
@@ -54,7 +55,7 @@ class StateFeedback(Controller):
 
 @component
 class LQI(Controller):
-    """State feedback with integrals of the errors, whose gain is designed here (not in the paper: spec 8).
+    """State feedback with integrals of the errors, whose gain is designed here (not in the paper: mirakhorli notes S4.6).
 
         u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r while no pump is at its limit
 

@@ -14,9 +14,9 @@ from jaxtank.tree import component, leaf
 
 @component
 class TwoTankBackstepping(Controller):
-    """Backstepping law of calofir, eqs. (16)-(21) with the errata of spec A.9, for a pumped tank that drains through a second one.
+    """Backstepping law of calofir, eqs. (16)-(21) with the errata of calofir notes S5, for a pumped tank that drains through a second one.
 
-    With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r = kappa h1r (spec A.4, where the
+    With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r = kappa h1r (calofir notes S4.2, where the
     paper's z0 and Q0 cancel):
 
         Phi = (b s - K_phi e)/a,   Y = Z - Phi,   a = c1/A, b = c2/A
@@ -41,7 +41,7 @@ class TwoTankBackstepping(Controller):
 
     @pointwise
     def prepare(self, r, dr, ddr):
-        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (spec A.2) [cm, cm^3/s]."""
+        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (calofir notes S2.2) [cm, cm^3/s]."""
         c1, c2 = self.model.pipe[0], self.model.drain[1]
         h3r = c1**2 / (c1**2 + c2**2) * r[0]  # kappa h1r
         return h3r, c1 * jnp.sqrt(2.0 * self.model.gravity) * jnp.sqrt(r[0] - h3r)

@@ -20,8 +20,9 @@ class DisturbanceObserver(Observer):
     d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are measured; x_hat = y.
 
     u is what the pumps were told after their limits: with `fed` = "command", the unlimited command, the observer winds up while a pump
-    is saturated (spec 3.3). `before_compensation` feeds it the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23)
-    prints it: the loop is then that of a single compensation with 2 l, and d^ reads half the disturbance.
+    is saturated (gouta2022 notes S4.2). `before_compensation` feeds it the input before eq. (28) subtracts the estimate again,
+    u + d^/c2, as eq. (23) prints it (gouta2022 notes S4.3): the loop
+    is then that of a single compensation with 2 l, and d^ reads half the disturbance.
     """
 
     model: Plant

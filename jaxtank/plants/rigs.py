@@ -16,7 +16,7 @@ def state_coupled_four_tank(area):
     pours into both lower tanks 1 and 2, whose levels are controlled.
 
     area: cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2 (plant A, "table1"), with
-    which the paper's own gains fail; 15 sqrt(2) read as an area gives plant B, "fast", which reproduces the text (spec 0).
+    which the paper's own gains fail; 15 sqrt(2) read as an area gives plant B, "fast", which reproduces the text (gouta2015 notes S1).
     """
     inner, outer = disc(0.38), disc(0.31)  # d31 = d42, d32 = d41 [cm], Table 1
     return network(

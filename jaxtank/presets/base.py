@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtank.loop import ClosedLoop
@@ -110,3 +111,8 @@ class Preset:
     tunable: Mapping[str, Free]
     uncertain: Mapping[str, tuple]
     departures: tuple
+
+    @property
+    def notes(self):
+        """Path of the derivation: equations as used, errata, assumptions, reference values. Messages name its sections."""
+        return Path(__file__).with_name("notes") / f"{self.paper}.md"

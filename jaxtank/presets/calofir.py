@@ -1,4 +1,4 @@
-"""Calofir and others: two coupled tanks in metres, backstepping. Labels as in the specification's part A."""
+"""Calofir and others: two coupled tanks in metres, backstepping. Derivation and labels: notes/calofir.md."""
 
 import dataclasses
 import functools
@@ -21,24 +21,24 @@ from jaxtank.tree import number
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
 Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]
 GRAVITY = 9.81  # not printed; only c = (effective area) sqrt(2 g) matters [m/s^2]
-KAPPA = C1**2 / (C1**2 + C2**2)  # h3/h1 at rest (spec A.2)
+KAPPA = C1**2 / (C1**2 + C2**2)  # h3/h1 at rest (notes S2.2)
 SPEED = (2 * GRAVITY) ** 0.5
-START = 0.05  # h1 at t = 0 [m] (spec A.6)
+START = 0.05  # h1 at t = 0 [m] (notes A2)
 
 TUNABLE = {"controller.K_phi": Free(1e-3, 1.0), "controller.K_y": Free(1e-3, 1.0)}
 
 KS = tuple(TUNABLE)
 
 DEPARTURES = (
-    "Equations: the errata of the paper are mended (spec A.9): signs of (12a), (14) and of the first term of f_a in (16); d phi/d z in "
+    "Equations: the errata of the paper are mended (notes S5): signs of (12a), (14) and of the first term of f_a in (16); d phi/d z in "
     "(4); (20) is v, not phi; in (21) a/z0 for z/z0, and the denominators of v_i and v_ii. As printed, the law does not rest at the "
     "reference.",
-    "The law is computed in physical units (spec A.4): z0 and Q0 cancel exactly, as long as z0 is one number.",
-    "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is below b/(2 sqrt(h3r)) + a/(2 z3r) (spec A.5).",
-    "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05, 0.05 kappa) m (spec A.6).",
+    "The law is computed in physical units (notes S4.2): z0 and Q0 cancel exactly, as long as z0 is one number.",
+    "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3).",
+    "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05, 0.05 kappa) m (notes A2).",
     "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for 900-1050 s; the paper does not say what "
-    "its faults were (spec A.6).",
-    "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it never starts from empty tanks (spec A.10).",
+    "its faults were (notes A3).",
+    "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it never starts from empty tanks (notes A4, H1).",
     "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81 m/s^2.",
     "Rims are physics: levels stop at 0.6 m and at 0 m.",
 )
@@ -82,7 +82,7 @@ def rig():
 
 
 def build(perturbed=False):
-    """The closed loop, with the faults of spec A.6 if `perturbed`."""
+    """The closed loop, with the faults of notes S3 if `perturbed`."""
     plant = rig()
     events = [("drain[1]", 300, 450, 0.75, 0.0), ("drain[0]", 900, 1050, 1.0, 0.2 * C1 / SPEED)]
     return ClosedLoop(
@@ -111,7 +111,7 @@ def verdict(holds):
 
 
 def constant_flow(case):
-    """Error of h1 [m] (samples,) with the flow at which each setpoint rests in the law's place (u_s alone, spec A.6)."""
+    """Error of h1 [m] (samples,) with the flow at which each setpoint rests in the law's place (u_s alone, notes S7.1)."""
     up, down = (C1 * (h * (1 - KAPPA)) ** 0.5 for h in (0.8 * H0, 0.5 * H0))
     law = OpenLoop(signal=ramps([up], [(600.0, 0, down)], ramp=0.0))
     return np.asarray(simulate(dataclasses.replace(case.loop, controller=law), case.clock).e[:, 0])
@@ -183,7 +183,7 @@ def preset():
             clock=Clock(dt=1.0, duration=1199.0, substeps=4),
             limits={"max_level": "rim"},
             free=TUNABLE,
-            # the error alone ranks nothing, the pump's limit sets it (spec A.8): overshoot counts a hundredfold, and 1e-6 m^3/s from
+            # the error alone ranks nothing, the pump's limit sets it (notes S10): overshoot counts a hundredfold, and 1e-6 m^3/s from
             # sample to sample, which noise of 1 mm makes felt, as 0.3 mm
             objective={"mean_square_error": 1.0, "mean_square_overshoot": 100.0, "mean_square_travel": 1e5},
             scenarios=(Scenario("noise", {"sensor.noise": "0.001 if zero"}, seed=1),),

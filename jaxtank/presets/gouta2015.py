@@ -18,7 +18,7 @@ from jaxtank.signals import ramps
 from jaxtank.tree import number
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
-FAST_AREA = 15 * 2**0.5  # the same figure read as an area (spec 0.3) [cm^2]
+FAST_AREA = 15 * 2**0.5  # the same figure read as an area (notes A1) [cm^2]
 
 # Fig. 5 as told in sec. 5.3: (time [s], output counted from 0, setpoint [cm])
 BENCHMARK = ((20.0, 0, 8.0), (20.0, 1, 8.0), (270.0, 1, 14.0), (470.0, 0, 16.0), (760.0, 1, 10.0), (900.0, 0, 12.0))
@@ -43,15 +43,15 @@ VARIANTS = {
 
 DEPARTURES = (
     "Areas: Table 1 as printed (D = 15 sqrt(2) cm, 353.4 cm^2) gives a plant about 17 times too slow for the printed gains. The default "
-    "plant reads 15 sqrt(2) as an area (21.2 cm^2), which reproduces most of the text; '-table1' keeps the printed one (spec 0, E13).",
-    "Reference: Fig. 5 is lost. Each change is a ramp that starts at the stated time and lasts 60 s; its second derivative is 0 (spec 3).",
-    "Start: all tanks at the steady state of r(0) = (3, 3) cm (spec 3).",
+    "plant reads 15 sqrt(2) as an area (21.2 cm^2), which reproduces most of the text; '-table1' keeps the printed one (notes S1, E13).",
+    "Reference: Fig. 5 is lost. Each change is a ramp that starts at the stated time and lasts 60 s; its second derivative is 0 (notes A2, A3).",
+    "Start: all tanks at the steady state of r(0) = (3, 3) cm (notes A4).",
     "Dead zone: the benchmark's steady voltages go down to 1.05 V, below the 3 V of Remark 4; it is off by default, and on with "
-    "actuator.dead_zone = 3 the run fails as Remark 4 tells (spec 8.1).",
-    "Level floor in the laws: 0.01 cm, so that roots and gradients stay finite when a tank runs dry (spec 9).",
+    "actuator.dead_zone = 3 the run fails as Remark 4 tells (notes S8.1).",
+    "Level floor in the laws: 0.01 cm, so that roots and gradients stay finite when a tank runs dry (notes A7).",
     "Rims: levels may rise past 30 cm, so that the limit on max_level is felt; plant.overflow = true makes them physics.",
-    "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46) lacks (spec 5.3), the second takes the "
-    "exact constrained minimiser of the paper's cost instead of clipping (spec 5.4).",
+    "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46) lacks (notes S4.4), the second takes the "
+    "exact constrained minimiser of the paper's cost instead of clipping (notes S4.5).",
     "Kp is printed in cm^3/V; its dimension is cm^3/(s V) (E2).",
 )
 
@@ -69,10 +69,13 @@ PUBLISHED = {
         "levels 'do not exceed 30 cm'",
         "",
         "Remark 2",
-        reason="with ramps of 60 s tank 4 needs more; ramps of 200 s are slow enough (spec 5)",
+        reason="with ramps of 60 s tank 4 needs more; ramps of 200 s are slow enough (notes S3)",
     ),
     "areas as printed": Published(
-        "D = 15 sqrt(2) cm serves the printed gains", "", "Table 1", reason="the plant is then 17 times too slow for them (spec 0)"
+        "D = 15 sqrt(2) cm serves the printed gains",
+        "",
+        "Table 1",
+        reason="the plant is then 17 times too slow for them (notes S1)",
     ),
     "dead zone of 3 V": Published("'failure of the control test'", "", "Remark 4"),
 }

@@ -15,12 +15,12 @@ from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Sine, Sum, pours, ramps
 from jaxtank.tree import number
 
-PRINTED_GAIN, RECONCILED_GAIN = 3.4717, 34.717  # Kp of Table 1, and ten times that (spec 1.1) [cm^3/(s V)]
-DEAD_ZONE = (2.7538, 4.3248)  # what the reported mean of d^ amounts to at the reconciled Kp (spec 1.2) [V]
+PRINTED_GAIN, RECONCILED_GAIN = 3.4717, 34.717  # Kp of Table 1, and ten times that (notes S2.2) [cm^3/(s V)]
+DEAD_ZONE = (2.7538, 4.3248)  # what the reported mean of d^ amounts to at the reconciled Kp (notes S2.3) [V]
 SENSOR = 1 / 0.04413  # MPX5010DP: 450 mV/kPa [cm/V]
-POUR = 1.1  # duration of which the reported peak of d^, 2 cm/s, speaks (spec 2) [s]
+POUR = 1.1  # duration of which the reported peak of d^, 2 cm/s, speaks (notes S3.2) [s]
 
-# What an ordinary rig would add; fitted to the paper's Table 3, not unique (spec 1.3, V2; its pour of 0.7 s is left at 1.1 s).
+# What an ordinary rig would add; fitted to the paper's Table 3, not unique (notes S2.4; its pour of 0.7 s is left at 1.1 s).
 PAPER_LIKE = {
     "plant.pump_gain": 16.7,
     "plant.drain": 0.66 * 0.7854,
@@ -61,31 +61,32 @@ LAWS = {
 
 DEPARTURES = (
     "Pump constant: Table 1 prints Kp = 3.4717, with which 12 V hold at most 1.43 cm; the reported voltages and disturbance estimates "
-    "bracket it in [27.9, 37.6], so ten times the printed one is the default (spec 1.1). --set plant.pump_gain=3.4717 "
+    "bracket it in [27.9, 37.6], so ten times the printed one is the default (notes S2.2). --set plant.pump_gain=3.4717 "
     "--set controller.model.pump_gain=3.4717 --set observer.model.pump_gain=3.4717 is the printed rig.",
-    "Sign of f in eqs. (12) and (27): the minimiser of eq. (9) has + f (spec 4); '-printed' keeps the printed sign.",
+    "Sign of f in eqs. (12) and (27): the minimiser of eq. (9) has + f (notes E2); '-printed' keeps the printed sign.",
     "Compensation: (27) and (28) subtract the estimate twice, which is right only because (23) is driven by the input before (28); "
-    "the default subtracts it once and feeds the observer the saturated input (spec 3.3). '-printed' keeps the double one.",
-    "Negative mean of d^: not a transport delay, as the paper says, but a dead zone of the pumps of (2.75, 4.32) V (spec 1.2), which is on.",
-    "Pours: 500 cm^3 over 1.1 s, from the reported peak of d^; their duration is not printed (spec 2).",
+    "the default subtracts it once and feeds the observer the saturated input (notes S4.3). '-printed' keeps the double one.",
+    "Negative mean of d^: not a transport delay, as the paper says, but a dead zone of the pumps of (2.75, 4.32) V (notes S2.3), which is on.",
+    "Pours: 500 cm^3 over 1.1 s, from the reported peak of d^; their duration is not printed (notes S3.2).",
     "Start: both tanks at 1 cm (not printed). r1 = 0 before 10 s is below the paper's own 1 cm: pump 1 simply stays off.",
-    "Benchmark 2: Fig. 5 is lost. 330 to 560 s is printed, the other trapezoids are assumed (spec 2). (14, 8) cm has no steady "
+    "Benchmark 2: Fig. 5 is lost. 330 to 560 s is printed, the other trapezoids are assumed (notes S3.3). (14, 8) cm has no steady "
     "state: pump 2 stays off and tank 2 stands at 8.056 cm.",
     "PI, PID and fractional PI: the paper compares with a rig of another paper; here they are tuned by SIMC for a dead time of 0.5 s "
-    "(spec 6) and run on the same rig. Their anti-windup has the tracking time Tt = 36 s.",
+    "(notes S4.5) and run on the same rig. Their anti-windup has the tracking time Tt = 36 s.",
     "Noise and delay are off by default; sensor.noise = 0.02 cm is the MPX5010DP averaged over 10 samples, 0.08 cm raw, and actuator.delay "
-    "0.2 to 1 s is that of a real pipe (spec 2). Without them, and without weighing the voltage, the gains of CHADPC are barely felt (spec 7).",
+    "0.2 to 1 s is that of a real pipe (notes S3.4). Without them, and without weighing the voltage, the gains of CHADPC are barely "
+    "felt (notes S10).",
 )
 
 UNCERTAIN = {
-    "plant.pump_gain": (0.1, "the bracket of spec 1.1 is +-15 % wide"),
+    "plant.pump_gain": (0.1, "the bracket of notes S2.2 is +-15 % wide"),
     "plant.drain": (0.2, "discharge coefficient of the outlets, taken as 1"),
     "plant.pipe": (0.2, "discharge coefficient of the pipe, taken as 1"),
     "actuator.dead_zone": (0.1, "inferred from the reported mean of d^"),
 }
 
-_FITTED = "the rig was fitted to these numbers (spec 1.3)"
-_RIG = "other runs, or another Tp: start-up is saturated at 12 V for both laws, and mean voltage is fixed by the mass balance (spec 5.3)"
+_FITTED = "the rig was fitted to these numbers (notes S2.4)"
+_RIG = "other runs, or another Tp: start-up is saturated at 12 V for both laws, and mean voltage is fixed by the mass balance (notes S8)"
 PUBLISHED = {
     "controller.Tp": Published(0.13, "s", "sec. 5.1"),
     "observer.l": Published((10.0, 10.0), "1/s", "sec. 5.1"),
@@ -95,16 +96,16 @@ PUBLISHED = {
         "cm",
         "Table 4 (0.76, 1.29 in Table 3)",
         0.2,
-        "the ideal rig starts faster: no delay, lag or noise (spec 5.3)",
+        "the ideal rig starts faster: no delay, lag or noise (notes S8)",
     ),
     "RMS error of ENMPC, paper-like rig": Published((0.7688, 1.2919), "cm", "Table 4", 0.2, _FITTED),
     "RMS voltage of ENMPC": Published(
         (8.29, 9.39), "V", "Table 3", 0.1, "discharge coefficients of 1: more flow per volt is needed"
     ),
     "RMS voltage of ENMPC, paper-like rig": Published((8.29, 9.39), "V", "Table 3", 0.1, _FITTED),
-    "settling time of ENMPC": Published((25.0, 41.0), "s", "Table 3", 0.2, "pump of the ideal rig is stronger (spec 5.3)"),
+    "settling time of ENMPC": Published((25.0, 41.0), "s", "Table 3", 0.2, "pump of the ideal rig is stronger (notes S8)"),
     "settling time of ENMPC, paper-like rig": Published((25.0, 41.0), "s", "Table 3", 0.2, _FITTED),
-    "recovery time of ENMPC": Published((8.0, 6.0), "s", "Table 3", 0.2, "no delay in the ideal rig (spec 5.3)"),
+    "recovery time of ENMPC": Published((8.0, 6.0), "s", "Table 3", 0.2, "no delay in the ideal rig (notes S8)"),
     "RMS error of CHADPC": Published((0.6208, 0.9821), "cm", "Table 4", 0.2, "as of ENMPC"),
     "RMS voltage of CHADPC": Published((7.90, 8.91), "V", "Table 3", 0.1, "as of ENMPC"),
     "settling time of CHADPC": Published((16.0, 24.0), "s", "Table 3", 0.2, "as of ENMPC"),
@@ -122,11 +123,11 @@ PUBLISHED = {
         reason="volume over area, which is what a pour at once would do; this one lasts 1.1 s and the pumps give way",
     ),
     "pump constant as printed": Published(
-        "Kp = 3.4717 holds the benchmark", "", "Table 1", reason="12 V cannot lift the levels; a misprint (spec 1.1)"
+        "Kp = 3.4717 holds the benchmark", "", "Table 1", reason="12 V cannot lift the levels; a misprint (notes S2.2)"
     ),
-    "a delay makes d^ negative": Published("Remark 2.1", "", "sec. 2, 5.2", reason="a delay has unit gain at rest (spec 1.2)"),
-    "eq. (12) tracks without offset": Published("ENMPC as printed", "", "eq. (12)", reason="sign of f (spec 4)"),
-    "the observer spares the pumps": Published("less noise, more comfort for the actuators", "", "sec. 5.2", reason="spec 3.4"),
+    "a delay makes d^ negative": Published("Remark 2.1", "", "sec. 2, 5.2", reason="a delay has unit gain at rest (notes S2.3)"),
+    "eq. (12) tracks without offset": Published("ENMPC as printed", "", "eq. (12)", reason="sign of f (notes E2)"),
+    "the observer spares the pumps": Published("less noise, more comfort for the actuators", "", "sec. 5.2", reason="notes S4.4"),
     "PI, PID and fractional PI of Table 4": Published(
         "1.53 to 1.77", "cm", "Table 4", reason="measured on the rig of another paper [4]"
     ),
@@ -147,7 +148,7 @@ def rig(pump_gain=RECONCILED_GAIN):
 
 
 def benchmark(band=0.05):
-    """Benchmark 1: r1 = 8 from 10 s on, with a raised sine of 250 s on it from 50 to 800 s; r2 = 10 (sec. 5.1; spec 2)."""
+    """Benchmark 1: r1 = 8 from 10 s on, with a raised sine of 250 s on it from 50 to 800 s; r2 = 10 (sec. 5.1; notes S3.1)."""
     steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=band)
     sine = Sine(
         amplitude=number(3.0), offset=number(3.0), period=250.0, zero=112.5, start=50.0, end=800.0, channel=0, width=2
@@ -156,14 +157,14 @@ def benchmark(band=0.05):
 
 
 def trapezoids():
-    """Benchmark 2, both levels starting at 1 cm; slopes that last 40 s are two of 20 s (spec 2, assumed but for 330 to 560 s)."""
+    """Benchmark 2, both levels starting at 1 cm; slopes that last 40 s are two of 20 s (notes S3.3, assumed but for 330 to 560 s)."""
     first = [(20.0, 8.0), (330.0, 14.0), (790.0, 12.0), (810.0, 10.0), (1250.0, 12.0)]
     second = [(20.0, 8.0), (560.0, 14.0), (1020.0, 12.0), (1040.0, 10.0)]
     return ramps((1.0, 1.0), [(t, 0, v) for t, v in first] + [(t, 1, v) for t, v in second], ramp=20.0)
 
 
 def _mirrored(values):
-    # 1.5/Tp is the gain of the error, l that of its integral's observer: the loop knows their sum and product (spec 3.4)
+    # 1.5/Tp is the gain of the error, l that of its integral's observer: the loop knows their sum and product (notes S4.4)
     rates = [v for n, v in values.items() if n.startswith("observer.l")]
     if "controller.Tp" not in values or not rates:
         return {}
@@ -175,7 +176,7 @@ MIRROR = Mirror("the gain k = 1.5/Tp and the observer's l exchange roles", _mirr
 
 
 def law(name, model):
-    """(controller, observer) of a case of LAWS, with the gains of sec. 5.1 or of SIMC (spec 6)."""
+    """(controller, observer) of a case of LAWS, with the gains of sec. 5.1 or of SIMC (notes S4.5)."""
     if name.startswith(("enmpc", "chadpc")):
         printed, compensated = name.endswith("-printed"), name.startswith("chadpc")
         return (
@@ -196,7 +197,7 @@ def law(name, model):
             Td=number([0.25, 0.25]) if kind == "pid" else None,
             order=number([0.85, 0.85]) if kind == "fopi" else None,
             Tt=number([36.0, 36.0]),
-            bias=number([6.34, 7.17]),  # mean voltages of the benchmark (spec 2)
+            bias=number([6.34, 7.17]),  # mean voltages of the benchmark (notes S4.5)
             feed_forward=name.endswith("-ff"),
         ),
         Direct(),
@@ -228,12 +229,12 @@ def build(name):
 
 
 def quiet(t):
-    """Samples after 60 s and not within 30 s of a pour: where means of d^ and offsets are taken (spec 5)."""
+    """Samples after 60 s and not within 30 s of a pour: where means of d^ and offsets are taken (notes A6)."""
     return (t > 60) & ~((t >= 500) & (t < 530)) & ~((t >= 700) & (t < 730))
 
 
 def figures(run):
-    """Numbers of a trajectory of benchmark 1 as Table 3 gives them (spec 5): RMS error and voltage, settling and recovery times, mean d^."""
+    """Numbers of a trajectory of benchmark 1 as Table 3 gives them (notes A6): RMS error and voltage, settling and recovery times, mean d^."""
     t, e = run.t, np.abs(run.e)
 
     def last(mask, output, band, begin):
@@ -334,7 +335,7 @@ def preset():
                 clock=Clock(dt=0.01, duration=1500.0 if name.endswith("-trapezoid") else 900.0),
                 limits={"max_level": "rim"},
                 free={p: TUNABLE[p] for p in free},
-                # without noise, delay or a price of travel the gains are not felt (spec 7): 0.1 V from sample to sample counts as 0.02 cm
+                # without noise, delay or a price of travel the gains are not felt (notes S10): 0.1 V from sample to sample counts as 0.02 cm
                 objective={"mean_square_error": 1.0, "mean_square_travel": 0.04},
                 scenarios=(Scenario("noise", {"sensor.noise": "0.02 if zero"}, seed=1),),
                 mirror=MIRROR if "chadpc" in name else None,

@@ -16,17 +16,17 @@ from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
 from jaxtank.tree import number
 
-U0 = 1e-4  # unit of the inputs (spec B.1) [m^3/s]
+U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]
 CHANNEL = 78.5e-6  # s1 = s2 = s3, Table I [m^2]
 DISCHARGE = (1.0, 1.0, 0.5)  # a0, a0, a1, Table I [-]
 GRAVITY = 9.8  # g, Table I [m/s^2]
 WIDE = 1e3  # limit of pumps that have none [U0]
-HALF = 300.0  # half period of the pulses (spec B.8) [s]
-CLOCK = Clock(dt=2.0, duration=1198.0, substeps=8)  # Ts, 600 samples (spec B.1, B.8), Runge-Kutta steps of 0.25 s
+HALF = 300.0  # half period of the pulses (notes A5) [s]
+CLOCK = Clock(dt=2.0, duration=1198.0, substeps=8)  # Ts, 600 samples (notes A1, S3), Runge-Kutta steps of 0.25 s
 MIDDLE = {
     1: (0.30, 0.06),
     2: (0.06, 0.075),
-}  # where the model is linearised: the middle of the pulse, by number of pumps (spec B.1) [m]
+}  # where the model is linearised: the middle of the pulse, by number of pumps (notes A4) [m]
 
 # scenario: (pumps, (low, high) of each output [m], start (H1, H2) [m], delay of the last output's pulses [s])
 SCENARIOS = {
@@ -59,21 +59,21 @@ TUNABLE = {
 }
 
 DEPARTURES = (
-    "Not printed, so chosen (spec B.1, B.8): sampling period 2 s, r_w = 0.01 (levels in m, inputs in 1e-4 m^3/s), half period of the "
+    "Not printed, so chosen (notes A1-A5): sampling period 2 s, r_w = 0.01 (levels in m, inputs in 1e-4 m^3/s), half period of the "
     "pulses 300 s, linearisation at the middle of the pulse, (0.30, 0.06) m with one pump and (0.06, 0.075) m with two.",
-    "Pulses: the cases run between 0.03 m and 0.15 m with one pump, 0.04-0.16 m and 0.03-0.18 m with two (spec S2, M2). The printed pulses "
-    "down to 0 m end at empty tanks, where gravity alone decides; `scenario('S1')` and 'M1' are those.",
+    "Pulses: the cases run between 0.03 m and 0.15 m with one pump, 0.04-0.16 m and 0.03-0.18 m with two (scenarios S2 and M2 of notes "
+    "S3). The printed pulses down to 0 m end at empty tanks, where gravity alone decides; `scenario('S1')` and 'M1' are those.",
     "Limits: the paper's simulations show none, and its conclusion leaves constraints to further work. The base cases let the flow go "
     "negative (limits of 1000 U0, levels stop at 0 m); '-constrained' solves the programme of eq. (32) with u in [0, 3] U0 and du within "
     "0.5 U0 per sample. controller.mode = clipped clips the linear law to the same limits.",
     "Pipe: sgn(H1-H2) sqrt|H1-H2| for the printed sqrt(H1-H2), since the references with two pumps have H1 < H2; its root and those of the "
-    "outlets are smooth within 1e-4 m, which moves no level by more than 4e-5 m (spec E.2).",
-    "Signs of eq. (2) and (9), C_m of eq. (16), the numerator of eq. (23), the sums of eq. (31) to Np: corrected (spec B.13).",
+    "outlets are smooth within 1e-4 m, which moves no level by more than 4e-5 m (notes H2).",
+    "Signs of eq. (2) and (9), C_m of eq. (16), the numerator of eq. (23), the sums of eq. (31) to Np: corrected (notes S5).",
     "Rim: the height of the tanks is not given; 1 m is above the highest level of the base cases, 0.91 m.",
     "Sensor: both levels are measured without noise; the converter's range is ours, and it is off.",
 )
 
-_SAME_RW = "figures without numbers; r_w and the sampling period are not printed, and the finding depends on them (spec B.11)"
+_SAME_RW = "figures without numbers; r_w and the sampling period are not printed, and the finding depends on them (notes S8)"
 PUBLISHED = {
     "plant.area": Published(9350e-6, "m^2", "Table I"),
     "plant.drain": Published(78.5e-6, "m^2", "Table I, s times a0 = 1"),
@@ -119,14 +119,14 @@ def tanks(pumps):
 
 
 def steady_input(pumps, x):
-    """(pumps,) inputs [U0] that hold the levels x = (H1, H2) [m] (spec B.2)."""
+    """(pumps,) inputs [U0] that hold the levels x = (H1, H2) [m] (notes S2.2)."""
     alpha = [CHANNEL * a * math.sqrt(2 * GRAVITY) / U0 for a in DISCHARGE]
     between = alpha[2] * math.copysign(math.sqrt(abs(x[0] - x[1])), x[0] - x[1])
     return (between,) if pumps == 1 else (alpha[0] * math.sqrt(x[0]) + between, alpha[1] * math.sqrt(x[1]) - between)
 
 
 def scenario(name):
-    """(reference, x0 [m], inputs before t = 0 [U0]) of a scenario of spec B.8: two periods of pulses, high first; M3 the last output later."""
+    """(reference, x0 [m], inputs before t = 0 [U0]) of a scenario of notes S3: two periods of pulses, high first; M3 the last output later."""
     pumps, spans, x0, delay = SCENARIOS[name]
     changes = []
     for channel, (low, high) in enumerate(spans):
@@ -255,7 +255,7 @@ def preset():
         for suffix, mode in (("", "unconstrained"), ("-constrained", "constrained")):
             loop = build(kind, mode=mode)
             free = ["controller.r_w"] + (["controller.a"] if law is Laguerre else [])
-            # the strongest single knob with one pump (spec D): overshoot falls where the model is that of a high level
+            # the strongest single knob with one pump (notes S10): overshoot falls where the model is that of a high level
             free += ["controller.operating_point[1]"] if loop.plant.pumps == 1 else ["controller.q[1]"]
             cases[kind + suffix] = Case(
                 name=f"khalid/{kind}{suffix}",
@@ -264,7 +264,7 @@ def preset():
                 clock=CLOCK,
                 limits={"max_level": "rim"},
                 free={name: TUNABLE[name.replace("q[1]", "q")] for name in free},
-                # J of spec D with its price of overshoot: the error alone is flat once the pumps saturate
+                # J of notes S10 with its price of overshoot: the error alone is flat once the pumps saturate
                 objective={"mean_square_error": 1e4, "mean_square_travel": 20.0, "mean_square_overshoot": 1e5},
             )
     return Preset(

@@ -20,7 +20,7 @@ SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]
 WARM = (6.0, 6.0)  # where the -warm cases start [cm]
 HIGH = 5.0  # upper limit of the pumps, not in the paper [V]
 SPLIT = (0.42, 0.34)  # gamma, Table 1
-UNROUNDED_SPLIT = (0.4165, 0.3414)  # with which Q = C'C, R = 3 I gives the printed K to its last digit (spec 3)
+UNROUNDED_SPLIT = (0.4165, 0.3414)  # with which Q = C'C, R = 3 I gives the printed K to its last digit (notes S4.1)
 GAIN = ((0.2422, 0.1954, 0.0522, 0.1541), (0.1932, 0.1409, 0.1675, -0.0144))  # K, sec. 6 [V/cm]
 
 
@@ -36,7 +36,7 @@ def plant(split=SPLIT):
 
 
 def sliding(model, printed=False):
-    """The sliding-mode law: as printed (sec. 6), or corrected (spec 4.3)."""
+    """The sliding-mode law: as printed (sec. 6), or corrected (notes S4.4)."""
     values = (10.0, 1.0, 0.1) if printed else (0.05, 0.03, 0.1)
     surface, ks, phi = (number(v) for v in values)
     form, switch = ("printed", "sign") if printed else ("corrected", "tanh")
@@ -44,7 +44,7 @@ def sliding(model, printed=False):
 
 
 def blend(model):
-    """The fuzzy blend of the corrected sliding mode and the paper's state feedback (spec 5)."""
+    """The fuzzy blend of the corrected sliding mode and the paper's state feedback (notes S4.5)."""
     return FuzzyBlend(
         model=model,
         K=number(GAIN),
@@ -59,7 +59,7 @@ def blend(model):
 
 
 def integral(model):
-    """State feedback with integral action (spec 8)."""
+    """State feedback with integral action (notes S4.6)."""
     return LQI(
         model=model,
         Q=number([1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3]),
@@ -68,7 +68,7 @@ def integral(model):
     )
 
 
-# What Table 3 needs besides what is printed (spec 7.2): pumps to 5.8 V and 5 % stronger than modelled, the printed law as a relay
+# What Table 3 needs besides what is printed (notes S7.2): pumps to 5.8 V and 5 % stronger than modelled, the printed law as a relay
 # (ks 100 drowns its chatter), memberships 3.25 +- 1.5 cm
 RELAY = {"controller.surface": 10.0, "controller.ks": 100.0, "controller.form": "printed", "controller.switch": "sign"}
 STRONGER = {"actuator.high": 5.8, "plant.pump_gain": [1.05 * 27.43, 1.05 * 19.55]}
@@ -97,14 +97,14 @@ TUNABLE = {
 }
 
 
-COST = {"ise": 1.0, "input_deviation": 3.0, "input_travel": 0.1}  # J of spec 6, with its price of travel
+COST = {"ise": 1.0, "input_deviation": 3.0, "input_travel": 0.1}  # J of notes S3, with its price of travel
 ROUGH = {"rms_error_total": 1.0, "input_travel": 1e-3}  # for the law that chatters: its slopes are not worth seven runs
 
 _MISSING = (
     "h(0), the pumps' range, the estimator of the level rates, the membership functions (Fig. 3) and the length of the record are not "
-    "given; overshoots and two settling times agree under one set of assumptions, the rise times do not at the same time (spec 7.2)"
+    "given; overshoots and two settling times agree under one set of assumptions, the rise times do not at the same time (notes S7.2)"
 )
-_LMSE = "the mean square error is not defined; ours is the mean of e^2 over 400 s, as a share of the setpoint squared (spec 6)"
+_LMSE = "the mean square error is not defined; ours is the mean of e^2 over 400 s, as a share of the setpoint squared (notes S3)"
 _TABLE = "Table 3, tank 1"
 
 PUBLISHED = {
@@ -118,10 +118,10 @@ PUBLISHED = {
     "gamma1 + gamma2": Published(0.76, "-", "sec. 3", 0.005),
     "controller.K": Published(tuple(v for row in GAIN for v in row), "V/cm", "sec. 6"),
     "controller.surface": Published(
-        10.0, "1/s", "sec. 6", reason="no sliding mode exists above 0.088 1/s (spec 4.2); smc-printed has it, smc and hybrid 0.05"
+        10.0, "1/s", "sec. 6", reason="no sliding mode exists above 0.088 1/s (notes S4.3); smc-printed has it, smc and hybrid 0.05"
     ),
     "controller.ks": Published(
-        1.0, "cm/s^2", "sec. 6", reason="40 to 60 times what the pumps can do (spec 0); smc-printed has it, smc and hybrid 0.03"
+        1.0, "cm/s^2", "sec. 6", reason="40 to 60 times what the pumps can do (notes S1); smc-printed has it, smc and hybrid 0.03"
     ),
     "fit of the model": Published(84.0, "%", "sec. 3", reason="the record and Appendix I are not available"),
     "overshoot, SMC": Published(44.16, "%", _TABLE, reason=_MISSING),
@@ -142,14 +142,14 @@ PUBLISHED = {
         "hits the SFC much more than the hybrid",
         "",
         "sec. 6, Fig. 9",
-        reason="'the outlet hose of pump 1' may be the pump's hose or the outlet of tank 1: it holds for some readings (spec 8)",
+        reason="'the outlet hose of pump 1' may be the pump's hose or the outlet of tank 1: it holds for some readings (notes S7.3)",
     ),
-    "zero steady-state error of the SFC": Published("zero", "", "sec. 4.3, 7", reason="it has no integral action (spec E21)"),
+    "zero steady-state error of the SFC": Published("zero", "", "sec. 4.3, 7", reason="it has no integral action (notes E21)"),
     "stability proof": Published(
         "sec. 5",
         "",
         "eqs. (18)-(36)",
-        reason="P of eq. (33) has rank 2 of 6 and eq. (36) is indefinite for the printed K (spec E14-E20): not a proof",
+        reason="P of eq. (33) has rank 2 of 6 and eq. (36) is indefinite for the printed K (notes E14-E20): not a proof",
     ),
 }
 
@@ -162,22 +162,22 @@ UNCERTAIN = {
 
 DEPARTURES = (
     "Start and pumps: neither the initial levels nor the pumps' range is given. Empty tanks (or rest at 6 cm, '-warm') and 0 to 5 V, at which "
-    "tank 1 just reaches its rim (spec 1).",
-    "SFC: u = u0 - K (h - h0). Eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P, which is unstable and leaves the pumps off (spec E11).",
-    "smc, hybrid: the corrected sliding mode of spec 4.3 with its own lambda, ks and boundary layer. As printed, with the direct flow "
+    "tank 1 just reaches its rim (notes A1, A2).",
+    "SFC: u = u0 - K (h - h0). Eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P, which is unstable and leaves the pumps off (notes E11).",
+    "smc, hybrid: the corrected sliding mode of notes S4.4 with its own lambda, ks and boundary layer. As printed, with the direct flow "
     "left out of the design, no sliding mode exists on the paper's own model; smc-printed shows it, with the level rates of the full "
-    "model (spec 4.1 a).",
+    "model (notes S4.2, reading a).",
     "hybrid: Fig. 3 is missing. Memberships are smoothsteps of |e| that cross at b with half width w; the sliding-mode voltages are held within "
-    "0 to 5 V before they are blended (controller.low, controller.high: change them together with actuator.high) (spec 5).",
+    "0 to 5 V before they are blended (controller.low, controller.high: change them together with actuator.high) (notes S4.5).",
     "hybrid: |e1| decides on u2 and |e2| on u1, as the text has it; eq. (17) pairs equal indices (controller.pairing = 'same').",
-    "lqi is not in the paper: the honest baseline with integral action (spec 8).",
+    "lqi is not in the paper: the honest baseline with integral action (notes S4.6).",
     "K was found to be the linear-quadratic gain of Q = C'C and R = 3 I with gamma = (0.4165, 0.3414); the rig has the printed (0.42, 0.34).",
     "The sensors' range and the 400 s of a run are not in the paper.",
 )
 
 
 def rehearsal():
-    """The runs that tuning is judged by (spec 10): the case's own start, and from rest at the
+    """The runs that tuning is judged by (notes S10): the case's own start, and from rest at the
     setpoint with one number of the plant off; 0.05 cm of noise on all levels, where the case has
     none. Without noise and travel the gains run away."""
     rest = dict.fromkeys(("x0", "actuator.initial", "reference.initial"), "steady")
@@ -217,7 +217,7 @@ def build(kind, warm=False):
 
 
 def response(trajectory, output=0):
-    """Of a step from rest to SETPOINT: {overshoot [% of the setpoint], rise [s], arrival [s], settling [s], mean_square [-]} (spec 6).
+    """Of a step from rest to SETPOINT: {overshoot [% of the setpoint], rise [s], arrival [s], settling [s], mean_square [-]} (notes S3).
 
     rise: 10 to 90 % of the way; arrival: first at the setpoint; settling: last outside 5 % of it; None where it does not happen.
     mean_square: of the error, over the square of the setpoint.
@@ -263,7 +263,7 @@ def measured(run):
             value, printed = like[law][quantity], PUBLISHED[f"{word}, {law}"].value
             near = value is None if isinstance(printed, str) else value is not None and abs(value - printed) <= 0.11 * printed
             others = ", ".join(f"{shown(own[case][quantity], units[quantity])} in {case}" for case in cases[law])
-            text = f"{shown(value, units[quantity])} under the assumptions of spec 7.2; {others}"
+            text = f"{shown(value, units[quantity])} under the assumptions of notes S7.2; {others}"
             # never simply "reproduced": the assumptions were chosen for it
             found[f"{word}, {law}"] = Claim("partly" if near else "not reproduced", text)
     narrow = {"plant.drain": [0.7 * 0.50265, 0.50265, 0.0, 0.0]}
@@ -279,7 +279,7 @@ def measured(run):
         "gamma1 + gamma2": float(np.sum(run("sfc")[0].loop.plant.split)),
         "SFC rises more slowly": Claim(
             "reproduced" if faster else "not reproduced",
-            "; ".join(f"{law} {shown(like[law]['arrival'], ' s')}" for law in like) + " under the assumptions of spec 7.2",
+            "; ".join(f"{law} {shown(like[law]['arrival'], ' s')}" for law in like) + " under the assumptions of notes S7.2",
         ),
         "chattering of the SMC": Claim(
             "reproduced" if travel["smc-printed"] > 1e3 else "not reproduced",

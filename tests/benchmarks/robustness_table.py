@@ -4,7 +4,7 @@
     python tests/benchmarks/robustness_table.py --markdown    # the same, into the README
 
 200 plants with c1, c2, c3, c7, c8 (and their twins) off by up to 5 and 10 %; the paper gives no ranges, nor numbers. Ramps of 30 s, steps of
-0.02 s (spec 11). Intervals of means and medians by resampling plants in pairs, of shares by Clopper and Pearson.
+0.02 s (gouta2015 notes S11). Intervals of means and medians by resampling plants in pairs, of shares by Clopper and Pearson.
 """
 
 import re

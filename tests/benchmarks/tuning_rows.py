@@ -1,7 +1,7 @@
 """Which tunings the README's table of gains is made of: the case, what is free, what is made small, what it is judged on besides.
 
-A target is the number of our re-derivation of the paper (spec 10 of gouta2015, 7 of gouta2022, 10 of mirakhorli, A.8 and D of calofir and
-khalid), which the tuned objective must reach to 1 % or half a unit of its last digit; tests/test_tuning_rows.py asks for it.
+A target is the number of our re-derivation of the paper (S10 of its
+notes), which the tuned objective must reach to 1 % or half a unit of its last digit; tests/test_tuning_rows.py asks for it.
 """
 
 from typing import Any, NamedTuple
@@ -51,7 +51,7 @@ def case_of(row):
     return rig.set_values(case, row.values)
 
 
-# gouta2015: ranges of spec 10 for k; Tp beyond the 330 s at which plant A has its best
+# gouta2015 notes S10: ranges for k; Tp beyond the 330 s at which plant A has its best
 FOUR_TANK = {
     "ngpc": {"controller.Tp": Free(0.5, 400.0)},
     "backstepping": {"controller.k": Free(1e-4, 7.4), "controller.k1": Free(1e-4, 7.4)},
@@ -93,7 +93,7 @@ def four_tank():
 
 
 def unseen():
-    """The held-out runs of spec 10 of mirakhorli: plants and seeds that `mirakhorli.rehearsal` does not have."""
+    """The held-out runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal` does not have."""
     x0, u0 = equilibrium(mirakhorli.plant(), mirakhorli.SETPOINT)
     warm_x, warm_u = equilibrium(mirakhorli.plant(), mirakhorli.WARM)
     k1, k2, (g1, g2), a2 = 27.43, 19.55, mirakhorli.SPLIT, 0.50265
@@ -152,10 +152,10 @@ def two_tank():
     return rows
 
 
-PLAIN = {"mean_square_error": 1e4, "mean_square_travel": 20.0}  # J of spec D [cm^2]
+PLAIN = {"mean_square_error": 1e4, "mean_square_travel": 20.0}  # J of khalid notes S10 [cm^2]
 # with its price of overshoot, 10 times that of the error: a mean over the plateaus after a rise, which are half of the run
 PRICED = {**PLAIN, "mean_square_overshoot": 2e5}
-# two pumps: spec D runs 300 samples and takes the mean over both pumps, not their sum, of the travel (its starting values 6.040, 7.842 and
+# two pumps: the prototype runs 300 samples and takes the mean over both pumps, not their sum, of the travel (its starting values 6.040, 7.842 and
 # 6.484 are then met to 4 digits)
 HALF = {"clock.duration": 598.0}
 PLAIN_TWO, PRICED_TWO = ({**terms, "mean_square_travel": 10.0} for terms in (PLAIN, PRICED))
@@ -168,7 +168,7 @@ def clipped():
 
 
 def delayed():
-    """Two pumps, scenario M3 of spec B.8, which has no steady state half of the time; limits in the programme."""
+    """Two pumps, scenario M3 of khalid notes S3, which has no steady state half of the time; limits in the programme."""
     return khalid.build("laguerre-mimo", "M3", mode="constrained")
 
 
