@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.numerics import at_least, clip
-from jaxtank.tree import component, leaf, static
+from jaxtank.core.numerics import at_least, clip
+from jaxtank.core.tree import component, leaf, static
 
 SATURATIONS = ("clip", "boxqp")
 DEAD_ZONES = ("plain", "offset", "hysteresis", "pulse")

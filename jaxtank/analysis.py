@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.errors import EquilibriumError, InputError
-from jaxtank.numerics import root
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.numerics import root
 
 
 def _balance(plant, xp=jnp):

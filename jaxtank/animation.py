@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.patches import Rectangle
 
-from jaxtank.errors import InputError
-from jaxtank.files import write_atomic
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import write_atomic
 from jaxtank.layout import place
 from jaxtank.plotting import PUMPS, WATER, styled
 from jaxtank.schematic import HALO, depth, mark, mark_height, schematic

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 REAL, WHOLE, TRUTH = "real", "whole", "truth"
 LARGE = 300

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxtank import measures as ms
+from jaxtank.core.tree import with_values
 from jaxtank.dependence import reached
 from jaxtank.invariants import scan
 from jaxtank.materialise import materialised
 from jaxtank.stepping import initial, inputs, is_broken, keyed, run_of, step
-from jaxtank.tree import with_values
 
 OUTER = 12
 """Number of parameters above which the Gauss-Newton matrix grows by a matrix product: element by element the compiler makes each slope

@@ -5,13 +5,14 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtank.errors import InputError
+from jaxtank.core.clock import check_clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import check_key
+from jaxtank.core.tree import check_leaves, is_component
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
-from jaxtank.records import check_clock, check_key
 from jaxtank.shapes import check_shapes
 from jaxtank.step_length import check_step
-from jaxtank.tree import check_leaves, is_component
 
 
 def check(loop, clock, key=None):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.units import local
+from jaxtank.core.units import local
 
 
 def equations(plant, disturbed=False):

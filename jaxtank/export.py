@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxtank import codegen as cg
 from jaxtank.controllers import OpenLoop
-from jaxtank.errors import InputError
-from jaxtank.records import Tick
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Tick
 from jaxtank.stepping import commanded, initial
 
 LANGUAGES = ("c", "m")
@@ -297,7 +297,7 @@ def _about(law, case, mark, name, begin):
 
 
 def _shown(case):
-    from jaxtank.tree import walk
+    from jaxtank.core.tree import walk
 
     found = {}
     for name, value, meta in walk(case.loop.controller, "controller.", units=case.loop.units):

@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.errors import InputError, NonFiniteError
+from jaxtank.core.records import Trajectory
+from jaxtank.core.tree import parameters, with_values
 from jaxtank.derivatives import _sensitivities
 from jaxtank.door import check
-from jaxtank.errors import InputError, NonFiniteError
 from jaxtank.invariants import scan
-from jaxtank.pieces import PIECE, is_pointwise
-from jaxtank.records import Clock, Trajectory
 from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, keyed, run_of, step, zero_of
-from jaxtank.tree import parameters, with_values
 
 
 def simulate(loop, clock, key=None, save_every=1):

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.compensated import nothing, plus, totals
-from jaxtank.errors import unknown
-from jaxtank.numerics import at_least, magnitude, root_of_mean
-from jaxtank.units import DEFAULT, local
+from jaxtank.core.errors import unknown
+from jaxtank.core.kahan import nothing, plus, totals
+from jaxtank.core.numerics import at_least, magnitude, root_of_mean
+from jaxtank.core.units import DEFAULT, local
 
 BAND = 0.05
 """Half width of the recovery band, as a share of the setpoint [-]."""

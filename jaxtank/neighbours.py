@@ -3,8 +3,8 @@
 import numpy as np
 
 from jaxtank.analysis import equilibrium, linearise
-from jaxtank.errors import InputError
-from jaxtank.units import local
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import local
 
 
 def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):

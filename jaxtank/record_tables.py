@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxtank.errors import InputError, unknown
-from jaxtank.tree import _short, describe, get_value
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import _short, describe, get_value
 
 
 def check_log(plant, table):

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.numerics import clip, quantise
-from jaxtank.pieces import PIECE
-from jaxtank.tree import component, leaf, static
+from jaxtank.core.clock import PIECE
+from jaxtank.core.numerics import clip, quantise
+from jaxtank.core.tree import component, leaf, static
 
 
 @component

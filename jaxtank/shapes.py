@@ -9,9 +9,9 @@ import re
 
 import numpy as np
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import is_component
 from jaxtank.plants.base import Plant
-from jaxtank.tree import is_component
 
 _SAID = re.compile(r"\(([a-z0-9, +]+)\) ")
 

@@ -10,9 +10,9 @@ import math
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.pieces import Piece, indices, pointwise, sample_times
-from jaxtank.tree import component, leaf, number, static
+from jaxtank.core.clock import Piece, indices, pointwise, sample_times
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component, leaf, number, static
 
 SHAPES = ("linear", "quintic")
 

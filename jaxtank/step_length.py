@@ -19,8 +19,8 @@ import warnings
 
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.tree import split_index, walk
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import split_index, walk
 
 LIMITS = {"rk4": 2.785, "midpoint": 2.0}
 SEEN = 0.01  # share of the levels that a run is about up to which one may be thrown without a word

@@ -12,19 +12,19 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.actuators import PumpBank
 from jaxtank.analysis import steady_along
-from jaxtank.compensated import added
 from jaxtank.controllers.base import Controller
-from jaxtank.errors import InputError
+from jaxtank.core.clock import PIECE, Piece
+from jaxtank.core.errors import InputError
+from jaxtank.core.kahan import added
+from jaxtank.core.records import Sample, Tick
+from jaxtank.core.tree import component, leaf
 from jaxtank.materialise import materialised
 from jaxtank.observers.base import Observer
-from jaxtank.pieces import PIECE, Piece
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.integration import change, integrate
-from jaxtank.records import Sample, Tick
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Signal
-from jaxtank.tree import component, leaf
 
 
 @component

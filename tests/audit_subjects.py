@@ -10,14 +10,16 @@ import numpy as np
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import actuators, analysis, linear, measures, numerics, observers, presets, qp, scheduling, sensors, signals
+from jaxtank import actuators, analysis, linear, measures, observers, presets, qp, scheduling, sensors, signals
 from jaxtank.controllers.fuzzy import membership
+from jaxtank.core import numerics
+from jaxtank.core.clock import Clock
+from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.plants import faults, hydraulics
+from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
 from jaxtank.plants.rigs import johansson, state_coupled_four_tank
 from jaxtank.presets.gouta2015 import FAST_AREA
-from jaxtank.records import Clock, Estimate, Sample, Tick
-from jaxtank.stepping import integrate
 
 SUBJECTS, QUICK = {}, set()
 POINTS = 12

@@ -215,7 +215,7 @@ def recorded():
 
 def record(rows, known):
     """Keep `rows` beside those kept before of subjects that are still `known`; the sum of all goes to survived.json."""
-    from jaxtank.files import write_atomic
+    from jaxtank.core.files import write_atomic
 
     here, kept = Path(__file__).parent, recorded()
     kept = {n: kept[n] for n in known if n in kept} | {r.name: list(r[1:]) for r in rows}

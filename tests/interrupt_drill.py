@@ -20,7 +20,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from jaxtank import files
+from jaxtank.core import files
 
 # what the console script `jaxtank` does
 JAXTANK = [sys.executable, "-c", "import sys; from tuning.cli import main; sys.exit(main())"]

@@ -19,14 +19,14 @@ import jaxtank
 from jaxtank import presets, step_length
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
-from jaxtank.errors import InputError
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, ramps
-from jaxtank.tree import with_values
+from jaxtank.stepping import ClosedLoop
 
 OFF = 0.05  # share of the rim
 RIM = 10.0

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from xml.etree import ElementTree
 
-from jaxtank.files import write_atomic
+from jaxtank.core.files import write_atomic
 
 HERE = Path(__file__).parent
 README, KEPT = HERE.parent / "README.md", HERE / "survived.json"

@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxtank
 from jaxtank import animation, plotting
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 
 @pytest.fixture(scope="module")

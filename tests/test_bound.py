@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear, minimize
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from tuning.bound import bound
 from tuning.input_search import TOLERANCE, InputSearch
 from tuning.inputs import open_loop, value_and_gradient

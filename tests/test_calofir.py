@@ -16,14 +16,14 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers import OpenLoop
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import with_values
 from jaxtank.loop import _evaluate
+from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
 from jaxtank.presets import calofir
-from jaxtank.records import Estimate, Tick
 from jaxtank.signals import ramps
-from jaxtank.stepping import integrate
-from jaxtank.tree import with_values
 
 CASES = presets.load("calofir").cases
 NAMES = ["controller.K_phi", "controller.K_y"]

@@ -13,11 +13,11 @@ from scipy.optimize import least_squares
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import _evaluate
 from jaxtank.presets import cascaded
-from jaxtank.records import Clock
 from jaxtank.signals import Table
-from jaxtank.tree import get_value, with_values
 from tuning import cli
 
 CASES = presets.load("cascaded").cases

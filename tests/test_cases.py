@@ -6,9 +6,9 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, walk
 from jaxtank.loop import _evaluate
-from jaxtank.tree import get_value, walk
 from tuning import cli
 from tuning.bench import is_one_function
 from tuning.compare import measure
@@ -117,7 +117,7 @@ def test_printed_units_follow_the_rig(capsys):
     assert cli.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
     said = capsys.readouterr().out
     assert " m " in said and "m^3/s" in said and "cm" not in said
-    assert jaxtank.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"] == "m^3/(s U0)"
+    assert jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"] == "m^3/(s U0)"
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import measures, presets, rig
-from jaxtank.records import Clock
-from jaxtank.tree import parameters
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import parameters
 from tuning import cli, tune_command
 
 CASE = "gouta2015/backstepping"

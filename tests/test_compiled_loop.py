@@ -12,10 +12,11 @@ import pytest
 
 import jaxtank
 from jaxtank import _xla, invariants
-from jaxtank.compensated import nothing, plus, totals
-from jaxtank.loop import _evaluate, _sensitivities, evaluate_for_reverse
+from jaxtank.core.clock import Clock
+from jaxtank.core.kahan import nothing, plus, totals
+from jaxtank.derivatives import _sensitivities
+from jaxtank.loop import _evaluate, evaluate_for_reverse
 from jaxtank.materialise import materialised
-from jaxtank.records import Clock
 from tuning import bench
 
 MEASURES = ("rms_error_total", "max_level")

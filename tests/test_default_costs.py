@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from jaxtank.tree import parameters, split_index
+from jaxtank.core.tree import parameters, split_index
 from tuning.objective import Problem
 
 QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")  # the others compile for long

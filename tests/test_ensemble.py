@@ -17,9 +17,9 @@ import jaxtank
 import tuning
 from jaxtank import loop as lp
 from jaxtank import rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.presets import Scenario
-from jaxtank.tree import with_values
 from tuning import evidence, parts, robust, shards
 from tuning.distributions import Draws, parse, stated
 from tuning.ensemble import clopper_pearson, probabilities

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import presets, rig, units
+from jaxtank import presets, rig
 from jaxtank.controllers.base import Controller
-from jaxtank.errors import InputError
+from jaxtank.core import units
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component
 from jaxtank.export import export
 from jaxtank.plants.network import network
 from jaxtank.rig import words as rig_words
-from jaxtank.tree import component
 from tuning import cli
 
 SAMPLES = 10_000

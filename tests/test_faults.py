@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import files, plotting, presets
-from jaxtank.errors import InputError
+from jaxtank import plotting, presets
+from jaxtank.core import files
+from jaxtank.core.errors import InputError
 from tuning import cli, holds, memo, parts, pictures
 
 HERE = Path(__file__).parent

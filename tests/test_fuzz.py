@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from tuning import cli
 from tuning.log_file import read_log
 

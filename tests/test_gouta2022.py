@@ -11,9 +11,9 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.analysis import equilibrium, linearise
 from jaxtank.controllers.pid import oustaloup
-from jaxtank.errors import EquilibriumError, InputError
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.presets import gouta2022 as paper
-from jaxtank.records import Clock
 
 CASES = paper.preset().cases
 NO_DEAD_ZONE = {"actuator.dead_zone": 0.0}

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 from gradient_audit import STEPS, Subject, audit, differences, told
 
-from jaxtank import actuators, numerics, presets, sensors
+from jaxtank import actuators, presets, sensors
 from jaxtank.controllers.fuzzy import membership
+from jaxtank.core import numerics
+from jaxtank.core.clock import Clock
 from jaxtank.loop import evaluate_and_flag
 from jaxtank.plants.network import network
-from jaxtank.records import Clock
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import jaxtank
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import evaluate_for_reverse
-from jaxtank.tree import get_value, with_values
 
 STEP = 1e-5
 

@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 import jaxtank
 import tuning
 from jaxtank import presets, rig
-from jaxtank.errors import DataError, InputError
-from jaxtank.tree import get_value, with_values
+from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.tree import get_value, with_values
 from tuning import cli, identifiability, playback
 from tuning.bounds import bounds
 from tuning.coordinates import coordinates

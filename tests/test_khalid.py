@@ -22,10 +22,10 @@ from jaxtank import presets, rig
 from jaxtank.controllers import GPC
 from jaxtank.controllers.incremental import EXACT, incremental_model
 from jaxtank.controllers.laguerre import laguerre_functions
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.loop import _evaluate
 from jaxtank.presets import khalid
-from jaxtank.tree import with_values
 
 DT = 2.0
 PRESET = presets.load("khalid")

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxtank import presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from jaxtank.rig.lexing import MOST, MOST_WORDS, check_keys
 
 HEAD = 'case = "gouta2015/backstepping"\n'

@@ -9,7 +9,7 @@ import pytest
 
 import tuning
 from jaxtank import presets, rig
-from jaxtank.errors import DataError, InputError
+from jaxtank.core.errors import DataError, InputError
 from tuning import cli, logs
 from tuning.log_file import read_log, split_header
 

@@ -18,15 +18,15 @@ import tuning
 from jaxtank import presets
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
-from jaxtank.loop import ClosedLoop, evaluate_for_reverse
+from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.tree import component
+from jaxtank.loop import evaluate_for_reverse
 from jaxtank.observers import Direct
-from jaxtank.pieces import PIECE, is_pointwise
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, Sine, Table, pours, ramps
-from jaxtank.tree import component
+from jaxtank.stepping import ClosedLoop
 
 DT = 0.01
 LONG = [100_000, pytest.param(10_000_000, marks=pytest.mark.slow)]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
+from jaxtank.core.tree import walk
 from jaxtank.equations import equations
-from jaxtank.tree import walk
 from tuning import cli, manual
 
 NAMES = list(

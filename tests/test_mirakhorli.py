@@ -29,17 +29,18 @@ from jaxtank.analysis import (
 from jaxtank.controllers import LQI, SlidingMode, StateFeedback
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.controllers.sliding_mode import acceleration, lower_tanks
-from jaxtank.errors import EquilibriumError, InputError
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.numerics import signed_root, signed_root_slope
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import component, number, with_values
 from jaxtank.linear import lqr
-from jaxtank.numerics import signed_root, signed_root_slope
 from jaxtank.plants import state_coupled_four_tank
+from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.presets import load, mirakhorli
 from jaxtank.presets.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, response
-from jaxtank.records import Clock, Estimate, Tick
-from jaxtank.stepping import integrate
-from jaxtank.tree import component, number, with_values
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -507,7 +508,7 @@ def test_cost_and_its_slopes(kind, prototype_root):
         t = jaxtank.simulate(with_values(loop, dict(zip(slopes, values))), case.clock)
         return 0.1 * jnp.sum(t.e[:-1] ** 2) + 0.3 * jnp.sum((t.u[:-1] - jnp.asarray(U0)) ** 2)
 
-    point = jnp.array([float(jaxtank.tree.get_value(loop, n)) for n in slopes])
+    point = jnp.array([float(jaxtank.core.tree.get_value(loop, n)) for n in slopes])
     found, forward = jax.jit(lambda p: (cost(p), jax.jacfwd(cost)(p)))(point)
     if prototype_root:
         np.testing.assert_allclose(found, expected, atol=1e-4)

@@ -10,7 +10,7 @@ import pytest
 
 import jaxtank
 from jaxtank import neighbours, presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 
 def test_python_control_sees_the_linearised_rig():

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxtank import InputError, _xla, evaluate, presets, sensitivities, with_values
-from jaxtank.records import Clock
+from jaxtank.core.clock import Clock
 
 RUNS = """
 import json, sys

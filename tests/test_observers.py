@@ -10,13 +10,14 @@ from scipy.linalg import expm, solve_discrete_are
 
 import jaxtank
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import InputError
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Tick
+from jaxtank.core.tree import component, get_value, number, static, with_values
 from jaxtank.loop import _evaluate
 from jaxtank.observers import ExtendedKalman, Kalman
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.base import Plant
-from jaxtank.records import Clock, Tick
-from jaxtank.tree import component, get_value, number, static, with_values
 
 PLANT = state_coupled_four_tank(15 * 2**0.5)
 LEVELS, INPUTS = equilibrium(PLANT, (8.0, 8.0))

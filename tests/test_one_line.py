@@ -3,9 +3,9 @@
 import pytest
 
 from jaxtank import rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import MOST, one_line, printable
 from tuning import cli
-from tuning.one_line import MOST, one_line, printable
 
 RED = "a\033[31m.csv"
 ESCAPED = r"a\x1b[31m.csv"

@@ -11,11 +11,12 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 import tuning
-from jaxtank import numerics, presets
+from jaxtank import presets
 from jaxtank.controllers.base import Controller
+from jaxtank.core import numerics
+from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.export import export
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf, number, static
 
 
 @component

@@ -9,12 +9,12 @@ from scipy.integrate import solve_ivp
 import jaxtank
 from jaxtank import measures as ms
 from jaxtank.actuators import PumpBank
-from jaxtank.errors import InputError
-from jaxtank.numerics import at_least, clip, quantise
-from jaxtank.records import Clock
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import at_least, clip, quantise
+from jaxtank.core.tree import number
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, ramps
-from jaxtank.tree import number
 
 # signals
 
@@ -259,7 +259,7 @@ def fake_run(error, dt=1.0):
 
 def folded(names, levels, target, step, since, u=None, command=None, r=None):
     """Measures of a hand-made run of one tank."""
-    from jaxtank.records import Sample
+    from jaxtank.core.records import Sample
 
     run = fake_run(levels)
     states = ms.start(run, names)

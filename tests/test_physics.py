@@ -12,13 +12,13 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError
-from jaxtank.numerics import ROOT_KNEE, floored_root, root
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.numerics import ROOT_KNEE, floored_root, root
 from jaxtank.plants import state_coupled_four_tank
+from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
 from jaxtank.presets.gouta2015 import FAST_AREA
-from jaxtank.records import Clock
-from jaxtank.stepping import integrate
 
 QUIET = settings(deadline=None, max_examples=8, derandomize=True)
 
@@ -340,7 +340,7 @@ def test_a_quadruple_tank_splits_its_pumps():
 def test_the_clock_does_not_drift():
     clock = Clock(dt=0.01, duration=1200.0)
     assert clock.samples == 120001
-    from jaxtank.signals import sample_times
+    from jaxtank.core.clock import sample_times
 
     assert sample_times(clock)[-1] == 1200.0 and sample_times(clock)[47000] == 470.0
 

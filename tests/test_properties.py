@@ -18,11 +18,11 @@ from scipy.integrate import solve_ivp
 from test_physics import in_metres
 
 from jaxtank.analysis import steady_levels
+from jaxtank.core.tree import component
 from jaxtank.invariants import scan
 from jaxtank.plants import Plant
+from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import TankNetwork, network
-from jaxtank.stepping import integrate
-from jaxtank.tree import component
 
 STILL = np.zeros(SIZE)
 LONGEST = 2560

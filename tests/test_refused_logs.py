@@ -5,7 +5,7 @@ import pytest
 
 import tuning
 from jaxtank import presets
-from jaxtank.errors import DataError
+from jaxtank.core.errors import DataError
 from tuning import cli
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"

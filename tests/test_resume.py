@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import files
-from jaxtank.errors import InputError
+from jaxtank.core import files
+from jaxtank.core.errors import InputError
 from tuning import memo, parts
 from tuning.memo import NAME, Log, Memo
 

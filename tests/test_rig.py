@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
-from jaxtank.errors import EquilibriumError, InputError
-from jaxtank.files import LARGEST_TEXT
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.files import LARGEST_TEXT
+from jaxtank.core.tree import parameters
 from jaxtank.presets.base import Free
-from jaxtank.records import Clock
 from jaxtank.rig.words import toml
 from jaxtank.signals import Constant, ramps
-from jaxtank.tree import parameters
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import jaxtank
 import tuning
 from jaxtank import controllers, equations, parameters, presets, rig, with_values
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
 from tuning import cli
 

@@ -13,10 +13,10 @@ import pytest
 
 import jaxtank
 from jaxtank import parameters, presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import walk
 from jaxtank.measures import MEASURES, TIMES
-from jaxtank.records import Clock
-from jaxtank.tree import walk
 from tuning import cli, options
 
 HEAD = 'case = "gouta2015/backstepping"\n'

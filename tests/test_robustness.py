@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank.tree import with_values
+from jaxtank.core.tree import with_values
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 

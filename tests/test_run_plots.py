@@ -9,7 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
 from jaxtank import plotting, presets, rig, run_plots
-from jaxtank.records import Trajectory
+from jaxtank.core.records import Trajectory
 
 
 @pytest.fixture

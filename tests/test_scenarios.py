@@ -9,9 +9,9 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import presets, rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.presets import Mirror, Scenario
-from jaxtank.tree import with_values
 from tuning import evidence, solvers
 from tuning.objective import Limit, Point, Problem
 from tuning.solvers import Search
@@ -227,7 +227,7 @@ def test_a_value_relative_to_the_case(case, name, value, found):
     def of(one):
         if name.startswith("clock."):
             return one.clock.duration
-        return one.loop.reference.ramp if name == "reference.ramp" else jaxtank.tree.get_value(one.loop, name)
+        return one.loop.reference.ramp if name == "reference.ramp" else jaxtank.core.tree.get_value(one.loop, name)
 
     np.testing.assert_array_equal(of(rig.set_scenario(case, {name: value})), found(of(case)))
 

@@ -15,13 +15,14 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.controllers import Backstepping, Controller, Scheduled
 from jaxtank.controllers.scheduled import interpolate
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import portion
+from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
 from jaxtank.dependence import use_of
-from jaxtank.errors import InputError
-from jaxtank.loop import _evaluate, _sensitivities, evaluate_and_flag, evaluate_for_reverse
-from jaxtank.numerics import portion
+from jaxtank.derivatives import _sensitivities
+from jaxtank.loop import _evaluate, evaluate_and_flag, evaluate_for_reverse
 from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
-from jaxtank.tree import component, describe, get_value, leaf, parameters, with_values
 from tuning import cli
 
 # 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within rounding of the others, where the slope would
@@ -102,8 +103,8 @@ def test_at_every_sample_the_law_has_the_gains_of_that_sample(gouta, variable):
     assert at.min() < KNOTS[0] and at.max() > 7.0
     for row in range(len(run.t)):
         k, k1 = (np.interp(at[row], KNOTS, v) for v in VALUES)
-        now = jaxtank.records.Tick(t=0.0, r=tuple(run.r[row]), dr=(0.0, 0.0), ddr=(0.0, 0.0))
-        there = jaxtank.records.Estimate(x=tuple(run.x[row]))
+        now = jaxtank.core.records.Tick(t=0.0, r=tuple(run.r[row]), dr=(0.0, 0.0), ddr=(0.0, 0.0))
+        there = jaxtank.core.records.Estimate(x=tuple(run.x[row]))
         command, _ = dataclasses.replace(law, k=k, k1=k1).step((), now, there)
         np.testing.assert_allclose(run.command[row], command, rtol=1e-9, atol=1e-9)
 

@@ -16,8 +16,8 @@ import pytest
 
 import jaxtank
 from jaxtank import plotting, presets, rig
-from jaxtank.errors import InputError
-from jaxtank.tree import get_value, with_values
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, with_values
 from tuning import cli, distributions, effects, indices, sensitivity_report
 from tuning.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.scenarios import Lane, groups_of, values_of

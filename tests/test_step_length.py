@@ -12,9 +12,9 @@ import stiff_rigs
 import jaxtank
 import tuning
 from jaxtank import presets, rig, step_length
-from jaxtank.errors import InputError
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
 from jaxtank.plants.faults import faults
-from jaxtank.records import Clock
 from jaxtank.signals import pours
 from tuning import cli
 

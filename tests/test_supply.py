@@ -15,8 +15,9 @@ import pytest
 
 import jaxtank
 import tuning
-from jaxtank import files, presets
-from jaxtank.errors import DataError, InputError
+from jaxtank import presets
+from jaxtank.core import files
+from jaxtank.core.errors import DataError, InputError
 from tuning import log_file, memo, parts
 
 ROOT = Path(__file__).parents[1]
@@ -58,7 +59,7 @@ MADE = {
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
-    ("jaxtank.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
+    ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.reading", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",

@@ -10,9 +10,10 @@ import pytest
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.errors import InputError
-from jaxtank.records import Clock, check_key
-from jaxtank.tree import check_leaves, describe, get_value, parameters, with_values
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import check_key
+from jaxtank.core.tree import check_leaves, describe, get_value, parameters, with_values
 
 OPTIONAL = ("actuator.dead_zone", "actuator.lag")
 

@@ -8,12 +8,13 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from jaxtank.presets.base import Free
 from tuning import objective
 from tuning.memo import Memo
 from tuning.objective import Limit, Point, Problem
-from tuning.screening import coarse_clock, distinct_starts, screen, sobol, spectral_radius
+from tuning.scenarios import coarse_clock
+from tuning.screening import distinct_starts, screen, sobol, spectral_radius
 from tuning.search import run_measures
 from tuning.solvers import METHODS, Search, optimality
 

@@ -4,9 +4,9 @@ import json
 
 import pytest
 
+from jaxtank.core.units import local
 from jaxtank.measures import MEASURES
 from jaxtank.measures import unit as measure_unit
-from jaxtank.units import local
 from tuning import cli
 
 FLOW = ("m", "m^3/s")

@@ -4,8 +4,8 @@ import os
 import re
 import sys
 
-from jaxtank.errors import InputError
-from tuning.one_line import printable
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import printable
 
 
 def open_case(args):
@@ -168,7 +168,7 @@ def folder_of(args):
         return args.case if os.path.isdir(args.case) else None
     folder = resume or out
     if folder is not None:
-        from jaxtank.files import check_folder
+        from jaxtank.core.files import check_folder
 
         check_folder(folder)
     return folder

@@ -3,10 +3,10 @@
 import os
 import sys
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import printable
 from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
-from tuning.one_line import printable
 from tuning.options import devices_of, distributions_of, limits_of, tell_written
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import presets
-from jaxtank.tree import with_values
+from jaxtank.core.tree import with_values
 from tuning import tables
 from tuning.manual import noisy
 from tuning.search import provenance

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank.errors import NonFiniteError
+from jaxtank.core.errors import NonFiniteError
 from tuning.input_search import InputSearch
 from tuning.inputs import open_loop
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.rig import check_free
-from jaxtank.tree import describe, get_value, split_index
 
 
 class Bound(NamedTuple):

@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
 from tuning.options import tell_written

@@ -4,8 +4,8 @@ import itertools
 from pathlib import Path
 
 from jaxtank import rig
-from jaxtank.errors import InputError
-from jaxtank.tree import split_index
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import split_index
 from tuning.bounds import bounds
 from tuning.memo import NAME
 

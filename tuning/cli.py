@@ -41,10 +41,10 @@ def _run(argv):
     import shlex
     import warnings
 
-    from jaxtank.errors import DataError, InputError, NonFiniteError, nearest
+    from jaxtank.core.errors import DataError, InputError, NonFiniteError, nearest
+    from jaxtank.core.text import one_line
     from tuning.arguments import folder_of
     from tuning.holds import hold
-    from tuning.one_line import one_line
     from tuning.parser import parser
 
     if argv is None:

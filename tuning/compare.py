@@ -11,9 +11,9 @@ import numpy as np
 import jaxtank
 from jaxtank import loop as lp
 from jaxtank import presets, rig
-from jaxtank.files import check_folder
+from jaxtank.core.files import check_folder
+from jaxtank.core.tree import get_value
 from jaxtank.presets.base import Claim
-from jaxtank.tree import get_value
 from tuning import pictures, saving, tables
 from tuning.manual import noisy
 from tuning.page import document, drawings

@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxtank.errors import unknown
+from jaxtank.core.errors import unknown
 
 NAMES = Path(__file__).with_name("names.txt")
 SHELLS = ("bash", "zsh", "fish")
@@ -105,9 +105,9 @@ def words():
 def gather():
     """The text of names.txt as the library has it. Starts jax."""
     from jaxtank import presets
+    from jaxtank.core.clock import CLOCK
+    from jaxtank.core.tree import walk
     from jaxtank.measures import MEASURES
-    from jaxtank.records import CLOCK
-    from jaxtank.tree import walk
 
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from jaxtank.core.tree import get_value, split_index
 from jaxtank.signals import Constant
-from jaxtank.tree import get_value, split_index
 
 
 @dataclasses.dataclass(frozen=True)

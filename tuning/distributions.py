@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.errors import InputError
-from jaxtank.tree import _short, check_value, describe, get_value, is_real, split_index
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import _short, check_value, describe, get_value, is_real, split_index
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

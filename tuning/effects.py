@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank.errors import NonFiniteError
-from jaxtank.tree import get_value
+from jaxtank.core.errors import NonFiniteError
+from jaxtank.core.tree import get_value
 from tuning.distributions import Correlated, Discrete, Normal
 
 CHUNK = 16

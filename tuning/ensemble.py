@@ -16,8 +16,8 @@ from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank._xla import WIDE
 from jaxtank.analysis import steady_flows
-from jaxtank.errors import InputError
-from jaxtank.tree import with_values
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from tuning import parts, shards
 from tuning.distributions import Correlated, Draws, Uniform, stated
 from tuning.objective import LOWER, resolve_limits

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank import step_length
-from jaxtank.files import check_folder
+from jaxtank.core.files import check_folder
 from tuning import page, parts, saving, search, tables
 from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import qmc
 
-from jaxtank.errors import DataError, InputError
-from jaxtank.tree import split_index, with_values
+from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.tree import split_index, with_values
 from tuning import playback as pb
 from tuning.bounds import bounds
 from tuning.coordinates import coordinates, nominal, usual

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.tree import get_value, with_values
+from jaxtank.core.tree import get_value, with_values
 from tuning import scenarios as sc
 from tuning.distributions import Correlated, Draws
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError
+from jaxtank.core.errors import EquilibriumError, InputError
 from tuning import playback as pb
 from tuning.coordinates import coordinates, nominal, usual
 

@@ -5,8 +5,8 @@ import os
 import time
 from pathlib import Path
 
-from jaxtank.errors import InputError
-from jaxtank.files import LOCK, check_folder, sweep
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import LOCK, check_folder, sweep
 from tuning.interrupts import before_leaving
 
 try:

@@ -7,7 +7,7 @@ from scipy.linalg import qr
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
-from jaxtank.tree import describe, get_value
+from jaxtank.core.tree import describe, get_value
 from tuning import playback as pb
 
 VAGUE = 0.5

@@ -3,21 +3,21 @@
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.errors import InputError
-from jaxtank.tree import with_values
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 
 
 def bare(plant):
     """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
     from jaxtank.actuators import PumpBank
     from jaxtank.controllers import OpenLoop
-    from jaxtank.loop import ClosedLoop
+    from jaxtank.core.clock import Clock
+    from jaxtank.core.tree import number
     from jaxtank.observers import Direct
     from jaxtank.presets.base import Case
-    from jaxtank.records import Clock
     from jaxtank.sensors import LevelSensor
     from jaxtank.signals import Constant
-    from jaxtank.tree import number
+    from jaxtank.stepping import ClosedLoop
 
     n, m = plant.tanks, plant.pumps
     still = number(np.zeros(m))

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.stats import chi2
 
 import jaxtank
-from jaxtank.errors import DataError, InputError
+from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.tree import describe
 from jaxtank.plants.base import Plant
-from jaxtank.tree import describe
 from tuning import identifiability as idf
 from tuning import logs as lg
 from tuning.estimation import Estimation, Fit, check_length

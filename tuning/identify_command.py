@@ -2,10 +2,10 @@
 
 import sys
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import printable
 from tuning import arguments
 from tuning.interrupts import Interrupts, put_back
-from tuning.one_line import printable
 from tuning.options import tell_unreachable
 
 LONGEST = 1e7
@@ -226,7 +226,7 @@ def plan(args, case, free):
             )
         )
         return 0
-    from jaxtank.tree import get_value
+    from jaxtank.core.tree import get_value
 
     letters, rows = dict(zip("ABCDEFGH", found)), []
     for name in next(iter(found.values()))["sd"]:

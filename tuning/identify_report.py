@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.files import check_folder
-from jaxtank.units import local
+from jaxtank.core.files import check_folder
+from jaxtank.core.units import local
 from tuning import identifiability as idf
 from tuning import page, pictures, saving, search, tables
 from tuning.identify import stopped

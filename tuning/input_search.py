@@ -8,9 +8,9 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import InputError, NonFiniteError
+from jaxtank.core.errors import InputError, NonFiniteError
+from jaxtank.core.tree import number
 from jaxtank.rig import check_objective
-from jaxtank.tree import number
 from tuning.inputs import RUNNING, Held, Terms, look, open_loop, value_and_gradient
 from tuning.objective import resolve_limits
 from tuning.projected import minimise

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.controllers import OpenLoop
-from jaxtank.numerics import magnitude
+from jaxtank.core.numerics import magnitude
+from jaxtank.core.tree import number
 from jaxtank.observers import Direct
 from jaxtank.signals import Table
 from jaxtank.stepping import initial, inputs, run_of, step
-from jaxtank.tree import number
 
 RUNNING = {"max_level": 1.0, "min_level": -1.0, "max_error": 1.0}
 """Measures whose limit is held sample by sample: +1 for an upper limit, -1 for a lower one."""

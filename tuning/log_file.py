@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxtank.errors import DataError, InputError, nearest
-from jaxtank.files import refusal
+from jaxtank.core.errors import DataError, InputError, nearest
+from jaxtank.core.files import refusal
+from jaxtank.core.text import printable
 from tuning.logs import FLOWS, LENGTHS, VOLTS, log
-from tuning.one_line import printable
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000

@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxtank.errors import DataError
-from jaxtank.units import DEFAULT
+from jaxtank.core.errors import DataError
+from jaxtank.core.units import DEFAULT
 
 RIM_MARGIN = 1.5
 """How many times its rim a level may read before the log is taken to be in another unit."""

@@ -3,9 +3,9 @@
 import warnings
 
 from jaxtank import loop as lp
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.step_length import StepWarning, check_run, doubts
-from jaxtank.tree import with_values
 
 MOST = 16
 """Runs that are made to see whether a level is thrown up in one."""

@@ -7,12 +7,12 @@ import textwrap
 import numpy as np
 
 from jaxtank import presets
+from jaxtank.core.clock import CLOCK
+from jaxtank.core.tree import walk
 from jaxtank.equations import equations, physics
 from jaxtank.measures import MEASURES, TIMES
 from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free
-from jaxtank.records import CLOCK
-from jaxtank.tree import walk
 from tuning import manual_parts, tables
 from tuning.objective import LOWER
 

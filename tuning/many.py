@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student
 
-from jaxtank.errors import InputError
-from jaxtank.tree import with_values
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from tuning import logs as lg
 from tuning import playback as pb
 from tuning.estimation import Estimation, check_length

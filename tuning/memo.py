@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.files import refusal, untouched
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import refusal, untouched
 
 NAME = "evaluations.jsonl"
 LARGEST = 1 << 30

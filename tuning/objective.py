@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.rig import check_limits, check_objective
-from jaxtank.tree import get_value, with_values
 from tuning import scenarios as sc
 from tuning.bounds import bounds
 from tuning.memo import Memo

@@ -3,9 +3,9 @@
 import re
 import sys
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import printable
 from tuning.arguments import number, once, pair, parse_value, plain_number, settings, whole
-from tuning.one_line import printable
 
 
 def limits_of(args, case):

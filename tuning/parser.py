@@ -3,7 +3,7 @@
 import argparse
 import sys
 
-from jaxtank.errors import InputError, nearest
+from jaxtank.core.errors import InputError, nearest
 from tuning import identify_command
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.files import check_folder, refusal, untouched, write_atomic
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import check_folder, refusal, untouched, write_atomic
 
 MANIFEST = "manifest.json"
 LARGEST = 1 << 28

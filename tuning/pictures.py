@@ -4,8 +4,8 @@ import sys
 
 import numpy as np
 
-from jaxtank.units import local
-from tuning.one_line import one_line
+from jaxtank.core.text import one_line
+from jaxtank.core.units import local
 
 
 def failed(name, error, *figures):

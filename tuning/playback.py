@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.actuators import PumpBank
+from jaxtank.core.clock import Clock
+from jaxtank.core.numerics import clip
+from jaxtank.core.tree import component, leaf, with_values
 from jaxtank.invariants import scan
-from jaxtank.numerics import clip
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant
-from jaxtank.tree import component, leaf, with_values
 
 
 @component

@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
 from jaxtank.analysis import linearise
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import number
 from jaxtank.presets.base import Free
 from jaxtank.rig.parts import law_of
 from jaxtank.signals import Constant, Ramps, ramps
-from jaxtank.tree import number
 
 LAWS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import split_index
 from jaxtank.presets.base import Scenario
 from jaxtank.rig import check_limits
-from jaxtank.tree import split_index
 from tuning.distributions import Draws, stated
 from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of
 from tuning.evidence import HELD_OUT, summary_of, validate

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank import loop as lp
-from jaxtank.errors import InputError
-from jaxtank.files import check_folder, write_together
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import check_folder, write_together
+from jaxtank.core.units import DEFAULT
 from jaxtank.neighbours import columns
-from jaxtank.units import DEFAULT
 from tuning.pictures import failed
 from tuning.tables import dumps
 

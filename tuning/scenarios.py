@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxtank import _xla, rig
 from jaxtank import loop as lp
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.tree import split_index, with_values
 from jaxtank.derivatives import _sensitivities
-from jaxtank.errors import EquilibriumError, InputError
 from jaxtank.presets.base import Scenario
-from jaxtank.tree import split_index, with_values
 
 MANY = 1024
 """Scenarios that one tuning may have."""

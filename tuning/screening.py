@@ -8,9 +8,9 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.stepping import Inputs, initial, step
-from jaxtank.tree import with_values
 from tuning.scenarios import coarse_clock
 
 TRIED = 3

@@ -13,15 +13,16 @@ from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank._xla import KEY
-from jaxtank.errors import InputError
-from jaxtank.tree import get_value, with_values
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, with_values
 from tuning import evidence, scenarios
 from tuning.evidence import REPORTED
 from tuning.long_steps import of_answer
 from tuning.memo import Log
 from tuning.objective import Problem
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
-from tuning.screening import best_screened, coarse_clock, distinct_starts, screen
+from tuning.scenarios import coarse_clock
+from tuning.screening import best_screened, distinct_starts, screen
 from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank.errors import InputError, unknown
-from jaxtank.tree import get_value
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import get_value
 from tuning import indices
 from tuning import scenarios as sc
 from tuning.distributions import Correlated, Draws, stated

@@ -6,8 +6,8 @@ import io
 
 import numpy as np
 
-from jaxtank.files import check_folder
-from jaxtank.tree import describe, get_value
+from jaxtank.core.files import check_folder
+from jaxtank.core.tree import describe, get_value
 from tuning import page, saving, search, tables
 from tuning.distributions import Correlated, Normal
 from tuning.effects import NORMAL_WIDTH

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtank import rig
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from tuning import distributions as ds
 from tuning import parts
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.units import DEFAULT
+from jaxtank.core.units import DEFAULT
 
 REASONS = {
     "overshoot_percent": "the reference does not change",

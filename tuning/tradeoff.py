@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from jaxtank.measures import check_names
 from tuning.objective import LOWER, Problem
 from tuning.screening import best_screened, screen

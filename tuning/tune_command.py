@@ -4,7 +4,7 @@ import contextlib
 import functools
 import sys
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from tuning.arguments import number, once, open_case, pair, span, whole
 from tuning.arguments import seed as seed_of
 from tuning.interrupts import Interrupts, put_back

@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank import rig
-from jaxtank.errors import InputError
-from jaxtank.files import check_folder
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import check_folder
 from tuning.report import json_of, parts_of, worst_of_scenarios
 from tuning.saving import earlier, run_for_people, trajectory_csv, write_result
 from tuning.tables import dumps, number, objective_unit

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.decoupling import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf, static
 
 
 @component

@@ -2,7 +2,7 @@
 
 import abc
 
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
 
 
 class Controller(abc.ABC):

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.numerics import floored_root
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import floored_root
 from jaxtank.plants.rigs import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
 from jaxtank.signals import Constant, Ramps
 

@@ -2,8 +2,8 @@
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf, static
 
 COMPENSATIONS = ("none", "single", "double")
 DRIFTS = ("derived", "printed")

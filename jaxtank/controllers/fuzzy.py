@@ -7,11 +7,11 @@ from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
 from jaxtank.controllers.state_feedback import feedback
-from jaxtank.errors import InputError
-from jaxtank.numerics import clip, magnitude
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import clip, magnitude
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf, static
 
 PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 

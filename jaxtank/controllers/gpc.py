@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.controllers.incremental import MODES, LinearPredictive
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.network import TankNetwork
-from jaxtank.tree import component, leaf, static
 
 
 @component

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtank import qp
 from jaxtank.analysis import linearise
 from jaxtank.controllers.base import Controller
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import clip
 from jaxtank.linear import zero_order_hold
-from jaxtank.numerics import clip
 
 MODES = ("unconstrained", "clipped", "constrained")
 EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact

@@ -2,8 +2,8 @@
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.decoupling import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf
 
 
 @component

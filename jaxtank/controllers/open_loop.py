@@ -1,9 +1,9 @@
 """No feedback: inputs played back."""
 
 from jaxtank.controllers.base import Controller
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
+from jaxtank.core.tree import component
 from jaxtank.signals import Signal
-from jaxtank.tree import component
 
 
 @component

@@ -1,6 +1,6 @@
 """What laws for tanks that each have their own pump share: the model as h_i' = f_i(h) + c2_i u_i (gouta2022 eqs. 1-3)."""
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 
 def drift(model, x):

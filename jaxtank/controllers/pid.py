@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
-from jaxtank.errors import InputError
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf, static
 
 FILTER = 8.0  # the derivative's filter has the time constant Td/8
 LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections

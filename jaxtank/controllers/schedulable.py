@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import describe, get_value, parameters, with_values
 from jaxtank.dependence import use_of
-from jaxtank.errors import InputError, unknown
-from jaxtank.records import Clock, Estimate, Tick
-from jaxtank.tree import describe, get_value, parameters, with_values
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.schedulable import check_gains, check_knots, check_variable, refusal
-from jaxtank.errors import InputError
-from jaxtank.numerics import portion
-from jaxtank.pieces import pointwise
-from jaxtank.tree import check_value, component, describe, leaf, parameters, static, with_values
+from jaxtank.core.clock import pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import portion
+from jaxtank.core.tree import check_value, component, describe, leaf, parameters, static, with_values
 
 
 class Memory(NamedTuple):

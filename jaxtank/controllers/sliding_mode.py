@@ -6,11 +6,11 @@ import jax.numpy as jnp
 
 from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
-from jaxtank.numerics import clip, signed_root, signed_root_slope
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
+from jaxtank.core.numerics import clip, signed_root, signed_root_slope
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import QUADRUPLE_FEEDS, QUADRUPLE_LINKS, check_topology
-from jaxtank.tree import component, leaf, static
 
 SWITCHES = {"tanh": jnp.tanh, "clip": lambda x: clip(x, -1.0, 1.0), "sign": jnp.sign}
 FORMS = ("corrected", "printed")

@@ -5,11 +5,11 @@ import numpy as np
 
 from jaxtank.analysis import linearise, steady_along, steady_flows
 from jaxtank.controllers.base import Controller
-from jaxtank.errors import InputError
+from jaxtank.core.clock import pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component, leaf
 from jaxtank.linear import lqr
-from jaxtank.pieces import pointwise
 from jaxtank.plants.base import Plant
-from jaxtank.tree import component, leaf
 
 
 def feedback(K, x, h0, u0):

@@ -4,12 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.controllers.base import Controller
-from jaxtank.errors import InputError
-from jaxtank.numerics import floored_root
-from jaxtank.pieces import pointwise
+from jaxtank.core.clock import pointwise
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import floored_root
+from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
-from jaxtank.tree import component, leaf
 
 
 @component

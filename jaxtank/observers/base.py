@@ -2,8 +2,8 @@
 
 import abc
 
-from jaxtank.records import Estimate
-from jaxtank.tree import component
+from jaxtank.core.records import Estimate
+from jaxtank.core.tree import component
 
 
 class Observer(abc.ABC):

@@ -1,11 +1,11 @@
 """The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25)."""
 
 from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
-from jaxtank.records import Estimate
-from jaxtank.tree import component, leaf, static
 
 FED = ("applied", "command")
 

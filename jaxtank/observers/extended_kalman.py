@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.records import Estimate
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.kalman import check_measured
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
-from jaxtank.records import Estimate
-from jaxtank.tree import component, leaf, static
 
 
 class Belief(NamedTuple):

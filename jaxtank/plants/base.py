@@ -4,7 +4,7 @@ import abc
 
 import jax.numpy as jnp
 
-from jaxtank.units import DEFAULT
+from jaxtank.core.units import DEFAULT
 
 
 class Plant(abc.ABC):

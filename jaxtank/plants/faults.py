@@ -5,9 +5,9 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.pieces import pointwise, sample_times
-from jaxtank.tree import component, get_value, leaf, number, split_index, static
+from jaxtank.core.clock import pointwise, sample_times
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component, get_value, leaf, number, split_index, static
 
 
 @component

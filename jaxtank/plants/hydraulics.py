@@ -4,8 +4,8 @@ import math
 
 import jax.numpy as jnp
 
-from jaxtank.errors import InputError
-from jaxtank.numerics import ROOT_KNEE, root
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import ROOT_KNEE, root
 
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
+from jaxtank.core.tree import check_value, component, leaf, number, static
+from jaxtank.core.units import DEFAULT, check_unit
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import efflux, usual_gravity, usual_knee
-from jaxtank.tree import check_value, component, leaf, number, static
-from jaxtank.units import DEFAULT, check_unit
 
 
 @component

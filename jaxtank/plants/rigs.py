@@ -1,6 +1,6 @@
 """The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws know them."""
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 from jaxtank.plants.hydraulics import disc
 from jaxtank.plants.network import network
 

@@ -11,7 +11,7 @@ import functools
 import importlib
 import pkgutil
 
-from jaxtank.errors import InputError, unknown
+from jaxtank.core.errors import InputError, unknown
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 
 PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "base" and not m.name.startswith("_")))

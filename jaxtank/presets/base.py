@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxtank.loop import ClosedLoop
-from jaxtank.records import Clock
+from jaxtank.core.clock import Clock
+from jaxtank.stepping import ClosedLoop
 
 
 class Free(NamedTuple):

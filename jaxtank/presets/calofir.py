@@ -8,15 +8,16 @@ import numpy as np
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
-from jaxtank.loop import ClosedLoop, simulate
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
+from jaxtank.loop import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
-from jaxtank.tree import number
+from jaxtank.stepping import ClosedLoop
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
 Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]

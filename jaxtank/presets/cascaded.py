@@ -4,14 +4,14 @@ import functools
 
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers import PID, OpenLoop
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.presets.base import Case, Free, Preset, Published
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, Table, ramps
-from jaxtank.tree import number
+from jaxtank.stepping import ClosedLoop
 
 RIM = 10.0  # level sensor's volts at which either tank overflows
 PERIOD = 4.0  # of the record [s]

@@ -7,15 +7,15 @@ import numpy as np
 from jaxtank.actuators import PumpBank
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers import NGPC, Backstepping
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
-from jaxtank.tree import number
+from jaxtank.stepping import ClosedLoop
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
 FAST_AREA = 15 * 2**0.5  # the same figure read as an area (notes A1) [cm^2]

@@ -7,14 +7,14 @@ import numpy as np
 
 from jaxtank.actuators import PumpBank
 from jaxtank.controllers import GPC, Laguerre
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
 from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
-from jaxtank.tree import number
+from jaxtank.stepping import ClosedLoop
 
 U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]
 CHANNEL = 78.5e-6  # s1 = s2 = s3, Table I [m^2]

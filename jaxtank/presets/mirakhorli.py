@@ -7,14 +7,14 @@ import numpy as np
 from jaxtank.actuators import PumpBank
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
 from jaxtank.observers import Direct
 from jaxtank.plants import quadruple_tank
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published, Scenario
-from jaxtank.records import Clock
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import ramps
-from jaxtank.tree import number
+from jaxtank.stepping import ClosedLoop
 
 SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]
 WARM = (6.0, 6.0)  # where the -warm cases start [cm]

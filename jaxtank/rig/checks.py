@@ -8,15 +8,15 @@ import numpy as np
 from jaxtank import loop as lp
 from jaxtank import scheduling
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.clock import CLOCK_UNITS
+from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.tree import _short, check_value, describe, get_value, split_index
 from jaxtank.measures import check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free, Scenario
-from jaxtank.records import CLOCK_UNITS
 from jaxtank.rig.values import by_dotted_name, set_scenario
 from jaxtank.rig.words import is_finite, is_numeric, name_of
 from jaxtank.signals import Ramps
-from jaxtank.tree import _short, check_value, describe, get_value, split_index
 
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 

@@ -3,9 +3,9 @@ weakened by `--set` says the same on purpose."""
 
 import numpy as np
 
+from jaxtank.core.tree import is_component, split_index, walk
 from jaxtank.rig.signals import steps
 from jaxtank.signals import Pours
-from jaxtank.tree import is_component, split_index, walk
 
 
 def doubts(case):

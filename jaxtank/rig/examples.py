@@ -3,14 +3,14 @@
 import numpy as np
 
 from jaxtank import scheduling
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures import MEASURES, TIMES
 from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free
 from jaxtank.rig import parts, signals
 from jaxtank.rig.keys import Key, Section, keys_of
 from jaxtank.signals import Constant, Ramps
-from jaxtank.tree import describe, get_value, is_component, parameters, walk
 
 RELATIVE = (
     'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" '

@@ -2,8 +2,8 @@
 
 from typing import Any, NamedTuple
 
+from jaxtank.core.units import local
 from jaxtank.rig.words import toml
-from jaxtank.units import local
 
 BARE = {"unit": "-", "doc": ""}
 

@@ -2,7 +2,7 @@
 
 import re
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 MOST = 100
 """Parts of a dotted key; the names of a rig have four."""

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from jaxtank import presets, scheduling
+from jaxtank.core.tree import is_component, walk
 from jaxtank.rig import parts, signals
-from jaxtank.tree import is_component, walk
 
 
 def origin_of(case):

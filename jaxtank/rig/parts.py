@@ -6,14 +6,14 @@ import numpy as np
 
 from jaxtank import controllers
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.tree import _short, number
+from jaxtank.core.units import local
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
 from jaxtank.rig.words import static_value
 from jaxtank.signals import Ramps, ramps
-from jaxtank.tree import _short, number
-from jaxtank.units import local
 
 LAWS = {
     "pid": controllers.PID,

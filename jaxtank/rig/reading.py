@@ -6,13 +6,13 @@ import tomllib
 import numpy as np
 
 from jaxtank import presets, record_tables
-from jaxtank.errors import InputError, unknown
-from jaxtank.files import read_text
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.files import read_text
+from jaxtank.core.tree import _short
 from jaxtank.rig import checks, parts, signals, tanks
 from jaxtank.rig.lexing import check_keys
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
 from jaxtank.rig.words import name_of
-from jaxtank.tree import _short
 
 TABLES = (
     "case",

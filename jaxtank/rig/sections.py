@@ -5,9 +5,10 @@ import tomllib
 import numpy as np
 
 from jaxtank import scheduling
-from jaxtank.errors import InputError
+from jaxtank.core.clock import CLOCK
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import walk
 from jaxtank.presets.base import Free
-from jaxtank.records import CLOCK
 from jaxtank.rig import examples, parts, signals, tanks
 from jaxtank.rig.checks import unreachable
 from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of
@@ -16,7 +17,6 @@ from jaxtank.rig.reading import start_of
 from jaxtank.rig.values import MODELS
 from jaxtank.rig.words import toml
 from jaxtank.signals import Ramps, Sum
-from jaxtank.tree import walk
 
 # leaves and statics that the tables of a rig described tank by tank set
 TANKWISE = {"x0", "sensor.noise", "actuator.low", "actuator.high", "actuator.initial"}

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from jaxtank.errors import InputError, unknown
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import _short, check_value, number
 from jaxtank.plants.faults import Faults, faults
 from jaxtank.rig.words import is_finite, plain, static_value
 from jaxtank.signals import Constant, Pours, Ramps, Sine, Sum, pours, ramps
-from jaxtank.tree import _short, check_value, number
 
 RAMP_KEYS = ("initial", "changes", "ramp", "shape", "band")
 SINE_KEYS = ("amplitude", "offset", "period", "zero", "start", "end", "output")

@@ -5,19 +5,19 @@ import dataclasses
 import numpy as np
 
 from jaxtank.actuators import PumpBank
-from jaxtank.errors import InputError, unknown
-from jaxtank.loop import ClosedLoop
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import _short, check_value, number
+from jaxtank.core.units import DEFAULT, check_unit, local
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.presets.base import Case
-from jaxtank.records import Clock
 from jaxtank.rig.parts import law_of, observer_of
 from jaxtank.rig.signals import INFLOW, meta_of
 from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant, ramps
-from jaxtank.tree import _short, check_value, number
-from jaxtank.units import DEFAULT, check_unit, local
+from jaxtank.stepping import ClosedLoop
 
 TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")
 TANK = {"name": "", "area": None, "rim": None, "drain": 0.0, "level": 0.0, "inflow": 0.0, "noise": 0.0}

@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxtank import scheduling
 from jaxtank.analysis import equilibrium
-from jaxtank.errors import EquilibriumError, InputError, unknown
-from jaxtank.records import CLOCK_UNITS, check_clock
+from jaxtank.core.clock import CLOCK_UNITS, check_clock
+from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.tree import _short, check_value, describe, get_value, split_index, walk, with_values
 from jaxtank.rig.words import is_numeric, plain, static_value, unit
-from jaxtank.tree import _short, check_value, describe, get_value, split_index, walk, with_values
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jaxtank.errors import InputError
-from jaxtank.tree import _short, check_value
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import _short, check_value
 
 SMALL_INT = (int, np.integer)
 

@@ -4,7 +4,7 @@ import textwrap
 from pathlib import Path
 
 from jaxtank import presets
-from jaxtank.files import write_atomic
+from jaxtank.core.files import write_atomic
 from jaxtank.rig.keys import lines_of
 from jaxtank.rig.origin import origin_of
 from jaxtank.rig.sections import sections

@@ -15,7 +15,7 @@ jax.config.update("jax_enable_x64", True)
 
 import tuning  # noqa: E402
 from jaxtank import presets  # noqa: E402
-from jaxtank.tree import get_value  # noqa: E402
+from jaxtank.core.tree import get_value  # noqa: E402
 from tuning import playback  # noqa: E402
 
 FREE = ("plant.pump_gain[0]", "plant.pump_gain[1]", "plant.drain[0]", "plant.drain[1]", "plant.orifice[0]")
@@ -44,7 +44,7 @@ def four_tank(count=64):
     print(f"levels from {min(one.y.min() for one in logs):.1f} to {max(one.y.max() for one in logs):.1f} cm")
     truth = {n: float(get_value(case.loop, n)) for n in FREE}
     signs = np.where(np.arange(len(FREE)) % 2, 1.3, 0.7)
-    from jaxtank.tree import with_values
+    from jaxtank.core.tree import with_values
 
     wrong = case.replace(loop=with_values(case.loop, {n: v * f for (n, v), f in zip(truth.items(), signs)}))
     free = {n: (v / 5, v * 5) for n, v in truth.items()}

@@ -25,7 +25,7 @@ import numpy as np
 
 import jaxtank
 from jaxtank import presets
-from jaxtank.files import write_atomic
+from jaxtank.core.files import write_atomic
 from tuning import bench, tables
 
 README = Path(__file__).parents[2] / "README.md"

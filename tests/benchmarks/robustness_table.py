@@ -17,8 +17,8 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import presets, rig
-from jaxtank.files import write_atomic
-from jaxtank.tree import with_values
+from jaxtank.core.files import write_atomic
+from jaxtank.core.tree import with_values
 from tuning.ensemble import clopper_pearson
 
 N = 200

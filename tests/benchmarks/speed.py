@@ -22,9 +22,9 @@ import jax
 import numpy as np
 
 from jaxtank import _xla, loop, presets
+from jaxtank.core.files import write_atomic
+from jaxtank.core.tree import with_values
 from jaxtank.derivatives import _sensitivities
-from jaxtank.files import write_atomic
-from jaxtank.tree import with_values
 from tuning import bench, tables
 from tuning.manual import noisy
 

@@ -20,7 +20,7 @@ from tuning_rows import BOUNDS, ROWS, case_of
 
 import jaxtank  # noqa: F401  (before jax starts)
 import tuning
-from jaxtank.files import write_atomic
+from jaxtank.core.files import write_atomic
 from tuning import search
 from tuning.result import constraint_rows
 

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.errors import InputError, unknown
-from jaxtank.units import DEFAULT, local
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.units import DEFAULT, local
 
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 

@@ -5,7 +5,7 @@
 
 import re
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 DEFAULT = ("cm", "V")
 

@@ -7,7 +7,7 @@ import stat
 import tempfile
 from pathlib import Path
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 

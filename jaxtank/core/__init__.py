@@ -1,0 +1,1 @@
+"""Components and dotted names, clock and records, numerics, units, errors, files."""
