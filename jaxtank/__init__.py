@@ -17,11 +17,11 @@ import to leave XLA as it is.
 
 import importlib
 
-from jaxtank import _xla
+from jaxtank.xla import flags
 
 __version__ = "0.1.0"
 
-_xla.enable_small_loop_compilation()
+flags.enable_small_loop_compilation()
 
 # Names are imported when they are first used: `jaxtank --help` must not wait for jax.
 _HOMES = {

@@ -8,10 +8,10 @@ from jax.flatten_util import ravel_pytree
 
 from jaxtank import measures as ms
 from jaxtank.core.tree import with_values
-from jaxtank.dependence import reached
-from jaxtank.invariants import scan
-from jaxtank.materialise import materialised
 from jaxtank.stepping import initial, inputs, is_broken, keyed, run_of, step
+from jaxtank.xla.barrier import materialised
+from jaxtank.xla.hoist import scan
+from jaxtank.xla.reachability import reached
 
 OUTER = 12
 """Number of parameters above which the Gauss-Newton matrix grows by a matrix product: element by element the compiler makes each slope

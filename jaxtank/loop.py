@@ -19,8 +19,8 @@ from jaxtank.core.records import Trajectory
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.derivatives import _sensitivities
 from jaxtank.door import check
-from jaxtank.invariants import scan
 from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, keyed, run_of, step, zero_of
+from jaxtank.xla.hoist import scan
 
 
 def simulate(loop, clock, key=None, save_every=1):

@@ -18,13 +18,13 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.kahan import added
 from jaxtank.core.records import Sample, Tick
 from jaxtank.core.tree import component, leaf
-from jaxtank.materialise import materialised
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.integration import change, integrate
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Signal
+from jaxtank.xla.barrier import materialised
 
 
 @component

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import _xla, invariants
 from jaxtank.core.clock import Clock
 from jaxtank.core.kahan import nothing, plus, totals
 from jaxtank.derivatives import _sensitivities
 from jaxtank.loop import _evaluate, evaluate_for_reverse
-from jaxtank.materialise import materialised
+from jaxtank.xla import flags as _xla
+from jaxtank.xla import hoist
+from jaxtank.xla.barrier import materialised
 from tuning import bench
 
 MEASURES = ("rms_error_total", "max_level")
@@ -104,15 +105,15 @@ def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
         jaxpr = jax.make_jaxpr(lambda a, b: run(scan, a, b))(2.0, 3.0)
         return [e for e in jaxpr.eqns if e.primitive.name == "scan"][0].params["jaxpr"].jaxpr, jaxpr
 
-    inside, whole = loop_of(invariants.scan)
+    inside, whole = loop_of(hoist.scan)
     assert not {"sqrt", "div"} & {e.primitive.name for e in inside.eqns}
     assert [e.primitive.name for e in whole.eqns].count("sqrt") == 1
     assert {"sqrt", "div"} <= {e.primitive.name for e in loop_of(jax.lax.scan)[0].eqns}
-    plain, lean = (run(s, 2.0, 3.0) for s in (jax.lax.scan, invariants.scan))
+    plain, lean = (run(s, 2.0, 3.0) for s in (jax.lax.scan, hoist.scan))
     np.testing.assert_allclose(lean[0], plain[0], rtol=1e-15)
     np.testing.assert_allclose(lean[1], plain[1], rtol=1e-15)
     for derivative in (jax.grad, jax.jacfwd):
-        a, b = (derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, invariants.scan))
+        a, b = (derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, hoist.scan))
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 

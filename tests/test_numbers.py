@@ -13,8 +13,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxtank import InputError, _xla, evaluate, presets, sensitivities, with_values
+from jaxtank import InputError, evaluate, presets, sensitivities, with_values
 from jaxtank.core.clock import Clock
+from jaxtank.xla import flags
 
 RUNS = """
 import json, sys
@@ -37,7 +38,7 @@ print(json.dumps([{f"{k} {n}": [x.hex() for x in np.ravel(v).tolist()] for k, t 
 
 def told(devices, option):
     """({quantity: (n,)}, where it was) of a fresh process."""
-    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)} | {_xla.SWITCH: option}
+    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", flags.SWITCH)} | {flags.SWITCH: option}
     done = subprocess.run([sys.executable, "-c", RUNS, str(devices)], capture_output=True, text=True, check=True, env=env)
     found, places = json.loads(done.stdout)
     return {name: np.array([float.fromhex(v) for v in values]) for name, values in found.items()}, places

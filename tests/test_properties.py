@@ -19,10 +19,10 @@ from test_physics import in_metres
 
 from jaxtank.analysis import steady_levels
 from jaxtank.core.tree import component
-from jaxtank.invariants import scan
 from jaxtank.plants import Plant
 from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import TankNetwork, network
+from jaxtank.xla.hoist import scan
 
 STILL = np.zeros(SIZE)
 LONGEST = 2560

@@ -18,11 +18,11 @@ from jaxtank.controllers.scheduled import interpolate
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
-from jaxtank.dependence import use_of
 from jaxtank.derivatives import _sensitivities
 from jaxtank.loop import _evaluate, evaluate_and_flag, evaluate_for_reverse
 from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
+from jaxtank.xla.reachability import use_of
 from tuning import cli
 
 # 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within rounding of the others, where the slope would

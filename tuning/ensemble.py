@@ -14,10 +14,10 @@ from scipy import stats
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank._xla import WIDE
 from jaxtank.analysis import steady_flows
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.xla.flags import WIDE
 from tuning import parts, shards
 from tuning.distributions import Correlated, Draws, Uniform, stated
 from tuning.objective import LOWER, resolve_limits

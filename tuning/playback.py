@@ -12,11 +12,11 @@ from jaxtank.actuators import PumpBank
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip
 from jaxtank.core.tree import component, leaf, with_values
-from jaxtank.invariants import scan
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
 from jaxtank.sensors import LevelSensor
 from jaxtank.signals import Constant
+from jaxtank.xla.hoist import scan
 
 
 @component

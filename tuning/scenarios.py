@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank import _xla, rig
 from jaxtank import loop as lp
+from jaxtank import rig
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.derivatives import _sensitivities
 from jaxtank.presets.base import Scenario
+from jaxtank.xla import flags
 
 MANY = 1024
 """Scenarios that one tuning may have."""
@@ -158,7 +159,7 @@ def _mapped(function, leaves, keys, shape):
     )(leaves, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=_xla.WIDE)
+@functools.partial(jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE)
 def _values(leaves, keys, shape, clock, names, points):
     def at(values):
         return _mapped(lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key), leaves, keys, shape)
@@ -166,7 +167,7 @@ def _values(leaves, keys, shape, clock, names, points):
     return jax.vmap(at)(points)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"), compiler_options=_xla.WIDE)
+@functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"), compiler_options=flags.WIDE)
 def _slopes(leaves, keys, shape, clock, names, order, values, squares):
     several = shape[-1] > 1
     return _mapped(lambda loop, key: _sensitivities(loop, clock, names, order, values, key, squares, several), leaves, keys, shape)

@@ -12,9 +12,9 @@ import jaxtank
 from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank import rig
-from jaxtank._xla import KEY
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.xla.flags import KEY
 from tuning import evidence, scenarios
 from tuning.evidence import REPORTED
 from tuning.long_steps import of_answer

@@ -11,7 +11,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import describe, get_value, parameters, with_values
-from jaxtank.dependence import use_of
+from jaxtank.xla.reachability import use_of
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")
 

@@ -1,6 +1,6 @@
 """One step of an integrator: what the time loop takes, and observers that carry a model on."""
 
-from jaxtank.materialise import materialised
+from jaxtank.xla.barrier import materialised
 
 
 def integrate(plant, integrator, t, x, u, d, h):

@@ -21,10 +21,11 @@ import ensemble
 import jax
 import numpy as np
 
-from jaxtank import _xla, loop, presets
+from jaxtank import loop, presets
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
 from jaxtank.derivatives import _sensitivities
+from jaxtank.xla import flags
 from tuning import bench, tables
 from tuning.manual import noisy
 
@@ -154,7 +155,7 @@ def gauss_newton(rounds):
     names, point = tuple(values), tuple(values.values())
 
     def compiled(one):
-        call = jax.jit(jax.vmap(one), compiler_options=_xla.WIDE).lower(orifice).compile()
+        call = jax.jit(jax.vmap(one), compiler_options=flags.WIDE).lower(orifice).compile()
         return lambda: call(orifice)
 
     at = lambda o: with_values(case.loop, {"plant.orifice": o})
