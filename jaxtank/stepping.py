@@ -23,7 +23,7 @@ from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.integration import change, integrate
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Signal
+from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 
 

@@ -14,7 +14,7 @@ from jaxtank import loop as lp
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.derivatives import _sensitivities
-from jaxtank.signals import Ramps
+from jaxtank.signals.setpoints import Ramps
 
 MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")
 SAMPLES = 64

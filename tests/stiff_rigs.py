@@ -25,7 +25,8 @@ from jaxtank.core.tree import with_values
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 OFF = 0.05  # share of the rim

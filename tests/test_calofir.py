@@ -23,7 +23,7 @@ from jaxtank.loop import _evaluate
 from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
 from jaxtank.presets import calofir
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 
 CASES = presets.load("calofir").cases
 NAMES = ["controller.K_phi", "controller.K_y"]

@@ -17,7 +17,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import _evaluate
 from jaxtank.presets import cascaded
-from jaxtank.signals import Table
+from jaxtank.signals.base import Table
 from tuning import cli
 
 CASES = presets.load("cascaded").cases

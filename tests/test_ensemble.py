@@ -186,7 +186,7 @@ def test_quantiles_of_a_linear_gaussian_case():
     """A closed tank filled at a constant rate: its last level is linear in the pump's gain."""
     from jaxtank.controllers import OpenLoop
     from jaxtank.plants.network import network
-    from jaxtank.signals import Constant
+    from jaxtank.signals.base import Constant
 
     base = jaxtank.presets.find("cascaded/open-loop").loop
     plant = network(area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),), rim=1e3, outputs=(0,))

@@ -21,7 +21,7 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.presets import load
 from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, law
-from jaxtank.signals import Constant
+from jaxtank.signals.base import Constant
 
 MEASURES = (
     "rms_error",

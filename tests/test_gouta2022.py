@@ -37,7 +37,7 @@ def run(name, values=None, loop=None, **clock):
 
 def constant_inflow(loop):
     """The mean d^ of the paper as a steady loss of both tanks, clipped at empty."""
-    from jaxtank.signals import Constant, Sum
+    from jaxtank.signals.base import Constant, Sum
 
     loss = Constant(level=225.0 * np.array([-0.4249, -0.6673]))
     plant = dataclasses.replace(loop.plant, bottom=True)
@@ -181,7 +181,8 @@ def test_pump_fault():
 
 def held_at(level):
     """A short unsaturated run: a steady setpoint, levels a little off it, a pour."""
-    from jaxtank.signals import Constant, pours
+    from jaxtank.signals.base import Constant
+    from jaxtank.signals.inflows import pours
 
     return lambda loop: dataclasses.replace(
         loop,
@@ -229,7 +230,8 @@ def test_k_and_l_are_interchangeable_in_the_loop():
 
 
 def quietly(loop):
-    from jaxtank.signals import Constant, pours
+    from jaxtank.signals.base import Constant
+    from jaxtank.signals.inflows import pours
 
     return dataclasses.replace(
         loop,

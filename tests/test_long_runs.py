@@ -25,7 +25,9 @@ from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, Sine, Table, pours, ramps
+from jaxtank.signals.base import Constant, Table
+from jaxtank.signals.inflows import pours
+from jaxtank.signals.setpoints import Sine, ramps
 from jaxtank.stepping import ClosedLoop
 
 DT = 0.01

@@ -9,7 +9,7 @@ from jaxtank import loop, presets
 from jaxtank.core.tree import with_values
 from jaxtank.derivatives import OUTER
 from jaxtank.scheduling import schedule
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from tuning.objective import Problem
 from tuning.scenarios import rough_clock
 from tuning.solvers import METHODS, Search

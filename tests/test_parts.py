@@ -14,7 +14,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import at_least, clip, quantise
 from jaxtank.core.tree import number
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import ramps
 
 # signals
 

@@ -14,7 +14,8 @@ from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
 from jaxtank.presets.base import Free
 from jaxtank.rig.words import toml
-from jaxtank.signals import Constant, ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import ramps
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 

@@ -158,7 +158,8 @@ def test_the_example_of_the_module_can_be_used():
 
 def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
     from jaxtank.plants.faults import faults
-    from jaxtank.signals import Sine, pours
+    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.setpoints import Sine
 
     text = (
         HEAD + "[reference.sine]\namplitude = 0.5\nperiod = 100.0\noutput = 2\nstart = 50.0\nend = 150.0\n"
@@ -311,7 +312,7 @@ def test_init_of_the_command(tmp_path, capsys):
 
 def test_what_a_preset_says_in_more_tables_does_not_come_back():
     """A short file without [uncertain], or with one pour of two, would have the preset's."""
-    from jaxtank.signals import pours
+    from jaxtank.signals.inflows import pours
 
     case = presets.find("gouta2015/ngpc").replace(uncertain={})
     assert rig.loads(rig.short(case)).uncertain == {}

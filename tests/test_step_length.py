@@ -15,7 +15,7 @@ from jaxtank import presets, rig, step_length
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.plants.faults import faults
-from jaxtank.signals import pours
+from jaxtank.signals.inflows import pours
 from tuning import cli
 
 ONE = """

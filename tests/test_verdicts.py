@@ -11,7 +11,7 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import presets, rig
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from tuning import cli
 from tuning.objective import Limit, Point, resolve_limits, room_of
 from tuning.solvers import Search, downhill, slsqp

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.tree import get_value, split_index
-from jaxtank.signals import Constant
+from jaxtank.signals.base import Constant
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,7 @@ def bare(plant):
     from jaxtank.observers import Direct
     from jaxtank.presets.base import Case
     from jaxtank.sensors import LevelSensor
-    from jaxtank.signals import Constant
+    from jaxtank.signals.base import Constant
     from jaxtank.stepping import ClosedLoop
 
     n, m = plant.tanks, plant.pumps

@@ -14,7 +14,7 @@ from jaxtank.controllers import OpenLoop
 from jaxtank.core.numerics import magnitude
 from jaxtank.core.tree import number
 from jaxtank.observers import Direct
-from jaxtank.signals import Table
+from jaxtank.signals.base import Table
 from jaxtank.stepping import initial, inputs, run_of, step
 
 RUNNING = {"max_level": 1.0, "min_level": -1.0, "max_error": 1.0}

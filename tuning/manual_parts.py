@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from jaxtank.signals import Constant, Pours, Ramps, Sine, Sum
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import Pours
+from jaxtank.signals.setpoints import Ramps, Sine
 
 
 def own_name(case, kind, i):

@@ -15,7 +15,7 @@ from jaxtank.core.tree import component, leaf, with_values
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant
+from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
 
 

@@ -14,7 +14,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
 from jaxtank.presets.base import Free
 from jaxtank.rig.parts import law_of
-from jaxtank.signals import Constant, Ramps, ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import Ramps, ramps
 
 LAWS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import floored_root
 from jaxtank.plants.rigs import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
-from jaxtank.signals import Constant, Ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import Ramps
 
 
 class Coefficients(NamedTuple):

@@ -3,7 +3,7 @@
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.tree import component
-from jaxtank.signals import Signal
+from jaxtank.signals.base import Signal
 
 
 @component

@@ -16,7 +16,7 @@ from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]

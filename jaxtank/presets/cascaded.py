@@ -10,7 +10,8 @@ from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.presets.base import Case, Free, Preset, Published
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, Table, ramps
+from jaxtank.signals.base import Constant, Table
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 RIM = 10.0  # level sensor's volts at which either tank overflows

@@ -14,7 +14,7 @@ from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]

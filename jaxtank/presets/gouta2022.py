@@ -12,7 +12,9 @@ from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Sine, Sum, pours, ramps
+from jaxtank.signals.base import Sum
+from jaxtank.signals.inflows import pours
+from jaxtank.signals.setpoints import Sine, ramps
 from jaxtank.stepping import ClosedLoop
 
 PRINTED_GAIN, RECONCILED_GAIN = 3.4717, 34.717  # Kp of Table 1, and ten times that (notes S2.2) [cm^3/(s V)]

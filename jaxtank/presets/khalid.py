@@ -13,7 +13,7 @@ from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]

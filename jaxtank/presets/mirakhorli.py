@@ -13,7 +13,7 @@ from jaxtank.observers import Direct
 from jaxtank.plants import quadruple_tank
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published, Scenario
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]

@@ -16,7 +16,7 @@ from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free, Scenario
 from jaxtank.rig.values import by_dotted_name, set_scenario
 from jaxtank.rig.words import is_finite, is_numeric, name_of
-from jaxtank.signals import Ramps
+from jaxtank.signals.setpoints import Ramps
 
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 

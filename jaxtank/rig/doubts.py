@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxtank.core.tree import is_component, split_index, walk
 from jaxtank.rig.signals import steps
-from jaxtank.signals import Pours
+from jaxtank.signals.inflows import Pours
 
 
 def doubts(case):

@@ -10,7 +10,8 @@ from jaxtank.measures import unit as measure_unit
 from jaxtank.presets.base import Free
 from jaxtank.rig import parts, signals
 from jaxtank.rig.keys import Key, Section, keys_of
-from jaxtank.signals import Constant, Ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import Ramps
 
 RELATIVE = (
     'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" '

@@ -13,7 +13,7 @@ from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalma
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
 from jaxtank.rig.words import static_value
-from jaxtank.signals import Ramps, ramps
+from jaxtank.signals.setpoints import Ramps, ramps
 
 LAWS = {
     "pid": controllers.PID,

@@ -16,7 +16,8 @@ from jaxtank.rig.origin import origin_of, structures
 from jaxtank.rig.reading import start_of
 from jaxtank.rig.values import MODELS
 from jaxtank.rig.words import toml
-from jaxtank.signals import Ramps, Sum
+from jaxtank.signals.base import Sum
+from jaxtank.signals.setpoints import Ramps
 
 # leaves and statics that the tables of a rig described tank by tank set
 TANKWISE = {"x0", "sensor.noise", "actuator.low", "actuator.high", "actuator.initial"}

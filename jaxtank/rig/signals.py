@@ -8,7 +8,9 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import _short, check_value, number
 from jaxtank.plants.faults import Faults, faults
 from jaxtank.rig.words import is_finite, plain, static_value
-from jaxtank.signals import Constant, Pours, Ramps, Sine, Sum, pours, ramps
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import Pours, pours
+from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
 RAMP_KEYS = ("initial", "changes", "ramp", "shape", "band")
 SINE_KEYS = ("amplitude", "offset", "period", "zero", "start", "end", "output")

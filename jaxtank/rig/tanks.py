@@ -16,7 +16,8 @@ from jaxtank.rig.parts import law_of, observer_of
 from jaxtank.rig.signals import INFLOW, meta_of
 from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.sensors import LevelSensor
-from jaxtank.signals import Constant, ramps
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 
 TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")

@@ -31,7 +31,7 @@ import jaxtank  # noqa: F401  (before jax starts)
 from jaxtank import presets
 from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
-from jaxtank.signals import ramps
+from jaxtank.signals.setpoints import ramps
 from tuning import tables
 from tuning.objective import Problem
 from tuning.scenarios import rough_clock

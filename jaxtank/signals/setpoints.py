@@ -4,7 +4,6 @@ A signal answers `sample(clock)` with three tuples (value, rate, second derivati
 samples are inputs of the loop: interpolating inside it would cost more than the plant does.
 """
 
-import abc
 import math
 
 import jax.numpy as jnp
@@ -13,41 +12,9 @@ import numpy as np
 from jaxtank.core.clock import Piece, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
+from jaxtank.signals.base import Signal
 
 SHAPES = ("linear", "quintic")
-
-
-class Signal(abc.ABC):
-    """A signal of one or more channels."""
-
-    @property
-    @abc.abstractmethod
-    def channels(self):
-        """Number of channels [-]."""
-
-    @abc.abstractmethod
-    def sample(self, clock):
-        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for a Clock. A signal whose every sample
-        follows from `sample_times(clock)` alone may be marked `pieces.pointwise`: a long run then asks for it piece by piece."""
-
-
-@component
-class Constant(Signal):
-    """A signal that does not change."""
-
-    level: np.ndarray = leaf(
-        "-", "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance"
-    )
-
-    @property
-    def channels(self):
-        return np.shape(self.level)[0]
-
-    @pointwise
-    def sample(self, clock):
-        zero = jnp.zeros(clock.samples)
-        flat = (zero,) * self.channels
-        return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
 
 
 @component
@@ -152,114 +119,6 @@ class Sine(Signal):
         moving = [jnp.where(inside, v, 0.0) for v in (self.offset + sine, omega * cosine, -omega * omega * sine)]
         still = jnp.zeros_like(t)
         return tuple(tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
-
-
-@component
-class Table(Signal):
-    """Recorded samples, one every `period` from t = 0 on: an input or an inflow that was logged.
-
-    Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them ("linear"); after the last, the last.
-    """
-
-    values: np.ndarray = leaf("-", "(channels, samples) the record, in the unit of what it stands for")
-    period: float = static("s", "time between samples", low=0.0, strict=True)
-    between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
-
-    @property
-    def channels(self):
-        return np.shape(self.values)[0]
-
-    def sample(self, clock):
-        last = np.shape(self.values)[1] - 1
-        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 * 0.1 s sample 3
-        at = np.arange(clock.samples) * (clock.dt / self.period)
-        index = np.minimum(np.floor(at + 5e-7), last).astype(int)
-        after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
-        table, still = jnp.asarray(self.values), jnp.zeros(clock.samples)
-        here = table[:, index]
-        if self.between == "hold":
-            return tuple(here), (still,) * self.channels, (still,) * self.channels
-        slope = table[:, after] - here
-        return tuple(here + slope * past), tuple(slope / self.period), (still,) * self.channels
-
-
-@component
-class Sum(Signal):
-    """Two signals added, channel by channel."""
-
-    first: Signal
-    second: Signal
-
-    @property
-    def channels(self):
-        return self.first.channels
-
-    @pointwise
-    def sample(self, clock):
-        return tuple(
-            tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
-        )
-
-    @pointwise
-    def windows(self, clock):
-        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
-        t = sample_times(clock)
-        found = list(self.first.windows(clock))
-        still = t < self.second.start - 1e-7 * clock.dt
-        found[self.second.channel] = tuple(jnp.where(still, a, 0.0) for a in found[self.second.channel])
-        return tuple(found)
-
-
-@component
-class Pours(Signal):
-    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; gouta2022 notes S3.2). An inflow per tank [cm^3/s].
-
-    What a sample is given is the mean over that sample, so that the whole volume arrives whatever the sampling period.
-    """
-
-    volume: np.ndarray = leaf("cm^3", "(pours,) volume of each pour; negative: taken out")
-    events: tuple = static(doc="((time [s], duration [s], tank), ...) one per pour")
-    width: int = static("-", "number of tanks", low=1, high=100)
-    window: float = static("s", "how long after a pour a tank is watched for its recovery", low=0.0, strict=True, default=60.0)
-
-    @property
-    def channels(self):
-        return self.width
-
-    @pointwise
-    def sample(self, clock):
-        t = sample_times(clock)
-        flow = [jnp.zeros_like(t) for _ in range(self.width)]
-        for j, (start, duration, tank) in enumerate(self.events):
-            share = (jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)) / (duration * clock.dt)
-            flow[tank] = flow[tank] + self.volume[j] * jnp.maximum(share, 0.0)
-        still = (jnp.zeros_like(t),) * self.width
-        return tuple(flow), still, still
-
-    @pointwise
-    def since(self, clock):
-        """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
-        t = sample_times(clock)
-        since = -jnp.ones_like(t)
-        for start, _, _ in sorted(self.events):
-            after = t - start
-            since = jnp.where(after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since)
-        return since
-
-
-def pours(tanks, entries):
-    """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0, volume [cm^3]). InputError for a bad one."""
-    for time, duration, tank, _ in entries:
-        if not (time >= 0 and duration > 0 and 0 <= tank < tanks):
-            raise InputError(
-                f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0 s, a duration above 0 s and a tank "
-                f"from 0 to {tanks - 1}, counted from 0"
-            )
-    return Pours(
-        volume=number([volume for *_, volume in entries]),
-        events=tuple((float(time), float(duration), int(tank)) for time, duration, tank, _ in entries),
-        width=tanks,
-    )
 
 
 def ramps(initial, changes, ramp=60.0, shape="linear", band=0.05):

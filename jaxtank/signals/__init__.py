@@ -1,0 +1,7 @@
+"""References and disturbances as functions of time, sampled before the time loop starts."""
+
+from jaxtank.signals.base import Constant, Signal, Sum, Table
+from jaxtank.signals.inflows import Pours, pours
+from jaxtank.signals.setpoints import Ramps, Sine, ramps
+
+__all__ = ["Constant", "Pours", "Ramps", "Signal", "Sine", "Sum", "Table", "pours", "ramps"]

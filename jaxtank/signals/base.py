@@ -1,0 +1,98 @@
+"""TODO docstring of jaxtank.signals.base."""
+
+import abc
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.clock import pointwise, sample_times
+from jaxtank.core.tree import component, leaf, static
+
+
+class Signal(abc.ABC):
+    """A signal of one or more channels."""
+
+    @property
+    @abc.abstractmethod
+    def channels(self):
+        """Number of channels [-]."""
+
+    @abc.abstractmethod
+    def sample(self, clock):
+        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for a Clock. A signal whose every sample
+        follows from `sample_times(clock)` alone may be marked `pieces.pointwise`: a long run then asks for it piece by piece."""
+
+
+@component
+class Constant(Signal):
+    """A signal that does not change."""
+
+    level: np.ndarray = leaf(
+        "-", "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance"
+    )
+
+    @property
+    def channels(self):
+        return np.shape(self.level)[0]
+
+    @pointwise
+    def sample(self, clock):
+        zero = jnp.zeros(clock.samples)
+        flat = (zero,) * self.channels
+        return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
+
+
+@component
+class Table(Signal):
+    """Recorded samples, one every `period` from t = 0 on: an input or an inflow that was logged.
+
+    Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them ("linear"); after the last, the last.
+    """
+
+    values: np.ndarray = leaf("-", "(channels, samples) the record, in the unit of what it stands for")
+    period: float = static("s", "time between samples", low=0.0, strict=True)
+    between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
+
+    @property
+    def channels(self):
+        return np.shape(self.values)[0]
+
+    def sample(self, clock):
+        last = np.shape(self.values)[1] - 1
+        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 * 0.1 s sample 3
+        at = np.arange(clock.samples) * (clock.dt / self.period)
+        index = np.minimum(np.floor(at + 5e-7), last).astype(int)
+        after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
+        table, still = jnp.asarray(self.values), jnp.zeros(clock.samples)
+        here = table[:, index]
+        if self.between == "hold":
+            return tuple(here), (still,) * self.channels, (still,) * self.channels
+        slope = table[:, after] - here
+        return tuple(here + slope * past), tuple(slope / self.period), (still,) * self.channels
+
+
+@component
+class Sum(Signal):
+    """Two signals added, channel by channel."""
+
+    first: Signal
+    second: Signal
+
+    @property
+    def channels(self):
+        return self.first.channels
+
+    @pointwise
+    def sample(self, clock):
+        return tuple(
+            tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
+        )
+
+    @pointwise
+    def windows(self, clock):
+        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
+        t = sample_times(clock)
+        found = list(self.first.windows(clock))
+        still = t < self.second.start - 1e-7 * clock.dt
+        found[self.second.channel] = tuple(jnp.where(still, a, 0.0) for a in found[self.second.channel])
+        return tuple(found)
