@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.actuators import PumpBank
 from jaxtank.analysis import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import PIECE, Piece
@@ -18,11 +17,12 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.kahan import added
 from jaxtank.core.records import Sample, Tick
 from jaxtank.core.tree import component, leaf
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.integration import change, integrate
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 

@@ -10,11 +10,12 @@ import numpy as np
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import actuators, analysis, linear, measures, observers, presets, qp, scheduling, sensors, signals
+from jaxtank import analysis, linear, measures, observers, presets, qp, scheduling, signals
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core import numerics
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Sample, Tick
+from jaxtank.instruments import actuators, sensors
 from jaxtank.plants import faults, hydraulics
 from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network

@@ -17,14 +17,14 @@ import numpy as np
 
 import jaxtank
 from jaxtank import presets, step_length
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop

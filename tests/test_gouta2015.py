@@ -13,11 +13,11 @@ import pytest
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.actuators import allocate
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers.decoupling import coefficients
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Tick
+from jaxtank.instruments.actuators import allocate
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.presets import load
 from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, law

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from gradient_audit import STEPS, Subject, audit, differences, told
 
-from jaxtank import actuators, presets, sensors
+from jaxtank import presets
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core import numerics
 from jaxtank.core.clock import Clock
+from jaxtank.instruments import actuators, sensors
 from jaxtank.loop import evaluate_and_flag
 from jaxtank.plants.network import network
 

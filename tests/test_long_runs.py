@@ -16,15 +16,15 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import presets
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import PIECE, Clock, is_pointwise
 from jaxtank.core.tree import component
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop import evaluate_for_reverse
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps

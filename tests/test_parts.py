@@ -8,12 +8,12 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import measures as ms
-from jaxtank.actuators import PumpBank
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import at_least, clip, quantise
 from jaxtank.core.tree import number
-from jaxtank.sensors import LevelSensor
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 

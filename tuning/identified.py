@@ -9,13 +9,13 @@ from jaxtank.core.tree import with_values
 
 def bare(plant):
     """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
-    from jaxtank.actuators import PumpBank
     from jaxtank.controllers import OpenLoop
     from jaxtank.core.clock import Clock
     from jaxtank.core.tree import number
+    from jaxtank.instruments.actuators import PumpBank
+    from jaxtank.instruments.sensors import LevelSensor
     from jaxtank.observers import Direct
     from jaxtank.presets.base import Case
-    from jaxtank.sensors import LevelSensor
     from jaxtank.signals.base import Constant
     from jaxtank.stepping import ClosedLoop
 

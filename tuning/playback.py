@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip
 from jaxtank.core.tree import component, leaf, with_values
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
 from jaxtank.plants.integration import integrate
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
 

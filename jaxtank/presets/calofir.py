@@ -5,17 +5,17 @@ import functools
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import OpenLoop
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 

@@ -2,14 +2,14 @@
 
 import functools
 
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import PID, OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.presets.base import Case, Free, Preset, Published
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop

@@ -4,16 +4,16 @@ import functools
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers import NGPC, Backstepping
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 

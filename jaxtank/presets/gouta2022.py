@@ -4,14 +4,14 @@ import functools
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import ENMPC, PID
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Sum
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps

@@ -5,14 +5,14 @@ import math
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.controllers import GPC, Laguerre
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 

@@ -4,15 +4,15 @@ import functools
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.analysis import equilibrium
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants import quadruple_tank
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published, Scenario
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop
 

@@ -4,18 +4,18 @@ import dataclasses
 
 import numpy as np
 
-from jaxtank.actuators import PumpBank
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import _short, check_value, number
 from jaxtank.core.units import DEFAULT, check_unit, local
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.presets.base import Case
 from jaxtank.rig.parts import law_of, observer_of
 from jaxtank.rig.signals import INFLOW, meta_of
 from jaxtank.rig.words import is_numeric, name_of
-from jaxtank.sensors import LevelSensor
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 from jaxtank.stepping import ClosedLoop

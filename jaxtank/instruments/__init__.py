@@ -1,0 +1,6 @@
+"""Sensors and actuators: what stands between the computer and the rig."""
+
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+
+__all__ = ["LevelSensor", "PumpBank"]
