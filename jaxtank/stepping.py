@@ -22,7 +22,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
-from jaxtank.plants.integration import change, integrate
+from jaxtank.plants.runge_kutta import change, integrate
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 

@@ -17,9 +17,9 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.instruments import actuators, sensors
 from jaxtank.plants import faults, hydraulics
-from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
 from jaxtank.plants.rigs import johansson, state_coupled_four_tank
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets.gouta2015 import FAST_AREA
 
 SUBJECTS, QUICK = {}, set()

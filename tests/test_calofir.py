@@ -20,8 +20,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import with_values
 from jaxtank.loop import _evaluate
-from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import calofir
 from jaxtank.signals.setpoints import ramps
 

@@ -36,9 +36,9 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, number, with_values
 from jaxtank.linear import lqr
 from jaxtank.plants import state_coupled_four_tank
-from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load, mirakhorli
 from jaxtank.presets.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, response
 

@@ -16,8 +16,8 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import ROOT_KNEE, floored_root, root
 from jaxtank.plants import state_coupled_four_tank
-from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import network
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets.gouta2015 import FAST_AREA
 
 QUIET = settings(deadline=None, max_examples=8, derandomize=True)

@@ -20,8 +20,8 @@ from test_physics import in_metres
 from jaxtank.analysis import steady_levels
 from jaxtank.core.tree import component
 from jaxtank.plants import Plant
-from jaxtank.plants.integration import integrate
 from jaxtank.plants.network import TankNetwork, network
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.xla.hoist import scan
 
 STILL = np.zeros(SIZE)

@@ -69,7 +69,7 @@ def settled(plant, voltage):
     u = tuple(jnp.asarray(v) for v in voltage)
     import jax
 
-    from jaxtank.plants.integration import integrate
+    from jaxtank.plants.runge_kutta import integrate
 
     size = float(np.max(np.asarray(plant.rim)))
     rate = max(abs(float(v)) for v in plant.derivative(0.0, tuple(jnp.asarray(0.5 * size) for _ in range(plant.tanks)), u, d))

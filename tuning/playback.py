@@ -14,7 +14,7 @@ from jaxtank.core.tree import component, leaf, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
-from jaxtank.plants.integration import integrate
+from jaxtank.plants.runge_kutta import integrate
 from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
 

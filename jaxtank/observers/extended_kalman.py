@@ -11,7 +11,7 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.kalman import check_measured
 from jaxtank.plants.base import Plant
-from jaxtank.plants.integration import integrate
+from jaxtank.plants.runge_kutta import integrate
 
 
 class Belief(NamedTuple):
