@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.analysis import equilibrium, linearise
+from jaxtank.analysis.steady_state import equilibrium, linearise
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
 

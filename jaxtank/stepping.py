@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.analysis import steady_along
+from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import PIECE, Piece
 from jaxtank.core.errors import InputError

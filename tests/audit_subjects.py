@@ -10,7 +10,8 @@ import numpy as np
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import analysis, linear, measures, observers, presets, qp, scheduling, signals
+from jaxtank import analysis, measures, observers, presets, scheduling, signals
+from jaxtank.analysis import qp, riccati
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core import numerics
 from jaxtank.core.clock import Clock
@@ -341,22 +342,22 @@ def weights(p):
 
 @subject("linear.zero_order_hold")
 def _(rng):
-    return matrices(rng)[:2], lambda p: linear.zero_order_hold(*p, 0.5)
+    return matrices(rng)[:2], lambda p: riccati.zero_order_hold(*p, 0.5)
 
 
 @subject("linear.lyapunov discrete_lyapunov")
 def _(rng):
-    return matrices(rng), lambda p: (linear.lyapunov(p[0], weights(p)[0]), linear.discrete_lyapunov(0.1 * p[0], weights(p)[0]))
+    return matrices(rng), lambda p: (riccati.lyapunov(p[0], weights(p)[0]), riccati.discrete_lyapunov(0.1 * p[0], weights(p)[0]))
 
 
 @subject("linear.riccati lqr")
 def _(rng):
-    return matrices(rng), lambda p: (linear.riccati(p[0], p[1], *weights(p)), linear.lqr(p[0], p[1], *weights(p)))
+    return matrices(rng), lambda p: (riccati.riccati(p[0], p[1], *weights(p)), riccati.lqr(p[0], p[1], *weights(p)))
 
 
 @subject("linear.discrete_riccati")
 def _(rng):
-    return matrices(rng), lambda p: linear.discrete_riccati(*linear.zero_order_hold(p[0], p[1], 0.5), *weights(p))
+    return matrices(rng), lambda p: riccati.discrete_riccati(*riccati.zero_order_hold(p[0], p[1], 0.5), *weights(p))
 
 
 @subject("qp.solve", points=40, tolerance=1e-5, why="the interior point stops at a complementarity of 1e-12")

@@ -14,7 +14,7 @@ from scipy.optimize import fsolve
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick

@@ -13,7 +13,7 @@ import pytest
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers.decoupling import coefficients
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Tick

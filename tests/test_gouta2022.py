@@ -9,7 +9,7 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.analysis import equilibrium, linearise
+from jaxtank.analysis.steady_state import equilibrium, linearise
 from jaxtank.controllers.pid import oustaloup
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError

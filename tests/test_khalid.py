@@ -63,7 +63,7 @@ def summary(kind, *setting, **more):
 
 
 def test_linear_model_with_one_pump():
-    from jaxtank.analysis import linearise
+    from jaxtank.analysis.steady_state import linearise
 
     plant = dataclasses.replace(khalid.tanks(1), knee=EXACT)
     A, B, C = (np.asarray(m) for m in linearise(plant, khalid.MIDDLE[1], (0.0,)))
@@ -82,7 +82,7 @@ def test_linear_model_with_one_pump():
 
 
 def test_linear_model_with_two_pumps():
-    from jaxtank.analysis import linearise
+    from jaxtank.analysis.steady_state import linearise
 
     plant = dataclasses.replace(khalid.tanks(2), knee=EXACT)
     for levels, poles in (((0.06, 0.075), (-0.22372, -0.07176)), ((0.12, 0.15), (-0.15819, -0.05074))):

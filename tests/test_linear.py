@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy import linalg
 
-from jaxtank.linear import discrete_lyapunov, discrete_riccati, lqr, lyapunov, riccati, zero_order_hold
+from jaxtank.analysis.riccati import discrete_lyapunov, discrete_riccati, lqr, lyapunov, riccati, zero_order_hold
 
 RICCATI, LQR, DISCRETE_RICCATI = jax.jit(riccati), jax.jit(lqr), jax.jit(discrete_riccati)
 QUADRUPLE = (  # mirakhorli at 12/12: mirakhorli notes S2.3

@@ -15,7 +15,8 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.analysis import (
+from jaxtank.analysis.riccati import lqr
+from jaxtank.analysis.steady_state import (
     equilibrium,
     linearise,
     relative_gain_array,
@@ -34,7 +35,6 @@ from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import signed_root, signed_root_slope
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, number, with_values
-from jaxtank.linear import lqr
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 
 import jaxtank
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick

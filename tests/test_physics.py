@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import jaxtank
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import ROOT_KNEE, floored_root, root

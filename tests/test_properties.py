@@ -17,7 +17,7 @@ from random_rigs import FEEDS, KINDS, RIM, SIZE, flows, levels, random_rig, rela
 from scipy.integrate import solve_ivp
 from test_physics import in_metres
 
-from jaxtank.analysis import steady_levels
+from jaxtank.analysis.steady_state import steady_levels
 from jaxtank.core.tree import component
 from jaxtank.plants import Plant
 from jaxtank.plants.network import TankNetwork, network

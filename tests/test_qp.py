@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.optimize import LinearConstraint, minimize
 
-from jaxtank import qp
+from jaxtank.analysis import qp
 
 
 def problem(n, rows, seed, tight=0.3):

@@ -14,7 +14,7 @@ from scipy import stats
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank.analysis import steady_flows
+from jaxtank.analysis.steady_state import steady_flows
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.xla.flags import WIDE

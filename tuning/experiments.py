@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
 from tuning import playback as pb
 from tuning.coordinates import coordinates, nominal, usual

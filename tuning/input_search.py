@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import measures as ms
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import number
 from jaxtank.rig import check_objective

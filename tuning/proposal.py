@@ -9,7 +9,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
-from jaxtank.analysis import linearise
+from jaxtank.analysis.steady_state import linearise
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
 from jaxtank.presets.base import Free

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.stepping import Inputs, initial, step

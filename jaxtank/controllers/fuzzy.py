@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis import steady_along
+from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
 from jaxtank.controllers.state_feedback import feedback

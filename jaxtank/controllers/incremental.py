@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank import qp
-from jaxtank.analysis import linearise
+from jaxtank.analysis import qp
+from jaxtank.analysis.riccati import zero_order_hold
+from jaxtank.analysis.steady_state import linearise
 from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
-from jaxtank.linear import zero_order_hold
 
 MODES = ("unconstrained", "clipped", "constrained")
 EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.analysis import steady_along
+from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, signed_root, signed_root_slope

@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis import linearise, steady_along, steady_flows
+from jaxtank.analysis.riccati import lqr
+from jaxtank.analysis.steady_state import linearise, steady_along, steady_flows
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
-from jaxtank.linear import lqr
 from jaxtank.plants.base import Plant
 
 

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis import linearise
+from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
+from jaxtank.analysis.steady_state import linearise
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate
 from jaxtank.core.tree import component, leaf, static
-from jaxtank.linear import discrete_riccati, zero_order_hold
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 

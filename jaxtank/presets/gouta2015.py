@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers import NGPC, Backstepping
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank import loop as lp
 from jaxtank import scheduling
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import _short, check_value, describe, get_value, split_index

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtank import controllers
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import _short, number
 from jaxtank.core.units import local

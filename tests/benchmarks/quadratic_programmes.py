@@ -8,7 +8,7 @@ import time
 import jax
 import numpy as np
 
-from jaxtank import qp
+from jaxtank.analysis import qp
 
 jax.config.update("jax_enable_x64", True)
 SIZES, LANES, ROUNDS, CALLS = (48, 60, 100), 16, 5, 4

@@ -7,7 +7,7 @@ notes), which the tuned objective must reach to 1 % or half a unit of its last d
 from typing import Any, NamedTuple
 
 from jaxtank import presets, rig
-from jaxtank.analysis import equilibrium
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.presets import khalid, mirakhorli
 from jaxtank.presets.base import Free, Scenario
 
