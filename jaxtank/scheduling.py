@@ -4,8 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxtank.controllers.schedulable import check_gains, check_knots, check_variable
-from jaxtank.controllers.scheduled import Scheduled
+from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knots, check_variable
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import describe, get_value, number, parameters, split_index, walk, with_values
 from jaxtank.presets.base import Free

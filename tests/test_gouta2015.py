@@ -14,7 +14,7 @@ import pytest
 import jaxtank
 from jaxtank import rig
 from jaxtank.analysis.steady_state import equilibrium
-from jaxtank.controllers.decoupling import coefficients
+from jaxtank.controllers.feedback_linearisation import coefficients
 from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.instruments.actuators import allocate
@@ -376,7 +376,7 @@ def test_lyapunov_function_of_backstepping_never_grows(gouta):
 
 def test_the_inversion_inverts():
     """b times what `decouple` adds for a unit demand is the identity, at random levels."""
-    from jaxtank.controllers.decoupling import decouple
+    from jaxtank.controllers.feedback_linearisation import decouple
 
     c = coefficients(state_coupled_four_tank(FAST_AREA))
     rng = np.random.default_rng(0)

@@ -207,7 +207,7 @@ def test_chadpc_is_a_pi_on_the_linearised_plant():
 
 
 def paper_drift(x):
-    from jaxtank.controllers.own_pump import drift
+    from jaxtank.controllers.feedback_linearisation import drift
 
     return np.stack(drift(paper.rig(), tuple(x.T)), axis=-1)
 

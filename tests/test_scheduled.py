@@ -14,7 +14,7 @@ from scipy.optimize import minimize, minimize_scalar
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.controllers import Backstepping, Controller, Scheduled
-from jaxtank.controllers.scheduled import interpolate
+from jaxtank.controllers.gain_schedule import interpolate
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values

@@ -4,12 +4,12 @@ from jaxtank.controllers.backstepping import Backstepping
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.enmpc import ENMPC
 from jaxtank.controllers.fuzzy import FuzzyBlend
+from jaxtank.controllers.gain_schedule import Scheduled
 from jaxtank.controllers.gpc import GPC
 from jaxtank.controllers.laguerre import Laguerre
 from jaxtank.controllers.ngpc import NGPC
 from jaxtank.controllers.open_loop import OpenLoop
 from jaxtank.controllers.pid import PID
-from jaxtank.controllers.scheduled import Scheduled
 from jaxtank.controllers.sliding_mode import SlidingMode
 from jaxtank.controllers.state_feedback import LQI, StateFeedback
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping

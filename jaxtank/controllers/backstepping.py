@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.decoupling import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
 

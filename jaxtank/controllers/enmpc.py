@@ -1,7 +1,7 @@
 """Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance estimate (gouta2022, sec. 3 and 4)."""
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
 

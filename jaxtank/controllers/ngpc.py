@@ -1,7 +1,7 @@
 """Nonlinear generalised predictive control (gouta2015, sec. 3)."""
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.decoupling import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, static

@@ -1,6 +1,6 @@
 """The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25)."""
 
-from jaxtank.controllers.own_pump import authority, check_own_pumps, drift
+from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate
 from jaxtank.core.tree import component, leaf, static
