@@ -2,7 +2,6 @@
 
 from jaxtank.observers.base import Direct, Observer
 from jaxtank.observers.disturbance import DisturbanceObserver
-from jaxtank.observers.extended_kalman import ExtendedKalman
-from jaxtank.observers.kalman import Kalman
+from jaxtank.observers.kalman import ExtendedKalman, Kalman
 
 __all__ = ["Direct", "DisturbanceObserver", "ExtendedKalman", "Kalman", "Observer"]
