@@ -39,8 +39,8 @@ def test_the_loop_compiles_to_one_function(gouta, name):
 
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
     """Two calls: the random generator has a loop of its own."""
-    from jaxtank.measures import MEASURES as every
-    from jaxtank.measures import serves
+    from jaxtank.measures.catalogue import MEASURES as every
+    from jaxtank.measures.catalogue import serves
 
     case = gouta(
         "ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12}

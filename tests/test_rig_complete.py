@@ -16,7 +16,7 @@ from jaxtank import parameters, presets, rig
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
-from jaxtank.measures import MEASURES, TIMES
+from jaxtank.measures.catalogue import MEASURES, TIMES
 from tuning import cli, options
 
 HEAD = 'case = "gouta2015/backstepping"\n'

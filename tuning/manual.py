@@ -10,8 +10,8 @@ from jaxtank import presets
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
 from jaxtank.equations import equations, physics
-from jaxtank.measures import MEASURES, TIMES
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures.catalogue import MEASURES, TIMES
+from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.presets.base import Free
 from tuning import manual_parts, tables
 from tuning.objective import LOWER

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.measures import check_names
+from jaxtank.measures.catalogue import check_names
 from tuning.objective import LOWER, Problem
 from tuning.screening import best_screened, screen
 from tuning.solvers import Search, approach, restore, slsqp
