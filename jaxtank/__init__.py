@@ -35,11 +35,11 @@ _HOMES = {
     "static": "jaxtank.core.tree",
     "Clock": "jaxtank.core.records",
     "Trajectory": "jaxtank.core.records",
-    "ClosedLoop": "jaxtank.loop",
-    "simulate": "jaxtank.loop",
-    "evaluate": "jaxtank.loop",
-    "sensitivities": "jaxtank.loop",
-    "check": "jaxtank.loop",
+    "ClosedLoop": "jaxtank.loop.run",
+    "simulate": "jaxtank.loop.run",
+    "evaluate": "jaxtank.loop.run",
+    "sensitivities": "jaxtank.loop.run",
+    "check": "jaxtank.loop.run",
 }
 _ROOMS = (
     "analysis",

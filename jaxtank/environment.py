@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.door import check
-from jaxtank.stepping import initial, inputs, move
+from jaxtank.loop.closed_loop import initial, inputs
+from jaxtank.loop.step import move
+from jaxtank.loop.validation import check
 
 PENALTY = 100.0
 """What a rim passed by one unit of length costs more than an error of as much [-]."""

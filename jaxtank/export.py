@@ -10,7 +10,8 @@ from jaxtank import codegen as cg
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
-from jaxtank.stepping import commanded, initial
+from jaxtank.loop.closed_loop import initial
+from jaxtank.loop.step import commanded
 
 LANGUAGES = ("c", "m")
 PRECISIONS = ("double", "float")

@@ -10,10 +10,10 @@ from audit_subjects import scales_of
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import loop as lp
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.derivatives import _sensitivities
+from jaxtank.loop import run as lp
+from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.signals.setpoints import Ramps
 
 MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")

@@ -16,18 +16,19 @@ import jax
 import numpy as np
 
 import jaxtank
-from jaxtank import presets, step_length
+from jaxtank import presets
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop import step_size
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 OFF = 0.05  # share of the rim
 RIM = 10.0
@@ -115,7 +116,7 @@ def reference(loops, inputs, dt):
     area, drain, orifice, pipe = (stack(lambda loop, k=k: getattr(loop.plant, k)) for k in ("area", "drain", "orifice", "pipe"))
     gain, split, rim, caught = (stack(lambda loop, k=k: getattr(loop.plant, k)) for k in ("pump_gain", "split", "rim", "caught"))
     x, d, knee = stack(lambda loop: loop.x0), stack(lambda loop: loop.disturbance.level), plant.knee
-    fastest = max(step_length.film_rates(loop.plant).max() for loop in loops)
+    fastest = max(step_size.film_rates(loop.plant).max() for loop in loops)
     parts = int(np.ceil(dt * fastest / FINE))
     path = []
     for k in range(inputs.shape[1]):
@@ -147,17 +148,17 @@ def tried(kind, seeds):
     """[(error as a share of the rim, True if it was reported)] of rigs of a kind; None of one that is refused beforehand."""
     loops, runs, reported = [], [], []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", step_length.StepWarning)
+        warnings.simplefilter("ignore", step_size.StepWarning)
         for seed in seeds:
             loop, clock = drawn(kind, seed)
             try:
                 run = jaxtank.simulate(loop, clock)
-                step_length.check_run(loop, clock, run)
+                step_size.check_run(loop, clock, run)
             except InputError:
                 continue
             loops.append(loop)
             runs.append(run)
-            reported.append(bool(step_length.doubts(loop, clock)))
+            reported.append(bool(step_size.doubts(loop, clock)))
     levels, inputs = (np.stack([np.asarray(getattr(run, name)) for run in runs]) for name in ("x", "u"))
     error = np.abs(levels - reference(loops, inputs, clock.dt)).max(axis=(1, 2)) / RIM
     return list(zip(error, reported))

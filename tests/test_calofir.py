@@ -19,7 +19,7 @@ from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import with_values
-from jaxtank.loop import _evaluate
+from jaxtank.loop.run import _evaluate
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import calofir

@@ -15,7 +15,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, with_values
-from jaxtank.loop import _evaluate
+from jaxtank.loop.run import _evaluate
 from jaxtank.presets import cascaded
 from jaxtank.signals.base import Table
 from tuning import cli

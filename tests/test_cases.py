@@ -8,7 +8,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, walk
-from jaxtank.loop import _evaluate
+from jaxtank.loop.run import _evaluate
 from tuning import cli
 from tuning.bench import is_one_function
 from tuning.compare import measure

@@ -13,8 +13,8 @@ import pytest
 import jaxtank
 from jaxtank.core.clock import Clock
 from jaxtank.core.kahan import nothing, plus, totals
-from jaxtank.derivatives import _sensitivities
-from jaxtank.loop import _evaluate, evaluate_for_reverse
+from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.run import _evaluate, evaluate_for_reverse
 from jaxtank.xla import flags as _xla
 from jaxtank.xla import hoist
 from jaxtank.xla.barrier import materialised

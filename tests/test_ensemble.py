@@ -15,10 +15,10 @@ from scipy import stats
 
 import jaxtank
 import tuning
-from jaxtank import loop as lp
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
 from tuning import evidence, parts, robust, shards
 from tuning.distributions import Draws, parse, stated

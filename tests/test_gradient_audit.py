@@ -20,7 +20,7 @@ from jaxtank.controllers.fuzzy import membership
 from jaxtank.core import numerics
 from jaxtank.core.clock import Clock
 from jaxtank.instruments import actuators, sensors
-from jaxtank.loop import evaluate_and_flag
+from jaxtank.loop.run import evaluate_and_flag
 from jaxtank.plants.network import network
 
 

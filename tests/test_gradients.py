@@ -13,7 +13,7 @@ import pytest
 
 import jaxtank
 from jaxtank.core.tree import get_value, with_values
-from jaxtank.loop import evaluate_for_reverse
+from jaxtank.loop.run import evaluate_for_reverse
 
 STEP = 1e-5
 

@@ -24,7 +24,7 @@ from jaxtank.controllers.incremental import EXACT, incremental_model
 from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop import _evaluate
+from jaxtank.loop.run import _evaluate
 from jaxtank.presets import khalid
 
 DT = 2.0
@@ -712,7 +712,7 @@ def test_reverse_slopes_through_programmes_are_the_forward_ones():
     loop, clock = khalid.build("laguerre", mode=QP), dataclasses.replace(COARSE, duration=98.0)
 
     def cost(z):
-        from jaxtank.loop import evaluate_for_reverse
+        from jaxtank.loop.run import evaluate_for_reverse
 
         moved = with_values(loop, {"controller.r_w": jnp.exp(z[0]), "controller.a": z[1], "controller.du_limit": z[2]})
         return evaluate_for_reverse(moved, clock, ("rms_error_total",))["rms_error_total"]
@@ -746,7 +746,7 @@ def test_the_loop_compiles_to_one_function(name):
 
 def test_every_case_passes_the_door():
     for name, case in PRESET.cases.items():
-        jaxtank.loop.check(case.loop, case.clock, None)
+        jaxtank.loop.run.check(case.loop, case.clock, None)
         if name in ("gpc", "gpc-mimo"):  # every plateau has a steady state
             rig.check(case)
         assert set(case.free) <= set(jaxtank.parameters(case.loop)) | {"controller.operating_point[1]", "controller.q[1]"}

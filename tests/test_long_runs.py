@@ -21,14 +21,14 @@ from jaxtank.core.clock import PIECE, Clock, is_pointwise
 from jaxtank.core.tree import component
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop import evaluate_for_reverse
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.run import evaluate_for_reverse
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps
-from jaxtank.stepping import ClosedLoop
 
 DT = 0.01
 LONG = [100_000, pytest.param(10_000_000, marks=pytest.mark.slow)]

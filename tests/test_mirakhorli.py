@@ -828,7 +828,7 @@ def test_the_printed_law_has_no_useful_slopes():
 def test_each_case_compiles_to_one_loop(name):
     from test_compiled_loop import loops_in
 
-    from jaxtank.loop import _evaluate
+    from jaxtank.loop.run import _evaluate
 
     case = load("mirakhorli").cases[name]
     compiled = _evaluate.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()
@@ -891,7 +891,7 @@ def test_batches_and_reverse_through_the_design_of_a_gain():
     cost = lambda q, evaluate=jaxtank.evaluate: evaluate(with_values(case.loop, {"controller.Q[4]": q}), case.clock, rms)[rms]
     batch = jax.jit(jax.vmap(cost))(np.array([3e-4, 1e-3]))
     np.testing.assert_allclose(batch, [cost(3e-4), cost(1e-3)], rtol=1e-12)
-    reverse = jax.jit(jax.grad(lambda q: cost(q, jaxtank.loop.evaluate_for_reverse)))(1e-3)
+    reverse = jax.jit(jax.grad(lambda q: cost(q, jaxtank.loop.run.evaluate_for_reverse)))(1e-3)
     np.testing.assert_allclose(reverse, jax.jit(jax.jacfwd(cost))(1e-3), rtol=1e-9)
 
 

@@ -14,7 +14,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import component, get_value, number, static, with_values
-from jaxtank.loop import _evaluate
+from jaxtank.loop.run import _evaluate
 from jaxtank.observers import ExtendedKalman, Kalman
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.base import Plant

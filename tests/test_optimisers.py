@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxtank import loop, presets
+from jaxtank import presets
 from jaxtank.core.tree import with_values
-from jaxtank.derivatives import OUTER
+from jaxtank.loop import run
+from jaxtank.loop.derivatives import OUTER
 from jaxtank.scheduling import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.objective import Problem
@@ -82,11 +83,11 @@ def test_gauss_newton_of_many_parameters(gouta):
     case = schedule(quick(gouta), {"controller.k1": "r1"}, np.linspace(3.0, 8.0, OUTER + 2))
     names = [f"controller.values[0,{j}]" for j in range(OUTER + 2)]
     at = {name: 0.2 + 0.01 * j for j, name in enumerate(names)}
-    _, _, matrix, broken = loop.sensitivities(case.loop, case.clock, "mean_square_error", at)
+    _, _, matrix, broken = run.sensitivities(case.loop, case.clock, "mean_square_error", at)
     assert not broken
 
     def error(changes):
-        return np.ravel(loop.simulate(with_values(case.loop, {**at, **changes}), case.clock).e)
+        return np.ravel(run.simulate(with_values(case.loop, {**at, **changes}), case.clock).e)
 
     step = 1e-5
     jacobian = np.array([(error({n: at[n] + step}) - error({n: at[n] - step})) / (2 * step) for n in names])

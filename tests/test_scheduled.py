@@ -18,8 +18,8 @@ from jaxtank.controllers.gain_schedule import interpolate
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
-from jaxtank.derivatives import _sensitivities
-from jaxtank.loop import _evaluate, evaluate_and_flag, evaluate_for_reverse
+from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.run import _evaluate, evaluate_and_flag, evaluate_for_reverse
 from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
 from jaxtank.xla.reachability import use_of

@@ -13,7 +13,8 @@ def open_case(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxtank import rig, step_length
+    from jaxtank import rig
+    from jaxtank.loop import step_size
 
     case, notes = rig.open_case(args.case), []
     if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
@@ -33,7 +34,7 @@ def open_case(args):
     if case.clock != clock and not args.quiet:
         for sentence in rig.clock_doubts(case.clock):
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
-    for sentence in () if args.quiet else step_length.doubts(case.loop, case.clock):
+    for sentence in () if args.quiet else step_size.doubts(case.loop, case.clock):
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
     return case
 

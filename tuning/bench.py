@@ -12,9 +12,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import presets
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from tuning import tables
 from tuning.manual import noisy
 from tuning.search import provenance

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.core.errors import NonFiniteError
+from jaxtank.loop import run as lp
 from tuning.input_search import InputSearch
 from tuning.inputs import open_loop
 

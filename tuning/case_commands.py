@@ -77,13 +77,13 @@ def simulate(args):
     seed, case = seed_of(args), open_case(args)
     import jax
 
-    from jaxtank import loop, step_length
     from jaxtank import measures as ms
+    from jaxtank.loop import run, step_size
     from tuning import manual, saving, search, tables
 
     key = jax.random.key(seed) if manual.noisy(case) else None
-    if step_length.doubts(case.loop, case.clock):
-        step_length.check_run(case.loop, case.clock, loop.simulate(case.loop, case.clock, key))
+    if step_size.doubts(case.loop, case.clock):
+        step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
     payload = {
         "case": case.name,
@@ -91,7 +91,7 @@ def simulate(args):
         "units": tables.units(case.loop.units),
         "reasons": tables.reasons(values),
         "clock": manual.clock(case.clock),
-        "parameters": tables.clean(loop.parameters(case.loop)),
+        "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": search.provenance(case, seed),
     }
     written = saving.save_run(case, saving.run_for_people(case, key), payload, args.out, args.gif) if args.out else []

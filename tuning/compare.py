@@ -9,10 +9,10 @@ import jax
 import numpy as np
 
 import jaxtank
-from jaxtank import loop as lp
 from jaxtank import presets, rig
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
 from jaxtank.presets.base import Claim
 from tuning import pictures, saving, tables
 from tuning.manual import noisy

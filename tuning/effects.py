@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.core.errors import NonFiniteError
 from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
 from tuning.distributions import Correlated, Discrete, Normal
 
 CHUNK = 16

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_flows
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
 from tuning import parts, shards
 from tuning.distributions import Correlated, Draws, Uniform, stated

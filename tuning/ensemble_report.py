@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank import step_length
 from jaxtank.core.files import check_folder
+from jaxtank.loop import step_size
 from tuning import page, parts, saving, search, tables
 from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
@@ -49,7 +49,7 @@ def json_of(ensemble):
 def remarks_of(ensemble):
     """Sentences on what to doubt of the draws: that steps are too long for the rig as it is, before anything is drawn."""
     return [
-        f"of the rig as it is, and of draws like it: {line}" for line in step_length.doubts(ensemble.case.loop, ensemble.case.clock)
+        f"of the rig as it is, and of draws like it: {line}" for line in step_size.doubts(ensemble.case.loop, ensemble.case.clock)
     ]
 
 

@@ -14,10 +14,10 @@ def bare(plant):
     from jaxtank.core.tree import number
     from jaxtank.instruments.actuators import PumpBank
     from jaxtank.instruments.sensors import LevelSensor
+    from jaxtank.loop.closed_loop import ClosedLoop
     from jaxtank.observers import Direct
     from jaxtank.presets.base import Case
     from jaxtank.signals.base import Constant
-    from jaxtank.stepping import ClosedLoop
 
     n, m = plant.tanks, plant.pumps
     still = number(np.zeros(m))

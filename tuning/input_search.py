@@ -5,11 +5,11 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import number
+from jaxtank.loop import run as lp
 from jaxtank.rig import check_objective
 from tuning.inputs import RUNNING, Held, Terms, look, open_loop, value_and_gradient
 from tuning.objective import resolve_limits

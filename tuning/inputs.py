@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.numerics import magnitude
 from jaxtank.core.tree import number
+from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import initial, inputs, run_of
+from jaxtank.loop.step import step
 from jaxtank.observers import Direct
 from jaxtank.signals.base import Table
-from jaxtank.stepping import initial, inputs, run_of, step
 
 RUNNING = {"max_level": 1.0, "min_level": -1.0, "max_error": 1.0}
 """Measures whose limit is held sample by sample: +1 for an upper limit, -1 for a lower one."""

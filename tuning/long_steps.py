@@ -2,10 +2,10 @@
 
 import warnings
 
-from jaxtank import loop as lp
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.step_length import StepWarning, check_run, doubts
+from jaxtank.loop import run as lp
+from jaxtank.loop.step_size import StepWarning, check_run, doubts
 
 MOST = 16
 """Runs that are made to see whether a level is thrown up in one."""

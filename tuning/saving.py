@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_together
 from jaxtank.core.units import DEFAULT
+from jaxtank.loop import run as lp
 from jaxtank.neighbours import columns
 from tuning.pictures import failed
 from tuning.tables import dumps

@@ -10,7 +10,8 @@ import scipy  # its parts are imported when they are first used
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.stepping import Inputs, initial, step
+from jaxtank.loop.closed_loop import initial
+from jaxtank.loop.step import Inputs, step
 from tuning.scenarios import coarse_clock
 
 TRIED = 3

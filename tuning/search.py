@@ -9,11 +9,11 @@ import jax
 import numpy as np
 
 import jaxtank
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.loop import run as lp
 from jaxtank.xla.flags import KEY
 from tuning import evidence, scenarios
 from tuning.evidence import REPORTED

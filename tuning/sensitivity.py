@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
 from tuning import indices
 from tuning import scenarios as sc
 from tuning.distributions import Correlated, Draws, stated

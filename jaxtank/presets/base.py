@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtank.core.clock import Clock
-from jaxtank.stepping import ClosedLoop
+from jaxtank.loop.closed_loop import ClosedLoop
 
 
 class Free(NamedTuple):

@@ -11,13 +11,13 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop import simulate
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
 Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]

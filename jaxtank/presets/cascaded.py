@@ -7,12 +7,12 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.presets.base import Case, Free, Preset, Published
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 RIM = 10.0  # level sensor's volts at which either tank overflows
 PERIOD = 4.0  # of the record [s]

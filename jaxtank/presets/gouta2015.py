@@ -10,12 +10,12 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
 FAST_AREA = 15 * 2**0.5  # the same figure read as an area (notes A1) [cm^2]

@@ -9,13 +9,13 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
 from jaxtank.signals.base import Sum
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps
-from jaxtank.stepping import ClosedLoop
 
 PRINTED_GAIN, RECONCILED_GAIN = 3.4717, 34.717  # Kp of Table 1, and ten times that (notes S2.2) [cm^3/(s V)]
 DEAD_ZONE = (2.7538, 4.3248)  # what the reported mean of d^ amounts to at the reconciled Kp (notes S2.3) [V]

@@ -10,11 +10,11 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]
 CHANNEL = 78.5e-6  # s1 = s2 = s3, Table I [m^2]

@@ -10,11 +10,11 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import quadruple_tank
 from jaxtank.presets.base import Case, Claim, Free, Preset, Published, Scenario
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]
 WARM = (6.0, 6.0)  # where the -warm cases start [cm]

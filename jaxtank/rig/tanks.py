@@ -10,6 +10,7 @@ from jaxtank.core.tree import _short, check_value, number
 from jaxtank.core.units import DEFAULT, check_unit, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.presets.base import Case
@@ -18,7 +19,6 @@ from jaxtank.rig.signals import INFLOW, meta_of
 from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
-from jaxtank.stepping import ClosedLoop
 
 TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")
 TANK = {"name": "", "area": None, "rim": None, "drain": 0.0, "level": 0.0, "inflow": 0.0, "noise": 0.0}

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxtank import loop as lp
 from jaxtank import presets, rig
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from tuning.ensemble import clopper_pearson
 
 N = 200

@@ -21,10 +21,11 @@ import ensemble
 import jax
 import numpy as np
 
-from jaxtank import loop, presets
+from jaxtank import presets
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
-from jaxtank.derivatives import _sensitivities
+from jaxtank.loop import run as loop
+from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.xla import flags
 from tuning import bench, tables
 from tuning.manual import noisy

@@ -8,7 +8,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxtank import measures as ms
 from jaxtank.core.tree import with_values
-from jaxtank.stepping import initial, inputs, is_broken, keyed, run_of, step
+from jaxtank.loop.closed_loop import initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
 from jaxtank.xla.reachability import reached

@@ -1,6 +1,7 @@
 """Checks at the door: a loop and a clock that cannot be run are told so before anything is compiled."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -9,10 +10,49 @@ from jaxtank.core.clock import check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
 from jaxtank.core.tree import check_leaves, is_component
+from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
-from jaxtank.shapes import check_shapes
-from jaxtank.step_length import check_step
+
+_SAID = re.compile(r"\(([a-z0-9, +]+)\) ")
+
+
+def check_shapes(loop):
+    """Raise InputError for a leaf of `loop` that has not the shape its documentation begins with. Leaves of a batch may have the axes in front
+    that x0 has; sizes that a component knows alone (changes, pours, knots) are its own to check."""
+    _check(loop, "", {}, np.shape(loop.x0)[:-1])
+
+
+def _check(tree, prefix, sizes, batch):
+    if hasattr(tree, "plant") and isinstance(tree.plant, Plant):
+        sizes = _sizes(tree.plant)
+    if isinstance(tree, Plant):
+        sizes = _sizes(tree)
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{prefix}{field.name}"
+        if is_component(value):
+            _check(value, f"{name}.", sizes, batch)
+        elif field.metadata.get("kind") == "leaf" and value is not None:
+            said = _SAID.match(field.metadata.get("doc") or "")
+            wanted = said and _shape(said.group(1), sizes)
+            if wanted is not None and np.shape(value) not in (wanted, batch + wanted):
+                raise InputError(f"{name} has shape {np.shape(value)}: must be {wanted}, ({said.group(1)})")
+
+
+def _sizes(plant):
+    more = {name: len(getattr(plant, name, ())) for name in ("links", "pipes", "spills")}
+    return {"n": plant.tanks, "tanks": plant.tanks, "m": plant.pumps, "pumps": plant.pumps, "outputs": len(plant.outputs), **more}
+
+
+def _shape(said, sizes):
+    """(4,) of "n,"; None where a size is not of the plant."""
+    found = []
+    for axis in filter(None, (a.strip() for a in said.split(","))):
+        terms = [sizes.get(t, int(t) if t.isdigit() else None) for t in axis.split(" + ")]
+        if None in terms:
+            return None
+        found.append(sum(terms))
+    return tuple(found)
 
 
 def check(loop, clock, key=None):

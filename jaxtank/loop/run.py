@@ -17,9 +17,10 @@ from jaxtank.core.clock import PIECE, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.records import Trajectory
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.derivatives import _sensitivities
-from jaxtank.door import check
-from jaxtank.stepping import ClosedLoop, initial, inputs, is_broken, keyed, run_of, step, zero_of
+from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of, zero_of
+from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.step import step
+from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
 
 

@@ -1,0 +1,1 @@
+"""The closed loop: one sample, a whole run, its derivatives, and the checks before it."""

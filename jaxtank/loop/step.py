@@ -1,0 +1,120 @@
+"""TODO docstring of jaxtank.loop.step."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.kahan import added
+from jaxtank.core.records import Sample, Tick
+from jaxtank.plants.runge_kutta import change, integrate
+from jaxtank.xla.barrier import materialised
+
+
+class State(NamedTuple):
+    """What one sample hands to the next."""
+
+    k: Any  # index of the sample
+    x: tuple  # levels [cm]
+    observer: Any
+    controller: Any
+    actuator: Any
+    excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
+
+
+class Inputs(NamedTuple):
+    """What is known of every sample before the loop starts: arrays (samples,)."""
+
+    r: tuple
+    dr: tuple
+    ddr: tuple
+    d: tuple | None
+    xi: tuple | None
+    window: tuple | None
+    since: Any  # time since the last pour [s], or None
+    rest: tuple | None  # inputs that hold the setpoint [V]
+    plan: Any  # what the law has prepared
+    own: Any  # signals of the law's own
+    fault: tuple | None  # 1 while a fault lasts
+
+
+def step(loop, clock, state, now):
+    """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
+    t = time_of(state, clock)
+    tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
+    y = loop.sensor.read(state.x, now.xi)
+    estimate, observer = loop.observer.step(state.observer, tick, y)
+    command, controller = commanded(loop, state.controller, tick, estimate)
+    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    applied = loop.actuator.limit(command, metric)
+    observer = loop.observer.predict(observer, tick, command, applied)
+    controller = loop.controller.track(controller, tick, command, applied)
+    moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
+    e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
+    sample = Sample(
+        t=t,
+        x=state.x,
+        y=y,
+        x_hat=estimate.x,
+        d_hat=estimate.d or (jnp.zeros_like(state.x[0]),) * loop.plant.tanks,
+        r=now.r,
+        e=e,
+        command=command,
+        applied=applied,
+        u=u,
+        spilled=spilled,
+        shortfall=shortfall,
+    )
+    return moved._replace(observer=observer, controller=controller), sample
+
+
+def move(loop, clock, state, applied, now):
+    """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim [cm^3], (n) volume that a negative
+    inflow could not take [cm^3]) for inputs `applied` (m) [V] within the limits: pumps, faults and plant. Observer and controller
+    of the state stay as they are."""
+    t = time_of(state, clock)
+    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
+    plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
+    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
+    return state._replace(k=state.k + 1, x=x, actuator=actuator, excess=excess), u, spilled, shortfall
+
+
+def time_of(state, clock):
+    """t [s] of a state."""
+    return state.k.astype(state.x[0].dtype) * clock.dt
+
+
+def commanded(loop, state, tick, estimate):
+    """Return the controller's ((m,) inputs before their limits, new state).
+
+    Raises InputError, while the loop is traced, for a number of inputs that is not that of the pumps.
+    """
+    command, state = loop.controller.step(state, tick, estimate)
+    pumps = loop.plant.pumps
+    count = (len(command),) if isinstance(command, tuple | list) else np.shape(command)[:1]
+    if count != (pumps,):
+        law = type(loop.controller).__name__
+        found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
+        raise InputError(
+            f"controller {law}: its step returns {found} for {pumps} pump{'' if pumps == 1 else 's'}: "
+            "must return (inputs, state), a tuple with one input for each pump"
+        )
+    return command, state
+
+
+def _advance(plant, clock, t, x, excess, u, d):
+    """Levels after dt with u and d held, what rounding has added to them too much, the volume lost over each rim on the way [cm^3], and
+    the volume that a negative inflow could not take from each empty tank [cm^3]."""
+    h = clock.dt / clock.substeps
+    spilled = shortfall = (0.0,) * plant.tanks
+    for j in range(clock.substeps):
+        if excess:
+            changes = change(plant, clock.integrator, t + j * h, x, u, d, h)
+            x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
+        else:
+            x = integrate(plant, clock.integrator, t + j * h, x, u, d, h)
+        shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
+        x, lost = plant.spill(x)
+        spilled = tuple(a + b for a, b in zip(spilled, lost))
+    return x, excess, spilled, shortfall
