@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 
+from jaxtank.case import Free
 from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knots, check_variable
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import describe, get_value, number, parameters, split_index, walk, with_values
-from jaxtank.presets.base import Free
 
 LAW = "controller."
 KEYS = ("gains", "variable", "knots")

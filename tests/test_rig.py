@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jaxtank import presets, rig
+from jaxtank.case import Free
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
-from jaxtank.presets.base import Free
 from jaxtank.rig.words import toml
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps

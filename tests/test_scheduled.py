@@ -13,6 +13,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.case import Free
 from jaxtank.controllers import Backstepping, Controller, Scheduled
 from jaxtank.controllers.gain_schedule import interpolate
 from jaxtank.core.errors import InputError
@@ -20,7 +21,6 @@ from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
 from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.loop.run import _evaluate, evaluate_and_flag, evaluate_for_reverse
-from jaxtank.presets.base import Free
 from jaxtank.scheduling import schedule
 from jaxtank.xla.reachability import use_of
 from tuning import cli

@@ -8,8 +8,8 @@ import pytest
 import jaxtank
 import tuning
 from jaxtank import rig
+from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from jaxtank.presets.base import Free
 from tuning import objective
 from tuning.memo import Memo
 from tuning.objective import Limit, Point, Problem

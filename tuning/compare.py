@@ -13,7 +13,7 @@ from jaxtank import presets, rig
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
-from jaxtank.presets.base import Claim
+from jaxtank.presets.paper import Claim
 from tuning import pictures, saving, tables
 from tuning.manual import noisy
 from tuning.page import document, drawings

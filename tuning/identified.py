@@ -9,6 +9,7 @@ from jaxtank.core.tree import with_values
 
 def bare(plant):
     """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
+    from jaxtank.case import Case
     from jaxtank.controllers import OpenLoop
     from jaxtank.core.clock import Clock
     from jaxtank.core.tree import number
@@ -16,7 +17,6 @@ def bare(plant):
     from jaxtank.instruments.sensors import LevelSensor
     from jaxtank.loop.closed_loop import ClosedLoop
     from jaxtank.observers import Direct
-    from jaxtank.presets.base import Case
     from jaxtank.signals.base import Constant
 
     n, m = plant.tanks, plant.pumps

@@ -7,12 +7,12 @@ import textwrap
 import numpy as np
 
 from jaxtank import presets
+from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
 from jaxtank.equations import equations, physics
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.presets.base import Free
 from tuning import manual_parts, tables
 from tuning.objective import LOWER
 

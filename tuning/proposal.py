@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
 from jaxtank.analysis.steady_state import linearise
+from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
-from jaxtank.presets.base import Free
 from jaxtank.rig.parts import law_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.case import Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
-from jaxtank.presets.base import Scenario
 from jaxtank.rig import check_limits
 from tuning.distributions import Draws, stated
 from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of

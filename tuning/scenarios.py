@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import rig
+from jaxtank.case import Scenario
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.derivatives import _sensitivities
-from jaxtank.presets.base import Scenario
 from jaxtank.xla import flags
 
 MANY = 1024

@@ -11,10 +11,11 @@ import functools
 import importlib
 import pkgutil
 
+from jaxtank.case import Case, Free, Mirror, Scenario
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
+from jaxtank.presets.paper import Claim, Preset, Published
 
-PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "base" and not m.name.startswith("_")))
+PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "paper" and not m.name.startswith("_")))
 
 
 def load(paper):

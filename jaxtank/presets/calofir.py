@@ -5,6 +5,7 @@ import functools
 
 import numpy as np
 
+from jaxtank.case import Case, Free, Mirror, Scenario
 from jaxtank.controllers import OpenLoop
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
 from jaxtank.core.clock import Clock
@@ -16,7 +17,7 @@ from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
-from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]

@@ -2,6 +2,7 @@
 
 import functools
 
+from jaxtank.case import Case, Free
 from jaxtank.controllers import PID, OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -10,7 +11,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.presets.base import Case, Free, Preset, Published
+from jaxtank.presets.paper import Preset, Published
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
 

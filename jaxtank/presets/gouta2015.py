@@ -5,6 +5,7 @@ import functools
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case, Free
 from jaxtank.controllers import NGPC, Backstepping
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -14,7 +15,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
-from jaxtank.presets.base import Case, Claim, Free, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]

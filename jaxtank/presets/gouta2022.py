@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 
+from jaxtank.case import Case, Free, Mirror, Scenario
 from jaxtank.controllers import ENMPC, PID
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -12,7 +13,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
-from jaxtank.presets.base import Case, Claim, Free, Mirror, Preset, Published, Scenario
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.base import Sum
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from jaxtank.case import Case, Free
 from jaxtank.controllers import GPC, Laguerre
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -13,7 +14,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import coupled_tanks
-from jaxtank.presets.base import Case, Claim, Free, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 U0 = 1e-4  # unit of the inputs (notes S2.1) [m^3/s]

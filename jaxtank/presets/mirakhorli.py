@@ -5,6 +5,7 @@ import functools
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case, Free, Scenario
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -13,7 +14,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import quadruple_tank
-from jaxtank.presets.base import Case, Claim, Free, Preset, Published, Scenario
+from jaxtank.presets.paper import Claim, Preset, Published
 from jaxtank.signals.setpoints import ramps
 
 SETPOINT = (12.0, 12.0)  # Fig. 6 [cm]

@@ -69,7 +69,7 @@ weight = 2.0
 values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [5, 4, 3, 2] }
 """
 
-from jaxtank.presets.base import Case
+from jaxtank.case import Case
 from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered, unreachable
 from jaxtank.rig.doubts import clock_doubts, doubts, model_doubts
 from jaxtank.rig.reading import from_table, load, loads, open_case

@@ -7,13 +7,13 @@ import numpy as np
 
 from jaxtank import scheduling
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Free, Scenario
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import _short, check_value, describe, get_value, split_index
 from jaxtank.loop import run as lp
 from jaxtank.measures.catalogue import check_names, entries
 from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.presets.base import Free, Scenario
 from jaxtank.rig.values import by_dotted_name, set_scenario
 from jaxtank.rig.words import is_finite, is_numeric, name_of
 from jaxtank.signals.setpoints import Ramps

@@ -3,11 +3,11 @@
 import numpy as np
 
 from jaxtank import scheduling
+from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.presets.base import Free
 from jaxtank.rig import parts, signals
 from jaxtank.rig.keys import Key, Section, keys_of
 from jaxtank.signals.base import Constant

@@ -5,10 +5,10 @@ import tomllib
 import numpy as np
 
 from jaxtank import scheduling
+from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
-from jaxtank.presets.base import Free
 from jaxtank.rig import examples, parts, signals, tanks
 from jaxtank.rig.checks import unreachable
 from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of

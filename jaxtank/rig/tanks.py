@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import _short, check_value, number
@@ -13,7 +14,6 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.presets.base import Case
 from jaxtank.rig.parts import law_of, observer_of
 from jaxtank.rig.signals import INFLOW, meta_of
 from jaxtank.rig.words import is_numeric, name_of

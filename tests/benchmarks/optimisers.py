@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 
 import jaxtank  # noqa: F401  (before jax starts)
 from jaxtank import presets
-from jaxtank.presets.base import Free
+from jaxtank.case import Free
 from jaxtank.scheduling import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning import tables

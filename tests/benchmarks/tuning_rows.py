@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Free, Scenario
 from jaxtank.presets import khalid, mirakhorli
-from jaxtank.presets.base import Free, Scenario
 
 
 class Bound(NamedTuple):
