@@ -10,7 +10,7 @@ import numpy as np
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
 
-from jaxtank import analysis, measures, observers, presets, scheduling, signals
+from jaxtank import analysis, measures, observers, presets, signals
 from jaxtank.analysis import qp, riccati
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core import numerics
@@ -22,6 +22,7 @@ from jaxtank.plants.network import network
 from jaxtank.plants.rigs import johansson, state_coupled_four_tank
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets.gouta2015 import FAST_AREA
+from jaxtank.rig import schedule
 
 SUBJECTS, QUICK = {}, set()
 POINTS = 12
@@ -496,7 +497,7 @@ for _paper, _names in LAWS.items():
 
 
 def with_a_schedule(case):
-    case = scheduling.schedule(case, {"controller.k": "h1", "controller.k1": "h1"}, [5.0, 10.0, 20.0])
+    case = schedule.schedule(case, {"controller.k": "h1", "controller.k1": "h1"}, [5.0, 10.0, 20.0])
     law = case.loop.controller
     law = dataclasses.replace(law, values=np.asarray(law.values) * np.array([1.0, 1.5, 0.8]))
     return case.replace(loop=dataclasses.replace(case.loop, controller=law))

@@ -21,7 +21,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
 from jaxtank.export import export
 from jaxtank.plants.network import network
-from jaxtank.rig import words as rig_words
+from jaxtank.rig import schema as rig_words
 from tuning import cli
 
 SAMPLES = 10_000

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from jaxtank.rig.lexing import MOST, MOST_WORDS, check_keys
+from jaxtank.rig.read import MOST, MOST_WORDS, check_keys
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 DOTS = ".".join("a" * (MOST + 1))

@@ -9,7 +9,7 @@ from jaxtank import presets
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run
 from jaxtank.loop.derivatives import OUTER
-from jaxtank.scheduling import schedule
+from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.objective import Problem
 from tuning.scenarios import rough_clock

@@ -13,7 +13,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
-from jaxtank.rig.words import toml
+from jaxtank.rig.schema import toml
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 

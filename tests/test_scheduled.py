@@ -21,7 +21,7 @@ from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
 from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.loop.run import _evaluate, evaluate_and_flag, evaluate_for_reverse
-from jaxtank.scheduling import schedule
+from jaxtank.rig.schedule import schedule
 from jaxtank.xla.reachability import use_of
 from tuning import cli
 

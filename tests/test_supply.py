@@ -60,7 +60,7 @@ MADE = {
 }
 READ = {
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
-    ("jaxtank.rig.reading", "load", "read_text"): "that of jaxtank.files",
+    ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
@@ -128,9 +128,7 @@ def test_every_reading_of_a_file_is_known_and_why_it_is_safe():
         (m, where, name)
         for m, tree in sources()
         for where, name, whole, _ in called(tree)
-        if name in READS
-        and not whole.startswith(ours)
-        and not (m in ("jaxtank.presets", "jaxtank.rig.reading") and whole == "load")
+        if name in READS and not whole.startswith(ours) and not (m in ("jaxtank.presets", "jaxtank.rig.read") and whole == "load")
     }
     assert found == set(READ)
     assert all(READ.values()) and all(MADE.values()) and all(IMPORTED.values())

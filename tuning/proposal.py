@@ -13,7 +13,7 @@ from jaxtank.analysis.steady_state import linearise
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
-from jaxtank.rig.parts import law_of
+from jaxtank.rig.components import law_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 

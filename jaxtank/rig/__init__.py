@@ -70,12 +70,22 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 """
 
 from jaxtank.case import Case
-from jaxtank.rig.checks import check, check_free, check_limits, check_objective, check_uncertain, uncovered, unreachable
-from jaxtank.rig.doubts import clock_doubts, doubts, model_doubts
-from jaxtank.rig.reading import from_table, load, loads, open_case
+from jaxtank.rig.read import from_table, load, loads, open_case
+from jaxtank.rig.schema import toml
+from jaxtank.rig.validate import (
+    check,
+    check_free,
+    check_limits,
+    check_objective,
+    check_uncertain,
+    clock_doubts,
+    doubts,
+    model_doubts,
+    uncovered,
+    unreachable,
+)
 from jaxtank.rig.values import has, is_change, overlap, overridden, set_and_schedule, set_scenario, set_values
-from jaxtank.rig.words import toml
-from jaxtank.rig.writing import complete, dump, save, short
+from jaxtank.rig.write import complete, dump, save, short
 
 __all__ = [
     "Case",

@@ -4,18 +4,16 @@ import tomllib
 
 import numpy as np
 
-from jaxtank import scheduling
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
-from jaxtank.rig import examples, parts, signals, tanks
-from jaxtank.rig.checks import unreachable
-from jaxtank.rig.keys import BARE, Key, Section, keys_of, lines_of
-from jaxtank.rig.origin import origin_of, structures
-from jaxtank.rig.reading import start_of
+from jaxtank.rig import components, network, schedule, signals, template
+from jaxtank.rig.preset_match import origin_of, structures
+from jaxtank.rig.read import start_of
+from jaxtank.rig.schema import BARE, Key, Section, keys_of, lines_of, toml
+from jaxtank.rig.validate import unreachable
 from jaxtank.rig.values import MODELS
-from jaxtank.rig.words import toml
 from jaxtank.signals.base import Sum
 from jaxtank.signals.setpoints import Ramps
 
@@ -31,7 +29,7 @@ def sections(case, tankwise=False):
         base = start_of(tomllib.loads("\n".join(line for s in built if s.on for line in lines_of(s))))
     except InputError as error:
         raise InputError(f"{case.name}: cannot be written as a rig file: {error}") from None
-    if structures(scheduling.unscheduled(case.loop)) != structures(base.loop):
+    if structures(schedule.unscheduled(case.loop)) != structures(base.loop):
         raise InputError(f"{case.name}: cannot be written as a rig file: its law or observer has another model than its rig")
     top = [
         *built[0].keys,
@@ -48,7 +46,7 @@ def sections(case, tankwise=False):
     have = {f.title for f in found} - {"[[pour]]", "[[fault]]", "[[scenario]]"} | {k.name for k in top}
     if any(k.name == "sine" for f in found for k in f.keys):
         have.add("[reference.sine]")
-    return [*found, *examples.sections(case, have)]
+    return [*found, *template.sections(case, have)]
 
 
 def _reachable(case, base):
@@ -62,21 +60,23 @@ def _reachable(case, base):
 
 def _building(case, origin, same):
     """The Sections that build a case before any value is set."""
-    loop, units = scheduling.unscheduled(case.loop), case.loop.units
+    loop, units = schedule.unscheduled(case.loop), case.loop.units
     start = None if origin is None else origin.loop
     name = Key("name", case.name, {**BARE, "doc": "what reports call it"})
     if origin is None:
         top = Section("", [name, Key("units", list(units), {**BARE, "doc": "[length, pump input]"})])
         found = [
-            Section(t, [*_named(kind, own), *keys_of([(k, tanks.METAS[kind][k], v) for k, v in own.items() if k != "name"], units)])
-            for t, kind, own in tanks.entries_of(loop, case.names)
+            Section(
+                t, [*_named(kind, own), *keys_of([(k, network.METAS[kind][k], v) for k, v in own.items() if k != "name"], units)]
+            )
+            for t, kind, own in network.entries_of(loop, case.names)
         ]
     else:
         top = Section("", [Key("case", origin.name, {**BARE, "doc": "the preset that this file starts from"}), name])
         found = []
-    for kind, known, part in (("law", parts.LAWS, loop.controller), ("observer", parts.OBSERVERS, loop.observer)):
+    for kind, known, part in (("law", components.LAWS, loop.controller), ("observer", components.OBSERVERS, loop.observer)):
         if kind not in same:
-            keys = keys_of(((n, m, v) for n, m, v in parts.keys_of(part, known)), units)
+            keys = keys_of(((n, m, v) for n, m, v in components.keys_of(part, known)), units)
             found.append(Section(f"[{kind}]", [k for k in keys if k.value is not None]))
     found += _reference(loop, start)
     disturbing = signals.disturbance_tables(loop.disturbance)
@@ -98,7 +98,7 @@ def _named(kind, own):
     if "name" not in own:
         return []
     name, number = own["name"]
-    return [Key("name", name or f"{kind} {number}", tanks.METAS[kind]["name"], bool(name))]
+    return [Key("name", name or f"{kind} {number}", network.METAS[kind]["name"], bool(name))]
 
 
 def _reference(loop, start):
@@ -131,7 +131,7 @@ def _reference(loop, start):
 
 
 def _schedule(case):
-    table = scheduling.table_of(case.loop)
+    table = schedule.table_of(case.loop)
     docs = {"gains": "gains that follow the variable", "variable": "a setpoint, r1 .., or a level, h1 ..", "knots": "where"}
     return [Section("[schedule]", [Key(k, v, {**BARE, "doc": docs[k]}) for k, v in table.items()])] if table else []
 
@@ -139,7 +139,7 @@ def _schedule(case):
 def _values(case, base, tankwise, same):
     """[values]: every leaf and static field that the tables before it have not set, a Section for each part of the loop."""
     loop, groups = case.loop, {}
-    scheduled = bool(scheduling.table_of(loop))
+    scheduled = bool(schedule.table_of(loop))
     fields = [*walk(base.loop), *walk(base.loop, kind="static")]
     known = {
         name: None if value is None else toml(np.asarray(value).tolist())
@@ -165,7 +165,7 @@ def _values(case, base, tankwise, same):
         follows = _followed(name, plants)
         if value is None:
             if not (scheduled and part == "controller"):
-                groups.setdefault(part, []).append(Key(toml(name), examples.absent(loop, name, meta), meta, False))
+                groups.setdefault(part, []).append(Key(toml(name), template.absent(loop, name, meta), meta, False))
         elif follows is not None:  # by what the file has of the plant, unless it is written
             groups.setdefault(part, []).append(Key(toml(name), value, meta, follows != toml(value)))
         elif not built or known.get(name) != toml(value):
@@ -191,21 +191,21 @@ def _tuning(case):
     plain = lambda v: np.asarray(v).tolist() if not isinstance(v, str) else v
     found = [
         Section(
-            "[limits]", [*(Key(m, plain(v), examples.of_measure(case, m)) for m, v in case.limits.items()), *examples.limits(case)]
+            "[limits]", [*(Key(m, plain(v), template.of_measure(case, m)) for m, v in case.limits.items()), *template.limits(case)]
         ),
         Section(
             "[free]",
-            [*(Key(toml(n), list(Free(*spec)), examples.of_free(case, n)) for n, spec in case.free.items()), *examples.free(case)],
+            [*(Key(toml(n), list(Free(*spec)), template.of_free(case, n)) for n, spec in case.free.items()), *template.free(case)],
         ),
         Section(
             "[objective]",
-            [*(Key(m, float(w), examples.of_measure(case, m)) for m, w in case.objective.items()), *examples.objective(case)],
+            [*(Key(m, float(w), template.of_measure(case, m)) for m, w in case.objective.items()), *template.objective(case)],
         ),
         Section(
             "[uncertain]",
             [
-                *(Key(toml(n), float(v), examples.of_uncertain(case, n)) for n, v in case.uncertain.items()),
-                *examples.uncertain(case),
+                *(Key(toml(n), float(v), template.of_uncertain(case, n)) for n, v in case.uncertain.items()),
+                *template.uncertain(case),
             ],
         ),
     ]

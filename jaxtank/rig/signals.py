@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import _short, check_value, number
 from jaxtank.plants.faults import Faults, faults
-from jaxtank.rig.words import is_finite, plain, static_value
+from jaxtank.rig.schema import is_finite, plain, static_value
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import Pours, pours
 from jaxtank.signals.setpoints import Ramps, Sine, ramps

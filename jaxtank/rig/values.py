@@ -5,12 +5,12 @@ import re
 
 import numpy as np
 
-from jaxtank import scheduling
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import _short, check_value, describe, get_value, split_index, walk, with_values
-from jaxtank.rig.words import is_numeric, plain, static_value, unit
+from jaxtank.rig import schedule
+from jaxtank.rig.schema import is_numeric, plain, static_value, unit
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""
@@ -58,7 +58,7 @@ def set_values(case, values):
             continue
         if not is_numeric(value):
             raise InputError(f"{name} = {_short(value)}: must be a number or a list of numbers{unit(meta)}")
-        scheduling.check_not_scheduled(case.loop, name)
+        schedule.check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         check_value(name, get_value(loop, name), meta)
         case = case.replace(loop=loop)
@@ -208,8 +208,8 @@ def set_and_schedule(case, values, table):
     """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What the case has by name is set before the
     schedule is made, which starts from it; what only the scheduled case has, as controller.values, after."""
     if table:
-        before, values = scheduling.known(case.loop, values)
-        case = scheduling.from_table(set_values(case, before), table)
+        before, values = schedule.known(case.loop, values)
+        case = schedule.from_table(set_values(case, before), table)
     return set_values(case, values)
 
 

@@ -30,7 +30,7 @@ from scipy.optimize import minimize
 import jaxtank  # noqa: F401  (before jax starts)
 from jaxtank import presets
 from jaxtank.case import Free
-from jaxtank.scheduling import schedule
+from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning import tables
 from tuning.objective import Problem

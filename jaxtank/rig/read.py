@@ -1,24 +1,56 @@
 """From a rig file to a Case."""
 
 import dataclasses
+import re
 import tomllib
 
 import numpy as np
 
-from jaxtank import presets, record_tables
+from jaxtank import presets
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.tree import _short
-from jaxtank.rig import checks, parts, signals, tanks
-from jaxtank.rig.lexing import check_keys
+from jaxtank.rig import components, experiment_tables, network, signals, validate
+from jaxtank.rig.schema import name_of
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
-from jaxtank.rig.words import name_of
+
+MOST = 100
+"""Parts of a dotted key; the names of a rig have four."""
+
+MOST_WORDS = 100_000
+"""Keys (each part of one), numbers (those with a point twice), texts, lists and tables of a file: it is parsed and checked in seconds."""
+
+_PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\[^\n])*+"|'[^'\n]*+')"""
+# Every alternative is possessive: nothing is read twice, whatever is left open. A value has two such parts at most, those of a float.
+_TOKEN = re.compile(
+    r'''(?P<text>"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}|\'\'\'(?:[^']|'{1,2}(?!'))*+'{3,5})'''
+    rf"""|(?P<open>\"\"\"|''')|(?P<key>{_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)|(?P<quote>["'])|[\[{{]|(?:\#[^\n]*+\s*+)++""",
+    re.DOTALL,
+)
+_ONE = re.compile(_PART)
+
+
+def check_keys(text):
+    """Raise InputError for a key of more than `MOST` dotted parts, and for a file of more than `MOST_WORDS` words. Dots of numbers, texts
+    and comments are none of a key's."""
+    words = 0
+    for token in _TOKEN.finditer(text):
+        if token.lastgroup in ("open", "quote"):
+            return  # a text without an end: the parser gets no further either
+        parts = sum(1 for _ in _ONE.finditer(token.group())) if token.lastgroup == "key" and "." in token.group() else 1
+        if parts > MOST:
+            line = text.count("\n", 0, token.start()) + 1
+            raise InputError(f"line {line}: a key of {parts} parts joined by dots: must be at most {MOST}")
+        words += parts
+        if words > MOST_WORDS:
+            raise InputError(f"has more than {MOST_WORDS} keys and values")
+
 
 TABLES = (
     "case",
     "name",
     "reachable",
-    *tanks.TABLES,
+    *network.TABLES,
     "law",
     "observer",
     "schedule",
@@ -86,20 +118,20 @@ def from_table(table):
     values = with_models(case.loop, table.get("values", {}))
     case = set_and_schedule(case, values, table.get("schedule", {}))
     if "limits" in table:
-        case = case.replace(limits=checks.check_limits(case.loop, table["limits"]))
+        case = case.replace(limits=validate.check_limits(case.loop, table["limits"]))
     if "objective" in table:
-        case = case.replace(objective=checks.check_objective(table["objective"]))
+        case = case.replace(objective=validate.check_objective(table["objective"]))
     if "free" in table:
-        case = case.replace(free=checks.free_of(case.loop, table["free"]))
+        case = case.replace(free=validate.free_of(case.loop, table["free"]))
     if "uncertain" in table:
-        case = case.replace(uncertain=checks.check_uncertain(case.loop, table["uncertain"]))
+        case = case.replace(uncertain=validate.check_uncertain(case.loop, table["uncertain"]))
     if "covariance" in table:
-        case = case.replace(covariance=record_tables.check_covariance(case.loop, table["covariance"]))
+        case = case.replace(covariance=experiment_tables.check_covariance(case.loop, table["covariance"]))
     if "log" in table:
-        case = case.replace(log=record_tables.check_log(case.loop.plant, table["log"]))
+        case = case.replace(log=experiment_tables.check_log(case.loop.plant, table["log"]))
     if "scenario" in table:
-        case = case.replace(scenarios=tuple(checks.scenario(case, entry, i) for i, entry in enumerate(table["scenario"])))
-    return checks.check(case)
+        case = case.replace(scenarios=tuple(validate.scenario(case, entry, i) for i, entry in enumerate(table["scenario"])))
+    return validate.check(case)
 
 
 def start_of(table):
@@ -111,7 +143,7 @@ def start_of(table):
         if not isinstance(value, wanted):
             raise InputError(f"{key} = {_short(value)}: must be {words}")
     name_of("name", table.get("name", ""))
-    if "case" in table and (given := [k for k in tanks.TABLES if k in table]):
+    if "case" in table and (given := [k for k in network.TABLES if k in table]):
         raise InputError(
             f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out case, or [{given[0]}]"
         )
@@ -119,14 +151,14 @@ def start_of(table):
         raise InputError(
             'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or [[tank]] to describe a rig'
         )
-    case = _with_parts(presets.find(table["case"]), table) if "case" in table else tanks.build(table)
+    case = _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     loop, changed = case.loop, {}
     if "reference" in table:
         changed["reference"] = signals.reference_of(table["reference"], loop.reference)
     if "disturbance" in table or "pour" in table:
-        named = tanks.names_in(table)
+        named = network.names_in(table)
         changed["disturbance"] = signals.disturbance_of(
-            table, loop, lambda value, where: tanks.tank_index(value, where, named, loop.plant.tanks)
+            table, loop, lambda value, where: network.tank_index(value, where, named, loop.plant.tanks)
         )
     if "fault" in table:
         changed["faults"] = signals.faults_of(table["fault"], loop.plant)
@@ -141,11 +173,11 @@ def _with_parts(case, table):
     levels, initial = np.asarray(loop.x0), loop.actuator.initial
     if "law" in table:
         start = [float(levels[i]) for i in loop.plant.outputs]
-        changed["controller"] = parts.law_of(table["law"], loop.plant, start, initial)
+        changed["controller"] = components.law_of(table["law"], loop.plant, start, initial)
         if type(changed["controller"]) is not type(loop.controller):
             case = case.replace(mirror=None)
     if "observer" in table:
-        changed["observer"] = parts.observer_of(table["observer"], loop.plant, levels, initial)
+        changed["observer"] = components.observer_of(table["observer"], loop.plant, levels, initial)
     if not changed:
         return case
     prefix = tuple(f"{name}." for name in changed)

@@ -14,9 +14,9 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.rig.parts import law_of, observer_of
+from jaxtank.rig.components import law_of, observer_of
+from jaxtank.rig.schema import is_numeric, name_of
 from jaxtank.rig.signals import INFLOW, meta_of
-from jaxtank.rig.words import is_numeric, name_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 

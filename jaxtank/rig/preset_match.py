@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtank import presets, scheduling
+from jaxtank import presets
 from jaxtank.core.tree import is_component, walk
-from jaxtank.rig import parts, signals
+from jaxtank.rig import components, schedule, signals
 
 
 def origin_of(case):
@@ -19,7 +19,7 @@ def origin_of(case):
     """
     if case.names:
         return None, ()
-    loop = scheduling.unscheduled(case.loop)
+    loop = schedule.unscheduled(case.loop)
     mine, statics, best, found = structures(loop), _statics(loop), None, (None, ())
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
@@ -31,8 +31,8 @@ def origin_of(case):
                 for word, field in (("law", "controller"), ("observer", "observer"))
                 if mine[field] == theirs[field] and _optional(other.loop, (field,)) <= _optional(loop)
             )
-            if ("law" not in same and parts.kind_of(loop.controller, parts.LAWS) is None) or (
-                "observer" not in same and parts.kind_of(loop.observer, parts.OBSERVERS) is None
+            if ("law" not in same and components.kind_of(loop.controller, components.LAWS) is None) or (
+                "observer" not in same and components.kind_of(loop.observer, components.OBSERVERS) is None
             ):
                 continue
             common = sum(a == b for a, b in zip(statics, _statics(other.loop)))

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from jaxtank import scheduling
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.rig import parts, signals
-from jaxtank.rig.keys import Key, Section, keys_of
+from jaxtank.rig import components, signals
+from jaxtank.rig import schedule as scheduling
+from jaxtank.rig.schema import Key, Section, keys_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
@@ -125,12 +125,12 @@ def sections(case, have):
         found.append(Section(title, keys_of(rows, units) if local_units else rows, prose, False))
 
     if not scheduling.table_of(loop):
-        own = parts.keys_of(loop.controller, parts.LAWS) if parts.kind_of(loop.controller, parts.LAWS) else []
+        own = components.keys_of(loop.controller, components.LAWS) if components.kind_of(loop.controller, components.LAWS) else []
         if own and is_component(getattr(loop.controller, "model", None)):
             add(
                 "[law]",
                 [row for row in own if row[2] is not None],
-                f"Another law than the preset's: {', '.join(parts.LAWS)}. [values] above then has that law's names.",
+                f"Another law than the preset's: {', '.join(components.LAWS)}. [values] above then has that law's names.",
             )
         table = schedule(case)
         if table:
@@ -145,7 +145,7 @@ def sections(case, have):
                 "Gains that follow a setpoint or a level, linear between knots; they start from the value above. "
                 'Theirs are then "controller.values", a row per gain; [free] may name the gain for all its knots.',
             )
-    add("[observer]", _observer(loop), f"Another observer than the preset's: {', '.join(parts.OBSERVERS)}.")
+    add("[observer]", _observer(loop), f"Another observer than the preset's: {', '.join(components.OBSERVERS)}.")
     if signals.steps(loop.reference) is loop.reference and isinstance(loop.reference, Ramps) and not _refers(case):
         start = signals.Sine(
             amplitude=np.float64(0.0),
@@ -216,13 +216,13 @@ def _refers(case):
 
 def _observer(loop):
     """Rows of an [observer]: the loop's own, or an extended Kalman filter where it has none."""
-    if parts.kind_of(loop.observer, parts.OBSERVERS) not in (None, "direct"):
-        return [row for row in parts.keys_of(loop.observer, parts.OBSERVERS) if row[2] is not None]
+    if components.kind_of(loop.observer, components.OBSERVERS) not in (None, "direct"):
+        return [row for row in components.keys_of(loop.observer, components.OBSERVERS) if row[2] is not None]
     rim = float(np.asarray(loop.plant.rim)[0])
-    meta = lambda field: {**signals.meta_of(parts.OBSERVERS["extended-kalman"], field)}
+    meta = lambda field: {**signals.meta_of(components.OBSERVERS["extended-kalman"], field)}
     small = lambda share: float(f"{(share * rim) ** 2:.3g}")
     return [
-        ("kind", {"unit": "-", "doc": f"one of {', '.join(parts.OBSERVERS)}"}, "extended-kalman"),
+        ("kind", {"unit": "-", "doc": f"one of {', '.join(components.OBSERVERS)}"}, "extended-kalman"),
         ("process", meta("process"), small(1e-3)),
         ("measurement", meta("measurement"), small(1e-3)),
         ("spread", meta("spread"), small(1e-2)),

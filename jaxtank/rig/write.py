@@ -5,10 +5,9 @@ from pathlib import Path
 
 from jaxtank import presets
 from jaxtank.core.files import write_atomic
-from jaxtank.rig.keys import lines_of
-from jaxtank.rig.origin import origin_of
+from jaxtank.rig.preset_match import origin_of
+from jaxtank.rig.schema import allowed, lines_of, toml
 from jaxtank.rig.sections import sections
-from jaxtank.rig.words import allowed, toml
 
 WIDTH = 110
 SHORT = ("[limits]", "[free]", "[objective]")

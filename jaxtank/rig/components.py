@@ -11,8 +11,8 @@ from jaxtank.core.tree import _short, number
 from jaxtank.core.units import local
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
 from jaxtank.plants.hydraulics import in_unit
+from jaxtank.rig.schema import static_value
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
-from jaxtank.rig.words import static_value
 from jaxtank.signals.setpoints import Ramps, ramps
 
 LAWS = {
