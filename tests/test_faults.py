@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import plotting, presets
+from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
+from jaxtank.plots import responses
 from tuning import cli, holds, memo, parts, pictures
 
 HERE = Path(__file__).parent
@@ -169,7 +170,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     whole = old_result(folder, words, capsys)
-    plot, broken = (plotting, "responses") if name == "simulate" else (pictures, "rig")
+    plot, broken = (responses, "responses") if name == "simulate" else (pictures, "rig")
     usual = getattr(plot, broken)
 
     def unset(*args):

@@ -11,7 +11,7 @@ import pytest
 
 from jaxtank import presets, rig
 from jaxtank.core.tree import walk
-from jaxtank.equations import equations
+from jaxtank.plots.equations import equations
 from tuning import cli, manual
 
 NAMES = list(

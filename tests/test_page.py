@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import tuning
-from jaxtank import plotting, rig
+from jaxtank import rig
+from jaxtank.plots import responses
 from tuning import cli, compare, page, pictures, tables
 from tuning.log_file import read_log
 
@@ -151,7 +152,7 @@ def test_what_users_call_things_is_text_and_no_markup(folders, kind):
 )
 def test_a_picture_that_fails_costs_itself_and_not_the_answer(results, folders, kind, tmp_path, monkeypatch, capsys):
     """A text that matplotlib cannot set, in one picture; then a function that cannot draw. Nothing of an earlier result stays."""
-    plot, name = (plotting, "panels") if kind == "sensitivity" else (pictures, "rig")
+    plot, name = (responses, "panels") if kind == "sensitivity" else (pictures, "rig")
     usual, (save, _) = getattr(plot, name), results[kind]
     whole = {path.name for path in folders[kind].iterdir()}
     shutil.copytree(folders[kind], tmp_path, dirs_exist_ok=True)
@@ -188,7 +189,7 @@ def test_results_are_on_the_disk_before_any_picture_is_drawn(results, folders, t
     def end(*_):
         raise Ended
 
-    monkeypatch.setattr(plotting, "responses", end)
+    monkeypatch.setattr(responses, "responses", end)
     with pytest.raises(Ended):
         results["tune"][0](tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"result.json", "rig.toml", "trajectory.csv", "before.csv"}

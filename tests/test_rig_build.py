@@ -11,9 +11,10 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 import tuning
-from jaxtank import controllers, equations, parameters, presets, rig, with_values
+from jaxtank import controllers, parameters, presets, rig, with_values
 from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
+from jaxtank.plots import equations
 from tuning import cli
 
 RIGS = Path(__file__).parent / "rigs"

@@ -8,8 +8,9 @@ import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
-from jaxtank import plotting, presets, rig, run_plots
+from jaxtank import presets, rig
 from jaxtank.core.records import Trajectory
+from jaxtank.plots import diagnostics, responses
 
 
 @pytest.fixture
@@ -34,13 +35,13 @@ def test_a_style_takes_back_its_own_settings_and_no_others():
     """A notebook's backend starts with the first figure and switches the interactive mode on; where that is inside, it must stay on."""
     before = dict(plt.rcParams)
     try:
-        with plotting.styled({"lines.linewidth": 7.0}):
-            assert plt.rcParams["figure.dpi"] == plotting.STYLE["figure.dpi"] != before["figure.dpi"]
+        with responses.styled({"lines.linewidth": 7.0}):
+            assert plt.rcParams["figure.dpi"] == responses.STYLE["figure.dpi"] != before["figure.dpi"]
             assert plt.rcParams["lines.linewidth"] == 7.0
             plt.rcParams["interactive"] = True
         assert plt.rcParams["interactive"] is True
         assert {**plt.rcParams, "interactive": before["interactive"]} == before
-        with pytest.raises(ValueError), plotting.styled():
+        with pytest.raises(ValueError), responses.styled():
             raise ValueError
         assert plt.rcParams["figure.dpi"] == before["figure.dpi"]
     finally:
@@ -50,7 +51,7 @@ def test_a_style_takes_back_its_own_settings_and_no_others():
 def test_phase_is_one_level_over_the_other_with_both_rims(ax):
     t = np.linspace(0.0, 1.0, 1001)
     run = made(x=columns(t, t, 5 * t, 29 * t**2))
-    run_plots.phase(ax, {"after": (run, plotting.AFTER, "-")}, (2, 3), [30.0] * 4, "cm")
+    diagnostics.phase(ax, {"after": (run, responses.AFTER, "-")}, (2, 3), [30.0] * 4, "cm")
     line, first, last = ax.lines
     np.testing.assert_array_equal(line.get_xydata(), run.x[:, 2:])
     assert tuple(first.get_xydata()[0]) == (0.0, 0.0) and tuple(last.get_xydata()[0]) == (5.0, 29.0)
@@ -61,20 +62,20 @@ def test_phase_is_one_level_over_the_other_with_both_rims(ax):
 def test_saturation_tells_the_share_and_when(ax):
     t = np.linspace(0.0, 100.0, 1001)
     run = made(command=columns(np.where(t < 25.0, 13.0, 5.0), np.where(t >= 90.0, -1.0, 12.0)))  # 12 V is not past 12 V
-    run_plots.saturation(ax, {"run": run}, [0.0, 0.0], [12.0, 12.0])
+    diagnostics.saturation(ax, {"run": run}, [0.0, 0.0], [12.0, 12.0])
     assert [label.get_text() for label in ax.get_yticklabels()] == ["pump 1\n25 % up, 0 % down", "pump 2\n0 % up, 10.1 % down"]
     strips = [c for c in ax.collections if isinstance(c, PolyCollection) and len(c.get_paths()) and len(c.get_paths()[0].vertices)]
     up, _, _, down = (c.get_paths()[0].vertices for c in strips[:4])
     y = ax.get_yticks()
-    assert up[np.abs(up[:, 1] - y[0]) > 1e-9, 0].max() == pytest.approx(25.0, abs=100.0 / run_plots.SLICES)
-    assert down[np.abs(down[:, 1] - y[1]) > 1e-9, 0].min() == pytest.approx(90.0, abs=100.0 / run_plots.SLICES)
+    assert up[np.abs(up[:, 1] - y[0]) > 1e-9, 0].max() == pytest.approx(25.0, abs=100.0 / diagnostics.SLICES)
+    assert down[np.abs(down[:, 1] - y[1]) > 1e-9, 0].min() == pytest.approx(90.0, abs=100.0 / diagnostics.SLICES)
     assert up[:, 1].max() > y[0] and down[:, 1].min() < y[1]
     assert {"past the upper limit", "past the lower limit"} == set(ax.get_legend_handles_labels()[1])
 
 
 def test_a_chattering_pump_is_a_strip_of_half_the_height(ax):
     flip = np.arange(1001) % 2 * 20.0
-    run_plots.saturation(ax, {"run": made(command=columns(flip, flip))}, [-1.0, -1.0], [12.0, 12.0])
+    diagnostics.saturation(ax, {"run": made(command=columns(flip, flip))}, [-1.0, -1.0], [12.0, 12.0])
     vertices = ax.collections[0].get_paths()[0].vertices
     heights = vertices[vertices[:, 1] > ax.get_yticks()[0] + 1e-9, 1] - ax.get_yticks()[0]
     np.testing.assert_allclose(heights / 0.42, 0.5, atol=0.13)  # four or five samples to a slice
@@ -83,16 +84,16 @@ def test_a_chattering_pump_is_a_strip_of_half_the_height(ax):
 def test_estimate_and_disturbance_are_the_runs_own(ax):
     t = np.linspace(0.0, 1.0, 1001)
     run = made(x=columns(t, t, t, t), y=columns(t + 0.1, t, t, t), x_hat=columns(t + 0.2, t, t, t), d_hat=columns(t - 1, t, t, t))
-    run_plots.estimate(ax, run, 0, "m")
+    diagnostics.estimate(ax, run, 0, "m")
     found = {line.get_label(): line.get_ydata() for line in ax.lines}
     assert ax.get_ylabel() == "level [m]"
     for name, offset in (("measured", 0.1), ("true", 0.0), ("estimated", 0.2)):
         np.testing.assert_allclose(found[name], t + offset)
     ax.clear()
-    run_plots.estimate(ax, run, 1)
+    diagnostics.estimate(ax, run, 1)
     assert "measured" not in {line.get_label() for line in ax.lines}  # it is what is true
     ax.clear()
-    run_plots.disturbance(ax, run, 0, inflow=2 * t, unit="m/s")
+    diagnostics.disturbance(ax, run, 0, inflow=2 * t, unit="m/s")
     found = {line.get_label(): line.get_ydata() for line in ax.lines}
     np.testing.assert_allclose(found["estimated"], t - 1)
     np.testing.assert_allclose(found["disturbing inflow"], 2 * t)
@@ -105,18 +106,20 @@ def limit(name, value, bound):
 
 def test_margins_are_shares_of_the_limit_with_the_nearest_first(ax):
     rows = [limit("far", 15.0, 30.0), limit("broken", 33.0, 30.0), limit("met", 30.0, 30.0)]
-    run_plots.margins(ax, rows)
+    diagnostics.margins(ax, rows)
     np.testing.assert_allclose([bar.get_width() for bar in ax.patches], [-10.0, 0.0, 50.0], atol=1e-12)
-    assert [bar.get_facecolor() for bar in ax.patches] == [to_rgba(c) for c in (plotting.FORBIDDEN, plotting.AFTER, plotting.AFTER)]
+    assert [bar.get_facecolor() for bar in ax.patches] == [
+        to_rgba(c) for c in (responses.FORBIDDEN, responses.AFTER, responses.AFTER)
+    ]
     names = [label.get_text() for label in ax.get_yticklabels()]
     assert names == ["broken\n33 of 30 cm", "met\n30 of 30 cm", "far\n15 of 30 cm"] and ax.yaxis_inverted()
     assert list(ax.lines[0].get_ydata()) == [1]  # a bar without length is marked
 
 
 def test_margins_beyond_what_can_be_shown_are_counted(ax):
-    run_plots.margins(ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(run_plots.MANY + 3)])
-    assert len(ax.patches) == run_plots.MANY and "3 with more room not shown" in ax.get_title()
-    assert ax.get_yticklabels()[0].get_text().startswith(f"tank {run_plots.MANY + 2}")
+    diagnostics.margins(ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(diagnostics.MANY + 3)])
+    assert len(ax.patches) == diagnostics.MANY and "3 with more room not shown" in ax.get_title()
+    assert ax.get_yticklabels()[0].get_text().startswith(f"tank {diagnostics.MANY + 2}")
 
 
 def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
@@ -125,7 +128,7 @@ def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
         {"limit": 10.0, "status": "not_converged", "objective": 0.2},
         {"limit": 8.0, "status": "infeasible", "objective": 0.3},
     ]
-    run_plots.tradeoff(ax, points, "max_level", "cm", "cm")
+    diagnostics.tradeoff(ax, points, "max_level", "cm", "cm")
     joined, *marks = ax.lines
     np.testing.assert_array_equal(joined.get_xydata(), [[10.0, 0.2], [12.0, 0.1]])
     assert {line.get_label(): line.get_xydata().tolist() for line in marks} == {
@@ -147,7 +150,7 @@ def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
     }
     t = np.linspace(0.0, 10.0, 11)
     bands = {"t": t, "r": np.full((11, 1), 3.0), "x": np.full((5, 11, tanks), 3.0)}
-    figure = plotting.fan(rig.from_table(table).loop, bands, "bands")
+    figure = responses.fan(rig.from_table(table).loop, bands, "bands")
     figure.canvas.draw()
     panels = figure.axes[:tanks]
     assert {i for i, ax in enumerate(panels) if ax.get_xlabel() == "time [s]"} == labelled
@@ -164,7 +167,7 @@ def test_a_rig_of_many_tanks_is_drawn_on_one_page():
     loop = SimpleNamespace(plant=plant, units=("cm", "V"), actuator=SimpleNamespace(low=np.zeros(2), high=np.full(2, 9.0)))
     x = np.ones((5, 1)) * np.linspace(1.0, 9.0, n)
     run = SimpleNamespace(t=t, x=x, r=x[:, [0, 31]], e=0.0 * x[:, [0, 31]], u=np.ones((5, 2)))
-    figure = plotting.responses(loop, {"run": run}, title="battery")
+    figure = responses.responses(loop, {"run": run}, title="battery")
     titles = [ax.get_title() for ax in figure.axes if ax.get_visible()]
     assert [word for word in titles if word.startswith("tank ")] == ["tank 1", "tank 32", *[f"tank {i}" for i in range(16, 32)]]
     assert figure.get_size_inches()[0] < 20 and "of the 30 tanks between, the 16" in figure.get_suptitle()
@@ -175,7 +178,7 @@ def test_a_rig_of_many_tanks_is_drawn_on_one_page():
 def test_every_run_is_drawn_and_can_be_told_from_the_others(count):
     loop = presets.find("mirakhorli/sfc").loop
     runs = {f"run {i}": made(x=columns(*np.full((4, 1001), 1.0 + 0.1 * i))) for i in range(count)}
-    figure = plotting.responses(loop, runs)
+    figure = responses.responses(loop, runs)
     panels = [ax for ax in figure.axes if ax.get_visible()]
     assert len(panels) == 8
     for ax in panels:
@@ -195,7 +198,7 @@ def test_the_rim_is_in_every_panel_of_a_fan():
     rims = np.asarray(loop.plant.rim)
     t = np.linspace(0.0, 10.0, 11)
     top = rims * [1.1, 0.6, 0.3, 0.2]
-    figure = plotting.fan(loop, {"t": t, "r": np.ones((11, 2)), "x": np.ones((5, 11, 4)) * top}, "fan")
+    figure = responses.fan(loop, {"t": t, "r": np.ones((11, 2)), "x": np.ones((5, 11, 4)) * top}, "fan")
     for i, ax in enumerate(figure.axes):
         (line,) = [line for line in ax.lines if line.get_label().startswith("rim")]
         if i < 3:

@@ -8,10 +8,11 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Rectangle
 
-from jaxtank import plotting, presets
-from jaxtank.layout import place, storeys
+from jaxtank import presets
 from jaxtank.plants.network import network
-from jaxtank.schematic import schematic
+from jaxtank.plots import responses
+from jaxtank.plots.layout import place, storeys
+from jaxtank.plots.schematic import schematic
 
 RIGS = (
     "gouta2015/ngpc",
@@ -37,7 +38,7 @@ def plant_of(name):
 
 def water(ax):
     """The patches in the colour of water but for the basin, which is pale."""
-    return [p for p in ax.patches if isinstance(p, Rectangle) and p.get_facecolor() == (*to_rgb(plotting.WATER), 1.0)]
+    return [p for p in ax.patches if isinstance(p, Rectangle) and p.get_facecolor() == (*to_rgb(responses.WATER), 1.0)]
 
 
 def words(ax):

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import plotting, presets, rig
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.plots import responses
 from tuning import cli, distributions, effects, indices, sensitivity_report
 from tuning.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.scenarios import Lane, groups_of, values_of
@@ -438,7 +439,7 @@ def test_three_devices_give_the_bits_of_one():
 def test_a_cloud_shows_who_broke_a_limit_and_when():
     pairs = np.array([[1.0, 0.5], [2.0, 1.0], [3.0, 3.5], [2.5, 1.5]])
     held = np.array([[True, True], [False, True], [False, False], [False, True]])
-    ax = plotting.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
+    ax = responses.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("highest level before [cm]", "highest level after [cm]")
     drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
     assert drawn == {
@@ -448,7 +449,7 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
     }
     labels = [line.get_label() for line in ax.lines]
     assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
-    far = plotting.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
+    far = responses.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
     assert far.get_xscale() == "log" and not any("limit" in line.get_label() for line in far.lines)
     plt.close("all")
 
@@ -458,14 +459,14 @@ def test_pictures():
     names = [f"p{i}" for i in range(20)]
     effect = np.linspace(1.0, 0.05, 20) * (-1.0) ** np.arange(20)
     ends = np.stack([np.abs(effect) - 0.1, np.abs(effect) + 0.1], axis=1)
-    ax = plotting.tornado(axes[0], names, effect, "cm", "x")
+    ax = responses.tornado(axes[0], names, effect, "cm", "x")
     assert (
-        ax.get_xlabel() == "change [cm]" and len(ax.patches) == 2 * plotting.BARS and "6 smaller ones not shown" in ax.get_title()
+        ax.get_xlabel() == "change [cm]" and len(ax.patches) == 2 * responses.BARS and "6 smaller ones not shown" in ax.get_title()
     )
     assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
-    ax = plotting.elementary(axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x")
+    ax = responses.elementary(axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x")
     assert ax.get_xlabel() == "change over the range [cm]" and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
-    ax = plotting.shares(axes[2], names[:3], np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
+    ax = responses.shares(axes[2], names[:3], np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
     segments = np.array(ax.collections[0].get_segments())
     np.testing.assert_allclose(

@@ -61,7 +61,7 @@ MADE = {
 READ = {
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
-    ("jaxtank.animation", "animate", "read_bytes"): "the picture that it has just drawn",
+    ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",

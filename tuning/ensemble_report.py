@@ -149,14 +149,14 @@ def draws_csv(ensemble):
 
 def figures(ensemble):
     """Matplotlib figures {name: figure}: "fan" of the levels, "violations", "rig"."""
-    from jaxtank import plotting
+    from jaxtank.plots import responses
     from tuning import pictures
 
     drawn = {}
     if ensemble.fan is not None:
-        drawn["fan"] = plotting.fan(ensemble.case.loop, ensemble.fan, f"{ensemble.case.name}: {drawn_of(ensemble)}")
+        drawn["fan"] = responses.fan(ensemble.case.loop, ensemble.fan, f"{ensemble.case.name}: {drawn_of(ensemble)}")
     if ensemble.limits:
-        drawn["violations"] = plotting.violations(ensemble.violations(), ensemble.samples)
+        drawn["violations"] = responses.violations(ensemble.violations(), ensemble.samples)
     return drawn | pictures.rig(ensemble.case.loop, None, ensemble.case.name)
 
 

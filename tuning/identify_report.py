@@ -199,12 +199,13 @@ def figures(found):
     """{"fit" or "fit_1" ..: readings and inputs of each log; "residuals", "correlation", "profile"}: matplotlib Figures."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, record_plots
+    from jaxtank.plots import fit as record_plots
+    from jaxtank.plots import responses
 
     est, made = found.estimation, {}
     told = est.predicted(est.unknowns(found.fit))
     names = channel_names(found)
-    with plotting.styled():
+    with responses.styled():
         for e, one in enumerate(est.logs):
             count = len(names) + 1
             figure, axes = plt.subplots(count, 1, figsize=(7.0, 1.0 + 1.7 * count), sharex=True, layout="constrained")
@@ -221,7 +222,7 @@ def figures(found):
             if one.u.shape[1] > 1:
                 axes[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=one.u.shape[1])
             figure.align_ylabels(axes)
-            title = plotting.plain(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig")
+            title = responses.plain(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig")
             figure.suptitle(title, fontsize=9)
             made["fit" if len(est.logs) == 1 else f"fit_{e + 1}"] = figure
         left = idf.residuals_of(est, found.fit)
@@ -237,19 +238,19 @@ def figures(found):
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
         figure.align_ylabels(axes)
         more = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
-        figure.suptitle(plotting.plain(f"{found.case.name}: measured less simulated{more}"), fontsize=9)
+        figure.suptitle(responses.plain(f"{found.case.name}: measured less simulated{more}"), fontsize=9)
         made["residuals"] = figure
         kept, matrix = correlation_of(found)
         if len(kept) > 1:
             side = 2.6 + 0.42 * len(kept)
             figure, ax = plt.subplots(figsize=(side + 1.0, side), layout="constrained")
             record_plots.correlation(ax, kept, matrix)
-            figure.suptitle(plotting.plain(f"{found.case.name}: correlation of the estimates"), fontsize=9)
+            figure.suptitle(responses.plain(f"{found.case.name}: correlation of the estimates"), fontsize=9)
             made["correlation"] = figure
         if found.profile:
             figure, ax = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
             record_plots.profile(ax, found.profile)
-            figure.suptitle(plotting.plain(f"{found.case.name}: profile likelihood"), fontsize=9)
+            figure.suptitle(responses.plain(f"{found.case.name}: profile likelihood"), fontsize=9)
             made["profile"] = figure
     return made
 

@@ -10,9 +10,9 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
-from jaxtank.equations import equations, physics
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.plots.equations import equations, physics
 from tuning import manual_parts, tables
 from tuning.objective import LOWER
 

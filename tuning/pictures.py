@@ -21,20 +21,20 @@ def rig(loop, run=None, title=""):
     """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant that is no network of tanks."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting
-    from jaxtank.layout import place
-    from jaxtank.schematic import schematic
+    from jaxtank.plots import responses
+    from jaxtank.plots.layout import place
+    from jaxtank.plots.schematic import schematic
 
     if not hasattr(loop.plant, "links"):
         return {}
     where = place(loop.plant)
     wide, high = where.right - where.left, where.top - where.bottom
-    with plotting.styled():
+    with responses.styled():
         figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
         levels, setpoints = (None, None) if run is None or not np.all(np.isfinite(run.x[-1])) else (run.x[-1], run.r[-1])
         schematic(ax, loop.plant, levels, setpoints)
-        ax.set_title(plotting.plain(title))
+        ax.set_title(responses.plain(title))
     return {"rig": figure}
 
 
@@ -45,16 +45,16 @@ def inner(loop, runs):
     """
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, run_plots
+    from jaxtank.plots import diagnostics, responses
 
     tanks = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
     if len(tanks) < 2:
         return {}
-    styles = [(plotting.AFTER, "-")] if len(runs) == 1 else [(plotting.BEFORE, "--"), (plotting.AFTER, "-")]
+    styles = [(responses.AFTER, "-")] if len(runs) == 1 else [(responses.BEFORE, "--"), (responses.AFTER, "-")]
     drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
-    with plotting.styled():
+    with responses.styled():
         figure, ax = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
-        run_plots.phase(ax, drawn, tanks[:2], np.asarray(loop.plant.rim), loop.units[0])
+        diagnostics.phase(ax, drawn, tanks[:2], np.asarray(loop.plant.rim), loop.units[0])
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return {"inner": figure}
 
@@ -63,14 +63,14 @@ def saturation(loop, runs):
     """{"saturation": when each pump was commanded past its limits}; {} where none ever was. runs: {name: Trajectory}."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, run_plots
+    from jaxtank.plots import diagnostics, responses
 
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         return {}
-    with plotting.styled():
+    with responses.styled():
         figure, ax = plt.subplots(figsize=(6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps), layout="constrained")
-        run_plots.saturation(ax, runs, low, high)
+        diagnostics.saturation(ax, runs, low, high)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return {"saturation": figure}
 
@@ -79,7 +79,7 @@ def estimates(loop, clock, run, title=""):
     """{"estimates": levels and disturbances as the observer saw them}; {} where levels are taken as they are measured."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, run_plots
+    from jaxtank.plots import diagnostics, responses
 
     tanks, disturbed = loop.plant.tanks, bool(np.any(run.d_hat))
     if not disturbed and np.array_equal(run.x_hat, run.y):
@@ -90,21 +90,21 @@ def estimates(loop, clock, run, title=""):
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
         known = np.stack([np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1) / np.asarray(loop.plant.area)
     rows = 2 if disturbed else 1
-    with plotting.styled():
+    with responses.styled():
         figure, axes = plt.subplots(
             rows, tanks, figsize=(max(6.4, 3.2 * tanks), 2.3 * rows + 0.5), sharex=True, squeeze=False, layout="constrained"
         )
         for i in range(tanks):
-            run_plots.estimate(axes[0, i], run, i, length)
+            diagnostics.estimate(axes[0, i], run, i, length)
             if disturbed:
                 inflow = None if known is None else known[:, i]
-                run_plots.disturbance(axes[1, i], run, i, inflow, local("cm/s", loop.units))
+                diagnostics.disturbance(axes[1, i], run, i, inflow, local("cm/s", loop.units))
             axes[-1, i].set_xlabel("time [s]")
         handles = {}
         for ax in axes[:, 0]:
             handles |= dict(zip(ax.get_legend_handles_labels()[1], ax.get_legend_handles_labels()[0]))
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
-        figure.suptitle(plotting.plain(title), fontsize=10)
+        figure.suptitle(responses.plain(title), fontsize=10)
     return {"estimates": figure}
 
 
@@ -112,13 +112,13 @@ def margins(rows):
     """{"margins": room to every limit}; {} where there are none."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, run_plots
+    from jaxtank.plots import diagnostics, responses
 
     if not rows:
         return {}
-    with plotting.styled():
-        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.42 * min(len(rows), run_plots.MANY)), layout="constrained")
-        run_plots.margins(ax, rows)
+    with responses.styled():
+        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY)), layout="constrained")
+        diagnostics.margins(ax, rows)
     return {"margins": figure}
 
 
@@ -126,11 +126,11 @@ def tradeoff(found, unit, cost_unit):
     """{"tradeoff": the least objective over a limit}; {} where none was asked. found: of `tuning.tradeoff`, or None."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting, run_plots
+    from jaxtank.plots import diagnostics, responses
 
     if not found:
         return {}
-    with plotting.styled():
+    with responses.styled():
         figure, ax = plt.subplots(figsize=(6.0, 3.6), layout="constrained")
-        run_plots.tradeoff(ax, found["points"], found["measure"], unit, cost_unit)
+        diagnostics.tradeoff(ax, found["points"], found["measure"], unit, cost_unit)
     return {"tradeoff": figure}

@@ -88,7 +88,7 @@ def write_result(folder, files, draw, page=None, stale=()):
 def save_run(case, run, payload, folder, gif=False):
     """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`, from which the run.gif of an
     earlier one is removed."""
-    from jaxtank import plotting
+    from jaxtank.plots import responses
 
     check_folder(folder)
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run, case.loop.units)}
@@ -96,10 +96,10 @@ def save_run(case, run, payload, folder, gif=False):
     old = (Path(folder) / "trajectory.csv").exists()
     stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
     written = write_result(
-        folder, files, lambda: {"responses": plotting.responses(case.loop, {case.name: run}, case.title)}, stale=stale
+        folder, files, lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)}, stale=stale
     )
     if gif:
-        from jaxtank.animation import animate
+        from jaxtank.plots.animation import animate
 
         try:
             with tempfile.TemporaryDirectory() as aside:

@@ -228,7 +228,7 @@ def table_csv(result):
 
 def figures(result):
     """{"tornado" or "sobol": figure} with one panel for each measure that has indices, at most PANELS of them."""
-    from jaxtank import plotting
+    from jaxtank.plots import responses as plotting
 
     shown = [c for c in result.columns if not c.empty][:PANELS]
     draws = []

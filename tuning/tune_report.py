@@ -25,7 +25,7 @@ def figures(result, runs=None):
     """Matplotlib figures of a tuning result: those of CAPTIONS that have something to show."""
     import matplotlib.pyplot as plt
 
-    from jaxtank import plotting
+    from jaxtank.plots import responses
     from tuning import pictures
 
     key = result_key(result)
@@ -49,7 +49,7 @@ def figures(result, runs=None):
         + ")"
     )
     drawn = {
-        "responses": plotting.responses(result.tuned.loop, runs, title, limits),
+        "responses": responses.responses(result.tuned.loop, runs, title, limits),
         **pictures.rig(result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"),
         **pictures.margins(worst_of_scenarios(result.constraints)),
         **pictures.inner(result.tuned.loop, runs),
@@ -58,12 +58,12 @@ def figures(result, runs=None):
             result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
         ),
     }
-    with plotting.styled():
+    with responses.styled():
         if result.cloud is not None and len(result.cloud["objective"]):
             drawn["clouds"] = _clouds(plt, result, unit)
         if result.history:
             figure, ax = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
-            plotting.convergence(ax, result.history, unit, bool(result.problem.limits))
+            responses.convergence(ax, result.history, unit, bool(result.problem.limits))
             drawn["convergence"] = figure
         figure, ax = plt.subplots(figsize=(6.4, 4.8), layout="constrained")
         _landscape(ax, result, unit)
@@ -124,22 +124,22 @@ def page_of(result, drawn, command=None):
 
 def _clouds(plt, result, unit):
     """The runs that the search never saw, before against after: the objective, and the level that comes nearest to its limit."""
-    from jaxtank import plotting
+    from jaxtank.plots import responses
 
     found, length = result.cloud, result.tuned.loop.units[0]
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 4.9), layout="constrained")
-    plotting.cloud(left, found["objective"], found["held"], "objective", unit)
+    responses.cloud(left, found["objective"], found["held"], "objective", unit)
     name = "highest level over its limit" if found["past"] else "highest level"
-    plotting.cloud(right, found["level"], found["held"], name, length, found["limit"])
+    responses.cloud(right, found["level"], found["held"], name, length, found["limit"])
     handles, labels = right.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(plotting.plain(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"), fontsize=10)
+    figure.suptitle(responses.plain(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"), fontsize=10)
     return figure
 
 
 def _landscape(ax, result, unit):
     """The objective around the answer at the case's own step: along one parameter, or over the two that it feels most."""
-    from jaxtank import plotting
+    from jaxtank.plots import responses
 
     problem = result.problem
     z = np.array([float(b.to_unit(p["after"])) for b, p in zip(problem.bounds, result.parameters.values())])
@@ -149,7 +149,7 @@ def _landscape(ax, result, unit):
         costs, margins = problem.screen(grid[:, None])
         violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
         b = problem.bounds[0]
-        return plotting.curve(
+        return responses.curve(
             ax,
             b.from_unit(grid),
             costs,
@@ -169,7 +169,7 @@ def _landscape(ax, result, unit):
     costs, margins = problem.screen(points)
     worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
     x, y = problem.bounds[first], problem.bounds[second]
-    plotting.contours(
+    responses.contours(
         ax,
         x.from_unit(a),
         y.from_unit(c),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.plotting import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
+from jaxtank.plots.responses import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240
 """Slices of time in the strips of `saturation`; each is as dark as the share of it that was spent at a limit."""

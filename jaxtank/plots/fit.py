@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank.plotting import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
+from jaxtank.plots.responses import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
 
 
 def measured(ax, t, y, told, name, unit, held_from=None):

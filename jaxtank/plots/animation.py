@@ -12,9 +12,9 @@ from matplotlib.patches import Rectangle
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
-from jaxtank.layout import place
-from jaxtank.plotting import PUMPS, WATER, styled
-from jaxtank.schematic import HALO, depth, mark, mark_height, schematic
+from jaxtank.plots.layout import place
+from jaxtank.plots.responses import PUMPS, WATER, styled
+from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
 
 RATE = 12
 """Pictures a second: enough for liquid, which moves slowly."""

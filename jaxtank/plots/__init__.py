@@ -1,0 +1,1 @@
+"""Pictures on given matplotlib axes; the only folder of this package that imports matplotlib."""
