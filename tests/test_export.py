@@ -19,7 +19,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
-from jaxtank.export import export
+from jaxtank.export.source import export
 from jaxtank.plants.network import network
 from jaxtank.rig import schema as rig_words
 from tuning import cli

@@ -15,7 +15,7 @@ from jaxtank import presets
 from jaxtank.controllers.base import Controller
 from jaxtank.core import numerics
 from jaxtank.core.tree import component, leaf, number, static
-from jaxtank.export import export
+from jaxtank.export.source import export
 from jaxtank.plants.base import Plant
 
 

@@ -57,7 +57,8 @@ def export_law(args):
     case = open_case(args)
     from pathlib import Path
 
-    from jaxtank.export import export, function_name
+    from jaxtank.export.printer import function_name
+    from jaxtank.export.source import export
     from tuning import saving, tables
 
     text = export(case, args.lang, args.precision, args.name)

@@ -1,0 +1,42 @@
+"""A law and its observer as one file without dependencies: C99, or a MATLAB function, made from the same step function that is simulated."""
+
+import re
+
+from jaxtank.controllers import OpenLoop
+from jaxtank.core.errors import InputError
+from jaxtank.export.c import C_CALLS, _c
+from jaxtank.export.matlab import _matlab
+from jaxtank.export.printer import SAME_NAME, Code, function_name
+
+LANGUAGES = ("c", "m")
+PRECISIONS = ("double", "float")
+
+
+def export(case, language="c", precision="double", name=None):
+    """The law of a Case as source code.
+
+    language: "c" (C99) or "m" (MATLAB); precision: "double" or "float" (of C); name: of the functions, made from the case's where None.
+    Returns the text of one file. Raises InputError for a law that plays a signal back, and one that uses an operation without a counterpart.
+    """
+    if language not in LANGUAGES:
+        raise InputError(f"--lang {language!r}: must be one of {', '.join(LANGUAGES)}")
+    if precision not in PRECISIONS:
+        raise InputError(f"--precision {precision!r}: must be one of {', '.join(PRECISIONS)}")
+    if language == "m" and precision == "float":
+        raise InputError("--precision float: is for C; MATLAB computes in double")
+    if isinstance(case.loop.controller, OpenLoop):
+        raise InputError(f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to export")
+    if case.loop.controller.inputs(case.clock) != ():
+        raise InputError(f"{case.name}: its law plays a signal of its own back, which code without a run cannot have")
+    name = name or function_name(case)
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
+        raise InputError(
+            f"--name {name!r}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51"
+        )
+    law = Code(case)
+    return (_c if language == "c" else _matlab)(law, case, name, precision)
+
+
+"""Functions that C and MATLAB have by the same name."""
+C_CALLS |= {name: name.upper() for name in (*SAME_NAME, "cbrt", "exp2")}
+C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT", "rem": "FMOD", "is_finite": "isfinite"}
