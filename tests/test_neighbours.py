@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import neighbours, presets, rig
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.interop import python_control
 
 
 def test_python_control_sees_the_linearised_rig():
     """mirakhorli at 12/12: zeros and steady gain of mirakhorli notes S2.3; poles from the printed time constants."""
     control = pytest.importorskip("control")
     plant = presets.find("mirakhorli/sfc").loop.plant
-    system = neighbours.to_control(plant, setpoints=(12.0, 12.0))
+    system = python_control.to_control(plant, setpoints=(12.0, 12.0))
     assert sorted(control.zeros(system).real) == pytest.approx([-0.10717, 0.02467], abs=1e-5)
     np.testing.assert_allclose(control.dcgain(system), [[3.5849, 4.0151], [4.9506, 2.0684]], atol=1e-4)
     np.testing.assert_allclose(sorted(-1 / control.poles(system).real), [19.0178, 33.4252, 43.2223, 43.2223], atol=1e-3)
@@ -38,24 +39,24 @@ def test_an_operating_point_is_asked_for():
         {"levels": (1.0,) * 3, "inputs": (1.0, 1.0)},
     ):
         with pytest.raises(InputError, match="to_control"):
-            neighbours.to_control(plant, **options)
+            python_control.to_control(plant, **options)
 
 
 def test_outputs_of_the_system_are_indices_of_tanks_as_those_of_the_plant():
     pytest.importorskip("control")
     plant = presets.find("mirakhorli/sfc").loop.plant
-    system = neighbours.to_control(plant, [3, 0], setpoints=(12.0, 12.0))
+    system = python_control.to_control(plant, [3, 0], setpoints=(12.0, 12.0))
     assert system.output_labels == ["y_h4", "y_h1"]
     np.testing.assert_array_equal(system.C, [[0, 0, 0, 1], [1, 0, 0, 0]])
-    np.testing.assert_allclose(system.A, neighbours.to_control(plant, setpoints=(12.0, 12.0)).A)
+    np.testing.assert_allclose(system.A, python_control.to_control(plant, setpoints=(12.0, 12.0)).A)
     with pytest.raises(InputError, match=r"outputs = \[12.0, 12.0\]: must be indices .* given as setpoints"):
-        neighbours.to_control(plant, [12.0, 12.0])
+        python_control.to_control(plant, [12.0, 12.0])
 
 
 def test_columns_of_a_run_have_units():
     case = rig.set_values(presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0})
     run = jaxtank.simulate(case.loop, case.clock)
-    found = neighbours.columns(run, case.loop.units)
+    found = python_control.columns(run, case.loop.units)
     assert {"t [s]", "h1 [m]", "r1 [m]"} <= set(found) and len({len(v) for v in found.values()}) == 1
     np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
 
@@ -64,8 +65,8 @@ def test_columns_share_one_dimension_where_it_is_named():
     """As xarray takes them: (dimension, values, attributes), time the coordinate of the dimension's name."""
     case = rig.set_values(presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0})
     run = jaxtank.simulate(case.loop, case.clock)
-    found = neighbours.columns(run, case.loop.units, dimension="t")
-    flat = neighbours.columns(run, case.loop.units)
+    found = python_control.columns(run, case.loop.units, dimension="t")
+    flat = python_control.columns(run, case.loop.units)
     assert {dims for dims, _, _ in found.values()} == {"t"}
     assert [f"{name} [{attrs['units']}]" for name, (_, _, attrs) in found.items()] == list(flat)
     for (_, values, _), wanted in zip(found.values(), flat.values()):
@@ -81,7 +82,7 @@ def test_the_environment_plays_the_case():
     pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
-    from jaxtank.environment import TankEnv
+    from jaxtank.interop.gymnasium import TankEnv
 
     case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 150.0})
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
@@ -127,7 +128,7 @@ def pumps_and_sensors(case):
 def test_an_episode_is_the_run_of_the_rig(name, change):
     """Levels, readings, inputs and what is lost over the rims, with the controller's inputs as actions and the seed of the run."""
     gymnasium = pytest.importorskip("gymnasium")
-    from jaxtank.environment import TankEnv
+    from jaxtank.interop.gymnasium import TankEnv
 
     case = change(rig.set_values(presets.find(name), EPISODES[name]))
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(5)))
@@ -158,7 +159,7 @@ def test_an_episode_is_the_run_of_the_rig(name, change):
 
 def test_noise_of_the_environment_follows_its_seed():
     pytest.importorskip("gymnasium")
-    from jaxtank.environment import TankEnv
+    from jaxtank.interop.gymnasium import TankEnv
 
     case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0, "sensor.noise": 0.1})
     env = TankEnv(case)

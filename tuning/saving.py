@@ -9,8 +9,8 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_together
 from jaxtank.core.units import DEFAULT
+from jaxtank.interop.python_control import columns
 from jaxtank.loop import run as lp
-from jaxtank.neighbours import columns
 from tuning.pictures import failed
 from tuning.tables import dumps
 
