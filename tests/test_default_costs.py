@@ -5,7 +5,7 @@ import pytest
 
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, split_index
-from tuning.objective import Problem
+from tuning.problem.problem import Problem
 
 QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")  # the others compile for long
 ROUGH = {

@@ -18,11 +18,11 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning import cli, identifiability, playback
-from tuning.bounds import bounds
 from tuning.coordinates import coordinates
 from tuning.distributions import Draws
 from tuning.ensemble import spread_of
 from tuning.experiments import candidates, compare_experiments, settled
+from tuning.problem.bounds import bounds
 from tuning.proposal import with_pi
 
 RECORD = pathlib.Path(__file__).parents[2] / "shared" / "data" / "cascaded_tanks.csv"

@@ -11,8 +11,8 @@ from jaxtank.loop import run
 from jaxtank.loop.derivatives import OUTER
 from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
-from tuning.objective import Problem
-from tuning.scenarios import rough_clock
+from tuning.problem.problem import Problem
+from tuning.problem.scenarios import rough_clock
 from tuning.solvers import METHODS, Search
 
 SQUARES = {"ise": 1.0, "input_deviation": 3.0, "mean_square_travel": 100.0}

@@ -13,7 +13,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.presets import Mirror, Scenario
 from tuning import evidence, solvers
-from tuning.objective import Limit, Point, Problem
+from tuning.problem.limits import Limit
+from tuning.problem.problem import Point, Problem
 from tuning.solvers import Search
 
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}

@@ -21,7 +21,7 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
 from tuning import cli, distributions, effects, indices, sensitivity_report
 from tuning.distributions import Discrete, LogUniform, Normal, Uniform
-from tuning.scenarios import Lane, groups_of, values_of
+from tuning.problem.scenarios import Lane, groups_of, values_of
 from tuning.sensitivity import sensitivity, what_varies
 
 VARIED = {"plant.drain": Uniform(relative=0.05), "plant.pump_gain": LogUniform(factor=1.2)}

@@ -10,10 +10,11 @@ import tuning
 from jaxtank import rig
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from tuning import objective
 from tuning.memo import Memo
-from tuning.objective import Limit, Point, Problem
-from tuning.scenarios import coarse_clock
+from tuning.problem import problem as objective
+from tuning.problem.limits import Limit
+from tuning.problem.problem import Point, Problem
+from tuning.problem.scenarios import coarse_clock
 from tuning.screening import distinct_starts, screen, sobol, spectral_radius
 from tuning.search import run_measures
 from tuning.solvers import METHODS, Search, optimality

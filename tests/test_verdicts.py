@@ -13,7 +13,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.signals.setpoints import ramps
 from tuning import cli
-from tuning.objective import Limit, Point, resolve_limits, room_of
+from tuning.problem.limits import Limit, resolve_limits, room_of
+from tuning.problem.problem import Point
 from tuning.solvers import Search, downhill, slsqp
 
 

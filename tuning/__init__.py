@@ -13,8 +13,8 @@ import sys
 import types
 
 _HOMES = {
-    "Bound": "tuning.bounds",
-    "Problem": "tuning.objective",
+    "Bound": "tuning.problem.bounds",
+    "Problem": "tuning.problem.problem",
     "TuningResult": "tuning.result",
     "Certificate": "tuning.robust",
     "Correlated": "tuning.distributions",

@@ -20,8 +20,8 @@ from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
 from tuning import parts, shards
 from tuning.distributions import Correlated, Draws, Uniform, stated
-from tuning.objective import LOWER, resolve_limits
-from tuning.scenarios import noisy
+from tuning.problem.limits import LOWER, resolve_limits
+from tuning.problem.scenarios import noisy
 
 LANES = 256
 """Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""

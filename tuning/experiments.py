@@ -116,7 +116,7 @@ def compare_experiments(
     loop = case.loop
     tanks = tuple(range(loop.plant.tanks)) if levels is None else tuple(levels)
     spec = usual(loop) if free is None else {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
-    from tuning.bounds import bounds
+    from tuning.problem.bounds import bounds
 
     moved = coordinates(bounds(loop, spec))
     made = candidates(loop, duration=duration, dt=dt, voltage=voltage, size=size, bit=bit) if inputs is None else inputs

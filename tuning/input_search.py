@@ -12,7 +12,7 @@ from jaxtank.core.tree import number
 from jaxtank.loop import run as lp
 from jaxtank.rig import check_objective
 from tuning.inputs import RUNNING, Held, Terms, look, open_loop, value_and_gradient
-from tuning.objective import resolve_limits
+from tuning.problem.limits import resolve_limits
 from tuning.projected import minimise
 
 SUMS = {"e2", "abs_e", "u2", "over_rim2", "spilled", "shortfall", "travel", "saturation_excess", "deviation2", "changes2", "past2"}

@@ -14,7 +14,7 @@ from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from tuning import manual_parts, tables
-from tuning.objective import LOWER
+from tuning.problem.limits import LOWER
 
 WIDTH = 100
 BELIEFS = ("controller.model.", "controller.law.model.", "observer.model.")

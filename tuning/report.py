@@ -3,7 +3,8 @@
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.objective import LOWER, TAIL
+from tuning.problem.limits import LOWER
+from tuning.problem.problem import TAIL
 from tuning.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
 
 SHOWN = (

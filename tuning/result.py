@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.evidence import flat_words
-from tuning.objective import EXPLODED
+from tuning.problem.problem import EXPLODED
 from tuning.solvers import SLOPING, UNSTABLE
 from tuning.tables import ABSENT, REASONS
 

@@ -13,7 +13,8 @@ from jaxtank.rig import check_limits
 from tuning.distributions import Draws, stated
 from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of
 from tuning.evidence import HELD_OUT, summary_of, validate
-from tuning.objective import LOWER, Problem
+from tuning.problem.limits import LOWER
+from tuning.problem.problem import Problem
 from tuning.search import own_values, tune
 
 CONFIDENCE = 1e-6

@@ -12,7 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import initial
 from jaxtank.loop.step import Inputs, step
-from tuning.scenarios import coarse_clock
+from tuning.problem.scenarios import coarse_clock
 
 TRIED = 3
 """Screened points that are run again at the true step, at most, to find one that is better than the

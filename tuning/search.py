@@ -15,13 +15,14 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import KEY
-from tuning import evidence, scenarios
+from tuning import evidence
 from tuning.evidence import REPORTED
 from tuning.long_steps import of_answer
 from tuning.memo import Log
-from tuning.objective import Problem
+from tuning.problem import scenarios
+from tuning.problem.problem import Problem
+from tuning.problem.scenarios import coarse_clock
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
-from tuning.scenarios import coarse_clock
 from tuning.screening import best_screened, distinct_starts, screen
 from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
 

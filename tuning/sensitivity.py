@@ -13,10 +13,10 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from tuning import indices
-from tuning import scenarios as sc
 from tuning.distributions import Correlated, Draws, stated
 from tuning.effects import Column, entries_of, local_columns
 from tuning.ensemble import check_devices, spread_of
+from tuning.problem import scenarios as sc
 
 METHODS = ("local", "morris", "sobol")
 

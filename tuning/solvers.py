@@ -3,7 +3,7 @@
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from tuning.objective import EXPLODED, ROOT
+from tuning.problem.problem import EXPLODED, ROOT
 
 BACKOFF = 1e-6
 """Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""

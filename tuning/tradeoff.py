@@ -7,7 +7,8 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.measures.catalogue import check_names
-from tuning.objective import LOWER, Problem
+from tuning.problem.limits import LOWER
+from tuning.problem.problem import Problem
 from tuning.screening import best_screened, screen
 from tuning.solvers import Search, approach, restore, slsqp
 

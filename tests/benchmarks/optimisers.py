@@ -33,8 +33,8 @@ from jaxtank.case import Free
 from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning import tables
-from tuning.objective import Problem
-from tuning.scenarios import rough_clock
+from tuning.problem.problem import Problem
+from tuning.problem.scenarios import rough_clock
 from tuning.screening import distinct_starts, screen
 from tuning.solvers import METHODS, Search
 

@@ -1,0 +1,1 @@
+"""What a search minimises and what must hold: bounds, limits, scenarios."""
