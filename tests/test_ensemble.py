@@ -20,10 +20,11 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
-from tuning import evidence, parts, robust, shards
+from tuning import evidence, robust, shards
 from tuning.distributions import Draws, parse, stated
 from tuning.ensemble import clopper_pearson, probabilities
 from tuning.sensitivity import what_varies
+from tuning.storage import batch_store
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
@@ -109,7 +110,7 @@ def test_folders_of_another_ensemble_are_refused(case, tmp_path):
     with pytest.raises(InputError, match="does not hold the measures"):
         tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
     with pytest.raises(InputError, match="not a batch"):
-        parts.read_part(path, {"failed"})  # a pickle inside is never opened
+        batch_store.read_part(path, {"failed"})  # a pickle inside is never opened
 
 
 LAYOUT = """

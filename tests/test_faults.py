@@ -19,7 +19,8 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
-from tuning import cli, holds, memo, parts, pictures
+from tuning import cli, pictures
+from tuning.storage import batch_store, evaluation_log, folder_lock
 
 HERE = Path(__file__).parent
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
@@ -99,20 +100,20 @@ def test_files_are_replaced_together_or_not_at_all(tmp_path):
 
 def test_a_log_and_batches_on_a_full_disk(tmp_path):
     """/dev/full takes nothing."""
-    (tmp_path / memo.NAME).symlink_to("/dev/full")
+    (tmp_path / evaluation_log.NAME).symlink_to("/dev/full")
     with pytest.raises(InputError, match=r"evaluations\.jsonl.*No space left.*--resume"):
-        memo.Log(tmp_path, {"p": 1})
+        evaluation_log.Log(tmp_path, {"p": 1})
     with small_disk(100), pytest.raises(InputError, match=r"manifest\.json.*too large.*--resume"):
-        parts.Store(tmp_path / "new", {"measures": ["x" * 200]})
+        batch_store.Store(tmp_path / "new", {"measures": ["x" * 200]})
     assert not list((tmp_path / "new").iterdir())
 
 
 def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
-    log = memo.Log(tmp_path, {"p": 1})
+    log = evaluation_log.Log(tmp_path, {"p": 1})
     with small_disk(2000), pytest.raises(InputError, match="make room, then --resume"):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
-    again, made = memo.Log(tmp_path, {"p": 1}, resume=True), []
+    again, made = evaluation_log.Log(tmp_path, {"p": 1}, resume=True), []
     assert [again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3)) for i in range(20)] == [
         (float(i), 1 / 3) for i in range(20)
     ]
@@ -155,7 +156,7 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
         assert not drawn & after.keys() and before.keys() - drawn <= after.keys() and json.loads(after["result.json"])
     # the old result of identify here is its result.json alone
     left = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
-    assert all(n == memo.NAME or n == parts.MANIFEST or parts.NAME.fullmatch(n) for n in left), left
+    assert all(n == evaluation_log.NAME or n == batch_store.MANIFEST or batch_store.NAME.fullmatch(n) for n in left), left
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
         assert out.strip()  # the answer is told all the same
 
@@ -268,7 +269,7 @@ def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, c
         assert time.monotonic() - began < 20 and [p.name for p in folder.iterdir()] == [files.LOCK]
         (folder / f".result.json.k3x{files.ASIDE}").write_text("half")
         (folder / ".mine").write_text("whole")
-    with holds.hold(folder):  # its process was killed
+    with folder_lock.hold(folder):  # its process was killed
         assert {p.name for p in folder.iterdir()} == {files.LOCK, ".mine"}
         assert int((folder / files.LOCK).read_text()) == os.getpid()
     assert [p.name for p in folder.iterdir()] == [".mine"]
@@ -276,21 +277,21 @@ def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, c
 
 def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
     with another(tmp_path, "shared"):
-        with holds.hold(tmp_path, shared=True):
+        with folder_lock.hold(tmp_path, shared=True):
             (tmp_path / f".part{files.ASIDE}").write_text("of the other")
         assert (tmp_path / files.LOCK).exists() and (tmp_path / f".part{files.ASIDE}").exists()
-        with pytest.raises(InputError, match="another run"), holds.hold(tmp_path):
+        with pytest.raises(InputError, match="another run"), folder_lock.hold(tmp_path):
             pass
 
 
 def test_a_folder_made_for_nothing_is_removed(tmp_path):
-    with pytest.raises(KeyError), holds.hold(tmp_path / "a" / "b"):
+    with pytest.raises(KeyError), folder_lock.hold(tmp_path / "a" / "b"):
         raise KeyError
     assert not list(tmp_path.iterdir())
-    with holds.hold(tmp_path / "a" / "b"):
+    with folder_lock.hold(tmp_path / "a" / "b"):
         (tmp_path / "a" / "b" / "result.json").write_text("{}")
     assert [p.name for p in (tmp_path / "a" / "b").iterdir()] == ["result.json"]
-    with holds.hold(None):
+    with folder_lock.hold(None):
         pass
 
 
@@ -314,7 +315,7 @@ def test_two_at_once(tmp_path):
 def interrupted(words, folder, lines, number=signal.SIGINT):
     """(stderr, exit code) of a command that gets a signal once its log has so many lines; 0: as soon as the folder is there."""
     process = subprocess.Popen([*JAXTANK, *words, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    log, until = folder / memo.NAME, time.monotonic() + 120
+    log, until = folder / evaluation_log.NAME, time.monotonic() + 120
     while process.poll() is None and time.monotonic() < until:
         if (lines == 0 and folder.exists()) or (log.exists() and log.read_bytes().count(b"\n") >= lines > 0):
             break
@@ -332,7 +333,7 @@ def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
     assert code == 130 and "interrupted" in said and "Traceback" not in said, said
     found = json.loads((tmp_path / "out" / "result.json").read_text())
     assert found["status"] == "interrupted" and "best point so far" in found["message"]
-    evaluated = (tmp_path / "out" / memo.NAME).read_bytes().count(b"\n") - 1
+    evaluated = (tmp_path / "out" / evaluation_log.NAME).read_bytes().count(b"\n") - 1
     assert 0 < evaluated < 200 and found["evaluations"]["simulations"] > 0
     assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / files.LOCK).exists()
 
@@ -350,8 +351,8 @@ def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folde
     said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
     assert (said, code) == (f"jaxtank: {word}\n", 128 + number)
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
-    assert left <= {memo.NAME}
-    with holds.hold(tmp_path / "out"):
+    assert left <= {evaluation_log.NAME}
+    with folder_lock.hold(tmp_path / "out"):
         pass
 
 
@@ -430,7 +431,7 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
 
     whole = tuning.identify(case, log, free, **options)
     assert tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status == "interrupted"
-    assert (tmp_path / memo.NAME).read_bytes().count(b"\n") == 3
+    assert (tmp_path / evaluation_log.NAME).read_bytes().count(b"\n") == 3
     again = tuning.identify(case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options)
     assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]  # what is recalled has no slopes
     told = [{k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)]

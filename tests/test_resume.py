@@ -13,8 +13,9 @@ import pytest
 import tuning
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
-from tuning import memo, parts
-from tuning.memo import NAME, Log, Memo
+from tuning.storage import batch_store
+from tuning.storage import evaluation_log as memo
+from tuning.storage.evaluation_log import NAME, Log, Memo
 
 FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
 OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
@@ -179,4 +180,4 @@ def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
 
 def began(command, folder):
     """Open the log, or the store of batches, of a run that goes on in `folder`."""
-    memo.Log(folder, {}, resume=True) if command == "tune" else parts.Store(folder, {}, resume=True)
+    memo.Log(folder, {}, resume=True) if command == "tune" else batch_store.Store(folder, {}, resume=True)

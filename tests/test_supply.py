@@ -18,7 +18,8 @@ import tuning
 from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import DataError, InputError
-from tuning import log_file, memo, parts
+from tuning import log_file
+from tuning.storage import batch_store, evaluation_log
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = {p.__name__: Path(p.__file__).parent for p in (jaxtank, tuning)}
@@ -66,16 +67,16 @@ READ = {
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.log_file", "_text", "read_bytes"): "after `refusal`",
-    ("tuning.memo", "_read", "read_bytes"): "after `refusal`",
-    ("tuning.memo", "__init__", "open"): "to write",
-    ("tuning.memo", "keep", "open"): "to write",
-    ("tuning.parts", "read_part", "ZipFile"): "after `refusal`; unpacked sizes are added up first",
-    ("tuning.parts", "read_part", "load"): "after that; allow_pickle=False",
-    ("tuning.parts", "read_manifest", "read_text"): "after `refusal`",
+    ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",
+    ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
+    ("tuning.storage.evaluation_log", "keep", "open"): "to write",
+    ("tuning.storage.batch_store", "read_part", "ZipFile"): "after `refusal`; unpacked sizes are added up first",
+    ("tuning.storage.batch_store", "read_part", "load"): "after that; allow_pickle=False",
+    ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
     ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.streams", "guard", "open"): "/dev/null, in place of a stream that was closed",
-    ("tuning.holds", "_locked", "open"): "its own lock, of which 20 bytes are read",
-    ("tuning.holds", "release", "open"): "its own lock, of which nothing is read",
+    ("tuning.storage.folder_lock", "_locked", "open"): "its own lock, of which 20 bytes are read",
+    ("tuning.storage.folder_lock", "release", "open"): "its own lock, of which nothing is read",
 }
 
 
@@ -143,15 +144,15 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
     for i, odd in enumerate((Path("/dev/zero"), tmp_path / "pipe", tmp_path, tmp_path / "huge")):
         folder = tmp_path / f"run{i}"
         folder.mkdir()
-        for name in (memo.NAME, parts.MANIFEST, "part-000000.npz", "rig.toml", "log.csv"):
+        for name in (evaluation_log.NAME, batch_store.MANIFEST, "part-000000.npz", "rig.toml", "log.csv"):
             (folder / name).symlink_to(odd)
         says = "is not a file|at most"
         with pytest.raises(InputError, match=says):
-            memo.Log(folder, {"p": 1}, resume=True)
+            evaluation_log.Log(folder, {"p": 1}, resume=True)
         with pytest.raises(InputError, match=says):
-            parts.read_manifest(folder)
+            batch_store.read_manifest(folder)
         with pytest.raises(InputError, match=says):
-            parts.read_part(folder / "part-000000.npz", {"x"})
+            batch_store.read_part(folder / "part-000000.npz", {"x"})
         with pytest.raises(InputError, match=says):
             files.read_text(folder / "rig.toml", "rig file")
         with pytest.raises(DataError, match=says):
@@ -187,7 +188,7 @@ def test_a_batch_is_not_trusted(held, tmp_path):
         for name, data in held.items():
             archive.writestr(name, data)
     with pytest.raises(InputError, match=r"part-000000\.npz: is not a batch of this program"):
-        parts.read_part(path, {"x"})
+        batch_store.read_part(path, {"x"})
     assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (tmp_path.parent / "x.npy").exists()
 
 
@@ -200,18 +201,18 @@ def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
     for where, value in ((at + 24, b"\x0a\0\0\0"), (at + 8, b"\x01\0"), (at + 10, b"\x63\0"), (60, b"\xff" * 40), (0, b"\0" * 4)):
         path.write_bytes(whole[:where] + value + whole[where + len(value) :])
         with pytest.raises(InputError, match="not a batch of this program"):
-            parts.read_part(path, {"x"})
+            batch_store.read_part(path, {"x"})
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="not a batch of this program"):
-        parts.read_part(path, {"x"})
+        batch_store.read_part(path, {"x"})
 
 
 def test_json_without_end_is_refused(tmp_path):
     head = json.dumps({"jaxtank": 1, "problem": {"p": 1}}) + "\n"
     deep = "[" * 200_000 + "\n"
-    (tmp_path / parts.MANIFEST).write_text(deep)
+    (tmp_path / batch_store.MANIFEST).write_text(deep)
     with pytest.raises(InputError, match="is not a manifest"):
-        parts.read_manifest(tmp_path)
+        batch_store.read_manifest(tmp_path)
     entry = '{"kind": "x", "key": "k", "result": ['
     for text, words in (
         (deep, "not a log"),
@@ -220,10 +221,10 @@ def test_json_without_end_is_refused(tmp_path):
         (head + entry + '{"shape": [1000000000, 1000000000], "hex": ["0x1p0"]}]}\n', "line 2"),
         (head + entry + '{"shape": [1], "hex": ["__import__"]}]}\n', "line 2"),
     ):
-        (tmp_path / memo.NAME).write_text(text)
+        (tmp_path / evaluation_log.NAME).write_text(text)
         with pytest.raises(InputError, match=words):
-            memo.Log(tmp_path, {"p": 1}, resume=True)
-        assert (tmp_path / memo.NAME).read_text() == text
+            evaluation_log.Log(tmp_path, {"p": 1}, resume=True)
+        assert (tmp_path / evaluation_log.NAME).read_text() == text
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ import tuning
 from jaxtank import rig
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from tuning.memo import Memo
 from tuning.problem import problem as objective
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
@@ -18,6 +17,7 @@ from tuning.problem.scenarios import coarse_clock
 from tuning.screening import distinct_starts, screen, sobol, spectral_radius
 from tuning.search import run_measures
 from tuning.solvers import METHODS, Search, optimality
+from tuning.storage.evaluation_log import Memo
 
 LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}

@@ -6,8 +6,8 @@ from pathlib import Path
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
-from tuning.memo import NAME
 from tuning.problem.bounds import bounds
+from tuning.storage.evaluation_log import NAME
 
 
 def _folder(log, i):

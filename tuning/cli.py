@@ -44,8 +44,8 @@ def _run(argv):
     from jaxtank.core.errors import DataError, InputError, NonFiniteError, nearest
     from jaxtank.core.text import one_line
     from tuning.arguments import folder_of
-    from tuning.holds import hold
     from tuning.parser import parser
+    from tuning.storage.folder_lock import hold
 
     if argv is None:
         # the note is printed once, where the case is opened

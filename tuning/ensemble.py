@@ -18,10 +18,11 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
-from tuning import parts, shards
+from tuning import shards
 from tuning.distributions import Correlated, Draws, Uniform, stated
 from tuning.problem.limits import LOWER, resolve_limits
 from tuning.problem.scenarios import noisy
+from tuning.storage import batch_store
 
 LANES = 256
 """Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
@@ -246,7 +247,7 @@ def ensemble(
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
         manifest["told"] = shards.told(case, case.limits if limits is None else limits)
-        store = parts.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1, anew=not merge)
+        store = batch_store.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1, anew=not merge)
     mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
     mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
     todo = [k for k in mine if store is None or not store.has(k)]
@@ -425,8 +426,8 @@ def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
     leaves, structure = jax.tree.flatten(case.loop)
     return {
         "case": case.name,
-        "loop": parts.digest([np.asarray(v) for v in leaves]),
-        "structure": parts.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
+        "loop": batch_store.digest([np.asarray(v) for v in leaves]),
+        "structure": batch_store.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
         "clock": repr(case.clock),
         "distributions": shards.to_json(distributions),
         "samples": samples,

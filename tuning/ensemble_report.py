@@ -9,8 +9,9 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
-from tuning import page, parts, saving, search, tables
+from tuning import page, saving, search, tables
 from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
+from tuning.storage import batch_store
 
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
@@ -229,9 +230,9 @@ def save(ensemble, folder, command=None):
     written = saving.write_result(
         folder, files, lambda: figures(ensemble), lambda drawn: page_of(ensemble, drawn, command), saving.earlier(folder, CAPTIONS)
     )
-    if (folder / parts.MANIFEST).exists():
+    if (folder / batch_store.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):
-            if parts.NAME.fullmatch(path.name):
+            if batch_store.NAME.fullmatch(path.name):
                 path.unlink()
-        (folder / parts.MANIFEST).unlink()
+        (folder / batch_store.MANIFEST).unlink()
     return written

@@ -17,9 +17,9 @@ from tuning import identifiability as idf
 from tuning import logs as lg
 from tuning.estimation import Estimation, Fit, check_length
 from tuning.identified import bare, proposed
-from tuning.memo import Log, Memo
-from tuning.parts import digest
 from tuning.proposal import check_law
+from tuning.storage.batch_store import digest
+from tuning.storage.evaluation_log import Log, Memo
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001

@@ -76,7 +76,7 @@ def run(args):
     from tuning import identify_report, tables
     from tuning.identify import identify
     from tuning.log_file import read_log
-    from tuning.memo import discard
+    from tuning.storage.evaluation_log import discard
 
     given = arguments.once("--column", [arguments.pair("--column", text, _column) for text in args.column])
     columns = dict(case.log) | (given or {})

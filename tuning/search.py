@@ -18,13 +18,13 @@ from jaxtank.xla.flags import KEY
 from tuning import evidence
 from tuning.evidence import REPORTED
 from tuning.long_steps import of_answer
-from tuning.memo import Log
 from tuning.problem import scenarios
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import coarse_clock
 from tuning.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.screening import best_screened, distinct_starts, screen
 from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
+from tuning.storage.evaluation_log import Log
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""

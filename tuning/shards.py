@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from tuning import distributions as ds
-from tuning import parts
+from tuning.storage import batch_store
 
 KINDS = {c.__name__: c for c in (ds.Uniform, ds.LogUniform, ds.Normal, ds.Discrete, ds.Correlated)}
 WORDS = {"samples": int, "key": int, "lanes": int, "draws": str, "measures": list, "distributions": dict}
@@ -55,7 +55,7 @@ def restore(folder):
     Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit for bit, that of the shards
     (`ensemble` compares their digests).
     """
-    manifest = parts.read_manifest(folder)
+    manifest = batch_store.read_manifest(folder)
     bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
     asked = manifest.get("told")
     if bad or not isinstance(asked, dict) or not isinstance(asked.get("limits"), dict):

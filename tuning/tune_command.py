@@ -92,7 +92,7 @@ def _tune(args):
     finally:  # a disk that is full costs the files, not the answer; and the log is kept
         print(tables.dumps(report.json_of(result)) if args.json else report.text(result))
     if folder and result.status != "interrupted":
-        from tuning.memo import discard
+        from tuning.storage.evaluation_log import discard
 
         discard(folder)  # the result is whole: there is nothing left to go on with
     tell_written(written, args)

@@ -9,10 +9,10 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.rig import check_objective
-from tuning.memo import Memo
 from tuning.problem import scenarios as sc
 from tuning.problem.bounds import bounds
 from tuning.problem.limits import NOT_A_NUMBER, resolve_in, room_of
+from tuning.storage.evaluation_log import Memo
 
 FORWARD_LIMIT = 24
 """Number of free parameters up to which derivatives run forward with the simulation; above, checkpointed

@@ -1,0 +1,1 @@
+"""Checkpoints: evaluation logs, finished batches, the lock on a folder."""
