@@ -42,7 +42,6 @@ def prepare(cache):
 
     matplotlib.use("Agg")
 
-    import tuning.ensemble
     import tuning.ensemble_report
     import tuning.identify
     import tuning.identify_report

@@ -20,11 +20,12 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
-from tuning import evidence, robust, shards
-from tuning.distributions import Draws, parse, stated
-from tuning.ensemble import clopper_pearson, probabilities
-from tuning.sensitivity import what_varies
+from tuning import evidence, robust
 from tuning.storage import batch_store
+from tuning.uncertainty import manifest
+from tuning.uncertainty.distributions import Draws, parse, stated
+from tuning.uncertainty.sampling import clopper_pearson, probabilities
+from tuning.uncertainty.sensitivity_study import what_varies
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
@@ -152,7 +153,7 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
 
 def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
     tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 1), limits={"max_level": 31.0})
-    there, options = shards.restore(tmp_path)
+    there, options = manifest.restore(tmp_path)
     assert options["distributions"] == TWO and options["limits"] == {"max_level": 31.0}
     assert same(tuning.ensemble(there, **options, fan=False, folder=tmp_path, resume=True, merge=True), whole)
     path = tmp_path / "manifest.json"
@@ -171,13 +172,13 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
     ):
         path.write_text(json.dumps(said | change))
         with pytest.raises(InputError, match=words):
-            shards.restore(tmp_path)
+            manifest.restore(tmp_path)
     every = {
         "a": tuning.LogUniform(factor=2.0),
         "b": tuning.Discrete(values=(1.0, 2.0)),
         "c": tuning.Correlated(names=("d", "e"), covariance=((1.0, 0.5), (0.5, 1.0))),
     }
-    assert shards.from_json(json.loads(json.dumps(shards.to_json(every)))) == every
+    assert manifest.from_json(json.loads(json.dumps(manifest.to_json(every)))) == every
 
 
 # statistics

@@ -150,8 +150,16 @@ def refused_lines(count, seed, folder, capsys, monkeypatch):
     def stop(*_, **__):
         raise InputError("would run")
 
-    homes = {"tuning.search": ("tune", "run_measures"), "tuning.ensemble": ("ensemble",), "tuning.robust": ("tune_robust",)}
-    homes |= {"tuning.identify": ("identify",), "tuning.sensitivity": ("sensitivity",), "jaxtank.export.source": ("export",)}
+    homes = {
+        "tuning.search": ("tune", "run_measures"),
+        "tuning.uncertainty.study": ("ensemble",),
+        "tuning.robust": ("tune_robust",),
+    }
+    homes |= {
+        "tuning.identify": ("identify",),
+        "tuning.uncertainty.sensitivity_study": ("sensitivity",),
+        "jaxtank.export.source": ("export",),
+    }
     for home, names in homes.items():
         for name in names:
             monkeypatch.setattr(importlib.import_module(home), name, stop)

@@ -19,11 +19,11 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
 from tuning import cli, identifiability, playback
 from tuning.coordinates import coordinates
-from tuning.distributions import Draws
-from tuning.ensemble import spread_of
 from tuning.experiments import candidates, compare_experiments, settled
 from tuning.problem.bounds import bounds
 from tuning.proposal import with_pi
+from tuning.uncertainty.distributions import Draws
+from tuning.uncertainty.sampling import spread_of
 
 RECORD = pathlib.Path(__file__).parents[2] / "shared" / "data" / "cascaded_tanks.csv"
 recorded = pytest.mark.skipif(

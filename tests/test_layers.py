@@ -74,8 +74,8 @@ DOORS = {
     ("jaxtank.__main__", "tuning.cli"),
     ("tuning.result", "tuning.report"),
     ("tuning.result", "tuning.tune_report"),
-    ("tuning.sensitivity", "tuning.sensitivity_report"),
-    ("tuning.ensemble", "tuning.ensemble_report"),
+    ("tuning.uncertainty.sensitivity_study", "tuning.sensitivity_report"),
+    ("tuning.uncertainty.study", "tuning.ensemble_report"),
     ("tuning.identify", "tuning.identify_report"),
 }
 

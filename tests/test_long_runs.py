@@ -242,7 +242,7 @@ def test_memory_of_a_million_draws():
 
 def test_steady_states_are_looked_for_in_blocks(monkeypatch):
     """The same answer whatever the size of a block, one that does not divide the draws too."""
-    module = importlib.import_module("tuning.ensemble")
+    module = importlib.import_module("tuning.uncertainty.study")
     case = presets.find("gouta2015/backstepping")
     draws = module.Draws(case.loop, module.spread_of(case))
     values = draws.values(module.probabilities("random", draws.dimensions, 300, 0))

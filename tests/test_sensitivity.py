@@ -19,10 +19,11 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning import cli, distributions, effects, indices, sensitivity_report
-from tuning.distributions import Discrete, LogUniform, Normal, Uniform
+from tuning import cli, sensitivity_report
 from tuning.problem.scenarios import Lane, groups_of, values_of
-from tuning.sensitivity import sensitivity, what_varies
+from tuning.uncertainty import distributions, indices, local
+from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
+from tuning.uncertainty.sensitivity_study import sensitivity, what_varies
 
 VARIED = {"plant.drain": Uniform(relative=0.05), "plant.pump_gain": LogUniform(factor=1.2)}
 D = 4
@@ -171,7 +172,7 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
 def test_local_against_central_differences(case, monkeypatch):
     """In chunks of 4 numbers; with tied entries, absolute, normal and discrete distributions. A step of 1e-5 of the half-width leaves 1e-9
     of third derivatives and 1e-11 of rounding over a slope of 1e-2 or more."""
-    monkeypatch.setattr(effects, "CHUNK", 4)
+    monkeypatch.setattr(local, "CHUNK", 4)
     loop, names = case.loop, ("rms_error_total", "max_level", "rms_input")
     varied = {
         "plant.drain": Uniform(relative=0.05),
@@ -321,7 +322,7 @@ def test_bad_input(case, options, words):
 def test_correlated_parameters_have_local_effects_only(case):
     names = ("plant.drain[0]", "plant.drain[1]")
     joint = {"fit": distributions.Correlated(names=names, covariance=((4e-4, 3e-4), (3e-4, 9e-4)))}
-    assert effects.half_widths(distributions.Draws(case.loop, joint)) == [{names[0]: 0.04}, {names[1]: pytest.approx(0.06)}]
+    assert local.half_widths(distributions.Draws(case.loop, joint)) == [{names[0]: 0.04}, {names[1]: pytest.approx(0.06)}]
     with pytest.raises(InputError, match="vary together"):
         sensitivity(case, joint, method="sobol")
 

@@ -36,8 +36,8 @@ def merge(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning.ensemble import ensemble
-    from tuning.shards import restore
+    from tuning.uncertainty.manifest import restore
+    from tuning.uncertainty.study import ensemble
 
     given = [a for a in ("values", "schedule", "dt", "spread", "vary", "measure") if getattr(args, a)]
     if given or args.samples != "1000" or args.draws != "random" or args.seed != "0":
@@ -50,7 +50,7 @@ def merge(args):
 
 
 def _ensemble(args, **options):
-    from tuning.ensemble import ensemble
+    from tuning.uncertainty.study import ensemble
 
     case = open_case(args)
     return ensemble(
@@ -95,7 +95,7 @@ def sensitivity(args):
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
     from tuning import sensitivity_report, tables
-    from tuning.sensitivity import MOST, sensitivity
+    from tuning.uncertainty.sensitivity_study import MOST, sensitivity
 
     terminal, told = sys.stderr.isatty(), [0]
 

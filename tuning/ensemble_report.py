@@ -10,8 +10,8 @@ from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
 from tuning import page, saving, search, tables
-from tuning.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 from tuning.storage import batch_store
+from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.tree import get_value, with_values
-from tuning.distributions import Correlated, Draws
 from tuning.problem import scenarios as sc
+from tuning.uncertainty.distributions import Correlated, Draws
 
 STEP = 1e-4
 """Step of the differences of the gradient, in the unit cube [-]."""

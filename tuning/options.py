@@ -85,7 +85,7 @@ def tradeoff_of(args):
 
 def distributions_of(args, case):
     """What varies, by --vary or --spread; None for the case's own."""
-    from tuning.ensemble import spread_of
+    from tuning.uncertainty.sampling import spread_of
 
     if args.vary and args.spread is not None:
         raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
@@ -104,7 +104,7 @@ def distributions_of(args, case):
 
 def _pair_of(text, case):
     """(name, distribution) of one --vary, if every draw of it is a value that the case may have."""
-    from tuning.distributions import Draws, parse
+    from tuning.uncertainty.distributions import Draws, parse
 
     name, value = pair("--vary", text, str)
     try:

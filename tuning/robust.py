@@ -10,12 +10,13 @@ from jaxtank.case import Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
-from tuning.distributions import Draws, stated
-from tuning.ensemble import clopper_pearson, ensemble, probabilities, spread_of
 from tuning.evidence import HELD_OUT, summary_of, validate
 from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
 from tuning.search import own_values, tune
+from tuning.uncertainty.distributions import Draws, stated
+from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
+from tuning.uncertainty.study import ensemble
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""

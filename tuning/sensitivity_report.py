@@ -9,8 +9,8 @@ import numpy as np
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
 from tuning import page, saving, search, tables
-from tuning.distributions import Correlated, Normal
-from tuning.effects import NORMAL_WIDTH
+from tuning.uncertainty.distributions import Correlated, Normal
+from tuning.uncertainty.local import NORMAL_WIDTH
 
 SHOWN = 8
 """Parameters in the table of a measure."""

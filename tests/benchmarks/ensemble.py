@@ -23,8 +23,8 @@ import numpy as np
 import tuning
 from jaxtank import presets, rig
 from tuning import bench
-from tuning.distributions import Draws
-from tuning.ensemble import probabilities, spread_of
+from tuning.uncertainty.distributions import Draws
+from tuning.uncertainty.sampling import probabilities, spread_of
 
 SOURCE = Path(__file__).with_name("floor_lanes.c")
 FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")

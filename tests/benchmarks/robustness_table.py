@@ -19,7 +19,7 @@ from jaxtank import presets, rig
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from tuning.ensemble import clopper_pearson
+from tuning.uncertainty.sampling import clopper_pearson
 
 N = 200
 SPREADS = (0.05, 0.10)

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import stats
 
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_flows
@@ -18,11 +17,12 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
-from tuning import shards
-from tuning.distributions import Correlated, Draws, Uniform, stated
 from tuning.problem.limits import LOWER, resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage import batch_store
+from tuning.uncertainty import manifest as shards
+from tuning.uncertainty.distributions import Draws, stated
+from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
 
 LANES = 256
 """Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
@@ -149,14 +149,6 @@ class Ensemble:
         return text(self)
 
 
-def clopper_pearson(count, samples, level=0.95):
-    """[low, high]: exact interval of a probability of which `count` of `samples` independent trials speak."""
-    tail = (1.0 - level) / 2
-    low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, samples - count + 1))
-    high = 1.0 if count == samples else float(stats.beta.ppf(1.0 - tail, count + 1, samples - count))
-    return [low, high]
-
-
 def _within(name, values, end):
     """`end` of an interval of measure `name`, moved to what the measure cannot pass (a share 0 and 1, say); values: (N, ...) that it had."""
     low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
@@ -164,36 +156,6 @@ def _within(name, values, end):
         end if low is None else np.maximum(end, np.minimum(low, values.min(axis=0)))
     )  # a value that did pass it is not argued with
     return end if high is None else np.minimum(end, np.maximum(high, values.max(axis=0)))
-
-
-def probabilities(method, dimensions, samples, seed):
-    """(samples, dimensions) points of the open unit cube: "random" (the first N are the same whatever N), "latin" or "sobol"."""
-    if method == "random":
-        return np.random.default_rng(seed).random((samples, dimensions)).clip(1e-12, 1 - 1e-12)
-    if method == "latin":
-        return stats.qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(samples)
-    if method == "sobol":
-        points = stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random_base2(
-            (samples - 1).bit_length()
-        )
-        return points[:samples].clip(1e-12, 1 - 1e-12)
-    raise InputError(f"draws = {method!r}: must be random, latin or sobol")
-
-
-def spread_of(case, share=None):
-    """{name: distribution}: what the case calls uncertain, uniform, each entry on its own, and what was identified together by its
-    covariance; share: one uniform spread for all of it, instead."""
-    if not case.uncertain and case.covariance is None:
-        raise InputError(
-            f"{case.name} names nothing uncertain: say what varies with --vary NAME=DISTRIBUTION (as plant.drain=uniform:10%), with a table "
-            '[uncertain] in the rig file (as "plant.drain" = 0.1), or in Python with distributions'
-        )
-    found = {name: Uniform(relative=own if share is None else share) for name, own in case.uncertain.items()}
-    if case.covariance is not None:
-        names, matrix = case.covariance
-        together = {"identified": Correlated(names=names, covariance=matrix)}
-        found |= together if share is None else {name: Uniform(relative=share) for name in names}
-    return found
 
 
 def ensemble(

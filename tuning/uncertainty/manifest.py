@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from tuning import distributions as ds
 from tuning.storage import batch_store
+from tuning.uncertainty import distributions as ds
 
 KINDS = {c.__name__: c for c in (ds.Uniform, ds.LogUniform, ds.Normal, ds.Discrete, ds.Correlated)}
 WORDS = {"samples": int, "key": int, "lanes": int, "draws": str, "measures": list, "distributions": dict}

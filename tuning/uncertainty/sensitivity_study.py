@@ -12,11 +12,12 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
-from tuning import indices
-from tuning.distributions import Correlated, Draws, stated
-from tuning.effects import Column, entries_of, local_columns
-from tuning.ensemble import check_devices, spread_of
 from tuning.problem import scenarios as sc
+from tuning.uncertainty import indices
+from tuning.uncertainty.distributions import Correlated, Draws, stated
+from tuning.uncertainty.local import Column, entries_of, local_columns
+from tuning.uncertainty.sampling import spread_of
+from tuning.uncertainty.study import check_devices
 
 METHODS = ("local", "morris", "sobol")
 

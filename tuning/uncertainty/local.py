@@ -8,7 +8,7 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import NonFiniteError
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
-from tuning.distributions import Correlated, Discrete, Normal
+from tuning.uncertainty.distributions import Correlated, Discrete, Normal
 
 CHUNK = 16
 """Parameters that slopes are carried of at once."""
