@@ -43,7 +43,7 @@ def prepare(cache):
     matplotlib.use("Agg")
 
     import tuning.ensemble_report
-    import tuning.identify
+    import tuning.identification.fit
     import tuning.identify_report
     import tuning.search  # noqa: F401
     from tuning import cli

@@ -16,7 +16,7 @@ import pytest
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning import cli
-from tuning.log_file import read_log
+from tuning.identification.csv_log import read_log
 
 RIGS = Path(__file__).parent / "rigs"
 WORDS = [
@@ -156,7 +156,7 @@ def refused_lines(count, seed, folder, capsys, monkeypatch):
         "tuning.robust": ("tune_robust",),
     }
     homes |= {
-        "tuning.identify": ("identify",),
+        "tuning.identification.fit": ("identify",),
         "tuning.uncertainty.sensitivity_study": ("sensitivity",),
         "jaxtank.export.source": ("export",),
     }

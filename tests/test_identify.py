@@ -17,11 +17,12 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
-from tuning import cli, identifiability, playback
-from tuning.coordinates import coordinates
-from tuning.experiments import candidates, compare_experiments, settled
+from tuning import cli
+from tuning.identification import confidence, simulation
+from tuning.identification.design import candidates, compare_experiments, settled
+from tuning.identification.parametrisation import coordinates
+from tuning.identification.proposal import with_pi
 from tuning.problem.bounds import bounds
-from tuning.proposal import with_pi
 from tuning.uncertainty.distributions import Draws
 from tuning.uncertainty.sampling import spread_of
 
@@ -53,7 +54,9 @@ def played(case, t, u, x0, substeps=4, channels=None):
     u = np.asarray(u, dtype=float).reshape(len(t), -1)
     step = np.append(np.diff(t), 0.0)[None]
     return np.asarray(
-        playback.play(playback.rig_of(case.loop), step, u[None], np.asarray(x0, float)[None], channels=channels, substeps=substeps)
+        simulation.play(
+            simulation.rig_of(case.loop), step, u[None], np.asarray(x0, float)[None], channels=channels, substeps=substeps
+        )
     )[0]
 
 
@@ -344,12 +347,12 @@ def slopes_of(case, names, t, u, x0, channels, tanks=()):
     free = {n: (v - 0.05 * abs(v), v + 0.05 * abs(v), "linear") for n, v in zip(names, truth(case, names))}
 
     moved = coordinates(bounds(case.loop, free))
-    p, played_rig = moved.point(dict(zip(names, truth(case, names)))), playback.rig_of(case.loop)
+    p, played_rig = moved.point(dict(zip(names, truth(case, names)))), simulation.rig_of(case.loop)
     step, x0 = np.append(np.diff(t), 0.0)[None], np.asarray(x0, float)
     own = x0[list(tanks)][None] if tanks else np.zeros((1, 0))
     played_rig = with_values(played_rig, {"x0": x0})
     options = {"coordinates": moved, "tanks": tuple(tanks), "channels": channels, "substeps": 4}
-    at = lambda q: playback.passes(played_rig, step, u[None], q[: len(p)], q[None, len(p) :], **options)
+    at = lambda q: simulation.passes(played_rig, step, u[None], q[: len(p)], q[None, len(p) :], **options)
     q = np.concatenate([p, own[0]])
     exact = np.asarray(at(q)[1])[0]
     h = 1e-6
@@ -411,9 +414,9 @@ def test_a_run_played_back_is_the_run(name, values):
     one = rig.set_values(one, values | short)
     run = jaxtank.simulate(one.loop, one.clock)
     log = tuning.log(t=np.asarray(run.t), u=np.asarray(run.applied), y=np.asarray(run.x))
-    record = playback.record([log], float(one.loop.actuator.delay))
-    told = playback.play(
-        playback.rig_of(one.loop),
+    record = simulation.record([log], float(one.loop.actuator.delay))
+    told = simulation.play(
+        simulation.rig_of(one.loop),
         record.dt,
         record.u,
         np.asarray(one.loop.x0)[None],
@@ -428,9 +431,9 @@ def test_a_run_played_back_is_the_run(name, values):
         cut = log.part(lead, log.samples)
         shifted = record.u[0, lead:]
         again = tuning.log(t=cut.t, u=shifted, y=cut.y)
-        record = playback.record([again], 0.0)
-        told = playback.play(
-            playback.rig_of(one.loop), record.dt, record.u, start[None], channels=record.channels, substeps=one.clock.substeps
+        record = simulation.record([again], 0.0)
+        told = simulation.play(
+            simulation.rig_of(one.loop), record.dt, record.u, start[None], channels=record.channels, substeps=one.clock.substeps
         )
         np.testing.assert_allclose(np.asarray(told)[0], cut.y, rtol=1e-9, atol=1e-9)
         assert not np.allclose(np.diff(cut.y, axis=0), 0)
@@ -462,9 +465,9 @@ def test_uneven_times_and_logs_of_two_lengths(case, away):
 def test_a_record_shifted_by_the_delay_of_the_pumps():
     """By hand: samples every 2 s, 3 s of delay: an input reaches the tank at the first sample at least as late, the first one before."""
     log = tuning.log(t=[0.0, 2, 4, 6, 8], u=[1.0, 2, 3, 4, 5], y=np.zeros(5))
-    np.testing.assert_array_equal(playback.record([log], 3.0).u[0, :, 0], [1, 1, 1, 2, 3])
-    np.testing.assert_array_equal(playback.record([log], 4.0).u[0, :, 0], [1, 1, 1, 2, 3])
-    np.testing.assert_array_equal(playback.record([log]).u[0, :, 0], [1, 2, 3, 4, 5])
+    np.testing.assert_array_equal(simulation.record([log], 3.0).u[0, :, 0], [1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(simulation.record([log], 4.0).u[0, :, 0], [1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(simulation.record([log]).u[0, :, 0], [1, 2, 3, 4, 5])
 
 
 def test_correlation_of_residuals_against_sums_over_pairs():
@@ -472,10 +475,10 @@ def test_correlation_of_residuals_against_sums_over_pairs():
     rng = np.random.default_rng(0)
     r = rng.standard_normal((2, 50))
     r[rng.random(r.shape) < 0.1] = np.nan
-    found = identifiability.autocorrelation(r, 10)
+    found = confidence.autocorrelation(r, 10)
     for k in range(1, 11):
         assert found[k] == pytest.approx(np.nanmean(r[:, k:] * r[:, :-k]) / np.nanmean(r**2), rel=1e-9)
-    np.testing.assert_array_equal(identifiability.autocorrelation(np.zeros((1, 20)), 3), [1, 0, 0, 0])
+    np.testing.assert_array_equal(confidence.autocorrelation(np.zeros((1, 20)), 3), [1, 0, 0, 0])
 
 
 def test_a_reading_that_never_moves_has_no_fit_percent(case, away, clean):
@@ -602,7 +605,7 @@ def test_a_split_that_does_nothing_is_no_unknown():
 
 
 def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
-    from tuning import playback as pb
+    from tuning.identification import simulation as pb
 
     rig_of, x0 = pb.rig_of(case.loop), np.zeros((1, 4))
     dt = np.append(np.ones(50), 0.0)[None]

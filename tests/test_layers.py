@@ -76,7 +76,7 @@ DOORS = {
     ("tuning.result", "tuning.tune_report"),
     ("tuning.uncertainty.sensitivity_study", "tuning.sensitivity_report"),
     ("tuning.uncertainty.study", "tuning.ensemble_report"),
-    ("tuning.identify", "tuning.identify_report"),
+    ("tuning.identification.fit", "tuning.identify_report"),
 }
 
 

@@ -16,7 +16,7 @@ import tuning
 from jaxtank import rig
 from jaxtank.plots import responses
 from tuning import cli, compare, page, pictures, tables
-from tuning.log_file import read_log
+from tuning.identification.csv_log import read_log
 
 NASTY = "a <b>\"rig\"</b> & $\\x{$ 'y' </style><script>alert(1)</script>"
 KINDS = ("tune", "uncertainty", "sensitivity", "identify", "compare")

@@ -18,7 +18,7 @@ import tuning
 from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import DataError, InputError
-from tuning import log_file
+from tuning.identification import csv_log
 from tuning.storage import batch_store, evaluation_log
 
 ROOT = Path(__file__).parents[1]
@@ -66,7 +66,7 @@ READ = {
     ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",
-    ("tuning.log_file", "_text", "read_bytes"): "after `refusal`",
+    ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
     ("tuning.storage.evaluation_log", "keep", "open"): "to write",
@@ -156,7 +156,7 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
         with pytest.raises(InputError, match=says):
             files.read_text(folder / "rig.toml", "rig file")
         with pytest.raises(DataError, match=says):
-            log_file.read_log(folder / "log.csv", loop)
+            csv_log.read_log(folder / "log.csv", loop)
 
 
 def header(shape):

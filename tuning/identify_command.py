@@ -74,8 +74,8 @@ def run(args):
     if not args.data:
         raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
     from tuning import identify_report, tables
-    from tuning.identify import identify
-    from tuning.log_file import read_log
+    from tuning.identification.csv_log import read_log
+    from tuning.identification.fit import identify
     from tuning.storage.evaluation_log import discard
 
     given = arguments.once("--column", [arguments.pair("--column", text, _column) for text in args.column])
@@ -188,7 +188,7 @@ def plan(args, case, free):
     import numpy as np
 
     from tuning import tables
-    from tuning.experiments import compare_experiments, most_telling
+    from tuning.identification.design import compare_experiments, most_telling
 
     duration = 300.0 if args.duration is None else arguments.number("--duration", args.duration)
     if not 0 < duration <= LONGEST:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.core.files import check_folder
 from jaxtank.core.units import local
-from tuning import identifiability as idf
 from tuning import page, pictures, saving, search, tables
-from tuning.identify import stopped
+from tuning.identification import confidence as idf
+from tuning.identification.confidence import stopped
 
 FEW = 0.5
 """Share of the starts that must agree for the answer not to say that few did."""

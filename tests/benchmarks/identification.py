@@ -16,7 +16,7 @@ jax.config.update("jax_enable_x64", True)
 import tuning  # noqa: E402
 from jaxtank import presets  # noqa: E402
 from jaxtank.core.tree import get_value  # noqa: E402
-from tuning import playback  # noqa: E402
+from tuning.identification import simulation  # noqa: E402
 
 FREE = ("plant.pump_gain[0]", "plant.pump_gain[1]", "plant.drain[0]", "plant.drain[1]", "plant.orifice[0]")
 """Five coefficients, as in methods 1.5; with four levels at the start that makes nine unknowns."""
@@ -33,7 +33,7 @@ def logs_of(case, count, noise=0.1, samples=1201, seed=0):
     channels = tuple((i, False) for i in range(4))
     x0 = np.array([[10.0, 9.0, 8.0, 7.0]])
     dt = np.append(np.diff(t), 0.0)
-    y = np.asarray(playback.play(playback.rig_of(case.loop), dt[None], u[None], x0, channels=channels, substeps=4))[0]
+    y = np.asarray(simulation.play(simulation.rig_of(case.loop), dt[None], u[None], x0, channels=channels, substeps=4))[0]
     return [tuning.log(t=t, u=u, y=y + noise * rng.standard_normal(y.shape), name=f"log {e + 1}") for e in range(count)], x0[0]
 
 

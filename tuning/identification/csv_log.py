@@ -11,7 +11,7 @@ import numpy as np
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
 from jaxtank.core.text import printable
-from tuning.logs import FLOWS, LENGTHS, VOLTS, log
+from tuning.identification.experiment import FLOWS, LENGTHS, VOLTS, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000

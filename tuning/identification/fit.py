@@ -11,13 +11,13 @@ from scipy.stats import chi2
 
 import jaxtank
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.tree import describe
 from jaxtank.plants.base import Plant
-from tuning import identifiability as idf
-from tuning import logs as lg
-from tuning.estimation import Estimation, Fit, check_length
-from tuning.identified import bare, proposed
-from tuning.proposal import check_law
+from tuning.identification import confidence as idf
+from tuning.identification import experiment as lg
+from tuning.identification.confidence import stopped
+from tuning.identification.identified_case import bare, proposed
+from tuning.identification.problem import Estimation, Fit, check_length
+from tuning.identification.proposal import check_law
 from tuning.storage.batch_store import digest
 from tuning.storage.evaluation_log import Log, Memo
 
@@ -252,18 +252,6 @@ def _problem(case, logs, partial, options):
         "jaxtank": jaxtank.__version__,
         "jax": jax.__version__,
     }
-
-
-def stopped(loop, parameters):
-    """Names of the parameters that ended at a bound of their search which is not one of nature, as 0 or 1 for a share."""
-    names = []
-    for name, p in parameters.items():
-        meta = describe(loop, name)
-        ends = [v for v in (meta["low"], meta["high"]) if v is not None]
-        reach = 1e-5 * (p["upper"] - p["lower"])
-        if p["at_bound"] and not any(abs(p["value"] - end) <= reach for end in ends):
-            names.append(name)
-    return names
 
 
 def _within(estimation, fit):

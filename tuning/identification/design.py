@@ -4,8 +4,8 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
-from tuning import playback as pb
-from tuning.coordinates import coordinates, nominal, usual
+from tuning.identification import simulation as pb
+from tuning.identification.parametrisation import coordinates, nominal, usual
 
 REGISTER = 7
 """Length of the shift register of the pseudo-random binary sequence: 127 bits, different for each pump."""

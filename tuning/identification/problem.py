@@ -9,8 +9,8 @@ from scipy.stats import qmc
 
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import split_index, with_values
-from tuning import playback as pb
-from tuning.coordinates import coordinates, nominal, usual
+from tuning.identification import simulation as pb
+from tuning.identification.parametrisation import coordinates, nominal, usual
 from tuning.problem.bounds import bounds
 
 ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")

@@ -38,7 +38,7 @@ def proposed(result):
     case = identified_plant(result)
     if result.law is None:
         return case, None
-    from tuning.proposal import with_pi
+    from tuning.identification.proposal import with_pi
 
     logs = result.estimation.logs
     inputs = np.concatenate([one.u for one in logs]).mean(axis=0)

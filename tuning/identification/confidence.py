@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import t as student
 
 from jaxtank.core.tree import describe, get_value
-from tuning import playback as pb
+from tuning.identification import simulation as pb
 
 VAGUE = 0.5
 """Standard deviation of a direction, in units of its coordinates (logarithms, shares of a range), at which nothing is known of it."""
@@ -342,7 +342,7 @@ def held_back(estimation, partial, fit, kept):
 
 def remedies(estimation, fit, spread):
     """Words: which experiment would tell what these data leave open, found by asking the model for its sensitivities there."""
-    from tuning import experiments as ex
+    from tuning.identification import design as ex
 
     z = estimation.unknowns(fit)
     found = []
@@ -395,3 +395,15 @@ def profile(estimation, fit, spread, loss="linear", points=11, reach=3.0):
     if ends[0] is not None and ends[1] is not None:
         ends = sorted(ends)
     return {"name": name, "unit": unit, "values": values.tolist(), "rise": rise.tolist(), "interval95": ends}
+
+
+def stopped(loop, parameters):
+    """Names of the parameters that ended at a bound of their search which is not one of nature, as 0 or 1 for a share."""
+    names = []
+    for name, p in parameters.items():
+        meta = describe(loop, name)
+        ends = [v for v in (meta["low"], meta["high"]) if v is not None]
+        reach = 1e-5 * (p["upper"] - p["lower"])
+        if p["at_bound"] and not any(abs(p["value"] - end) <= reach for end in ends):
+            names.append(name)
+    return names

@@ -11,10 +11,10 @@ from scipy.stats import t as student
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from tuning import logs as lg
-from tuning import playback as pb
-from tuning.estimation import Estimation, check_length
-from tuning.identifiability import ROUND_OFF, VAGUE
+from tuning.identification import experiment as lg
+from tuning.identification import simulation as pb
+from tuning.identification.confidence import ROUND_OFF, VAGUE
+from tuning.identification.problem import Estimation, check_length
 
 ROOM = 256 * 2**20
 """Bytes of slopes held at once: the logs go through in shares that fit."""

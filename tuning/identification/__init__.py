@@ -1,0 +1,1 @@
+"""Plant parameters from experiment data, with intervals, and which experiment to make."""
