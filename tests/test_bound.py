@@ -11,10 +11,10 @@ from scipy.optimize import lsq_linear, minimize
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from tuning.bound import bound
-from tuning.input_search import TOLERANCE, InputSearch
-from tuning.inputs import open_loop, value_and_gradient
-from tuning.projected import minimise
+from tuning.optimal_input.cost import open_loop, value_and_gradient
+from tuning.optimal_input.lbfgsb import minimise
+from tuning.optimal_input.perfect_information import bound
+from tuning.optimal_input.search import TOLERANCE, InputSearch
 
 
 def short(paper, name, values=None, duration=60.0):

@@ -450,5 +450,5 @@ def test_functions_keep_their_names_beside_their_modules():
     import importlib
 
     importlib.import_module("tuning.tradeoff")
-    importlib.import_module("tuning.bound")
+    importlib.import_module("tuning.optimal_input.perfect_information")
     assert callable(tuning.tradeoff) and callable(tuning.bound)

@@ -26,7 +26,7 @@ _HOMES = {
     "LogUniform": "tuning.uncertainty.distributions",
     "Normal": "tuning.uncertainty.distributions",
     "Uniform": "tuning.uncertainty.distributions",
-    "bound": "tuning.bound",
+    "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",
     "Identifications": "tuning.identification.batch",

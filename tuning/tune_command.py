@@ -83,7 +83,7 @@ def _tune(args):
         with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
             result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, progress=progress.check, **options))
     if args.bound and not progress.stop and result.status != "interrupted":
-        from tuning.bound import bound
+        from tuning.optimal_input.perfect_information import bound
 
         result = result.replace(bound=bound(result.tuned, objective, limits, progress=progress.check))
     args.out = folder

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import NonFiniteError
 from jaxtank.loop import run as lp
-from tuning.input_search import InputSearch
-from tuning.inputs import open_loop
+from tuning.optimal_input.cost import open_loop
+from tuning.optimal_input.search import InputSearch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

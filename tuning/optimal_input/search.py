@@ -11,9 +11,9 @@ from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import number
 from jaxtank.loop import run as lp
 from jaxtank.rig import check_objective
-from tuning.inputs import RUNNING, Held, Terms, look, open_loop, value_and_gradient
+from tuning.optimal_input.cost import RUNNING, Held, Terms, look, open_loop, value_and_gradient
+from tuning.optimal_input.lbfgsb import minimise
 from tuning.problem.limits import resolve_limits
-from tuning.projected import minimise
 
 SUMS = {"e2", "abs_e", "u2", "over_rim2", "spilled", "shortfall", "travel", "saturation_excess", "deviation2", "changes2", "past2"}
 """Accumulators that are sums over the run with a slope in every input: measures of these alone can be made small, or be limited."""

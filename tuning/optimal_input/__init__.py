@@ -1,0 +1,1 @@
+"""The perfect-information open-loop optimum: the best inputs when the whole run is known in advance."""
