@@ -45,7 +45,7 @@ def prepare(cache):
     import tuning.ensemble_report
     import tuning.identification.fit
     import tuning.identify_report
-    import tuning.search  # noqa: F401
+    import tuning.search.tuner  # noqa: F401
     from tuning import cli
 
     jax.config.update("jax_compilation_cache_dir", cache)

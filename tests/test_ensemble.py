@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
-from tuning import evidence, robust
+from tuning.search import diagnostics, robust
 from tuning.storage import batch_store
 from tuning.uncertainty import manifest
 from tuning.uncertainty.distributions import Draws, parse, stated
@@ -447,7 +447,7 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
     assert all(c["margin"] >= 0 for c in result.constraints) and "5 % off every limit" in result.message
     costs, held = np.zeros((48, 2)), np.zeros((48, 2), dtype=bool)
     for side, there in enumerate((result.case, result.tuned)):
-        seen = tuning.ensemble(there, samples=48, key=evidence.HELD_OUT, measures=("rms_error_total", "max_level"), fan=False)
+        seen = tuning.ensemble(there, samples=48, key=diagnostics.HELD_OUT, measures=("rms_error_total", "max_level"), fan=False)
         costs[:, side] = seen.measures["rms_error_total"]
         held[:, side] = (seen.measures["max_level"] <= options["limits"]["max_level"]).all(axis=1)
     assert result.certificate.broken == (~held[:, 1]).sum() < (~held[:, 0]).sum()

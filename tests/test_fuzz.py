@@ -151,9 +151,9 @@ def refused_lines(count, seed, folder, capsys, monkeypatch):
         raise InputError("would run")
 
     homes = {
-        "tuning.search": ("tune", "run_measures"),
+        "tuning.search.tuner": ("tune", "run_measures"),
         "tuning.uncertainty.study": ("ensemble",),
-        "tuning.robust": ("tune_robust",),
+        "tuning.search.robust": ("tune_robust",),
     }
     homes |= {
         "tuning.identification.fit": ("identify",),

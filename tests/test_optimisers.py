@@ -13,7 +13,8 @@ from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import rough_clock
-from tuning.solvers import METHODS, Search
+from tuning.search.driver import Search
+from tuning.search.methods import METHODS
 
 SQUARES = {"ise": 1.0, "input_deviation": 3.0, "mean_square_travel": 100.0}
 

@@ -8,7 +8,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.presets import Scenario
 from tuning import report
-from tuning.robust import Certificate, _words
+from tuning.search.robust import Certificate, _words
 
 SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}
 RESTS = "; the other rows: the case's own run, on its own plant"

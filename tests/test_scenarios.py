@@ -12,10 +12,10 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.presets import Mirror, Scenario
-from tuning import evidence, solvers
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
-from tuning.solvers import Search
+from tuning.search import diagnostics, methods
+from tuning.search.driver import Search
 
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 SQUARES = {"mean_square_error": 1.0, "mean_square_travel": 5.0}
@@ -282,12 +282,12 @@ def test_scenarios_that_cannot_be_run_are_refused(case, scenarios, words):
 def test_validation_is_of_runs_the_search_never_saw(case):
     case = case.replace(uncertain={"plant.drain": 0.1})
     problem = Problem(case, scenarios=SEVERAL[:2], seed=0)
-    lanes = evidence.perturbed(problem, 6, 0)
+    lanes = diagnostics.perturbed(problem, 6, 0)
     drains = np.array([lane.case.loop.plant.drain for lane in lanes])
     base = np.array([problem.lanes[i % 2].case.loop.plant.drain for i in range(6)])
     assert len(np.unique(drains[:, :2])) == 12 and 0.05 < np.abs(drains[:, :2] / base[:, :2] - 1).max() <= 0.1
     own, tuned = {"controller.k": 0.03, "controller.k1": 0.088}, {"controller.k": 0.3, "controller.k1": 0.2}
-    found, cloud = evidence.validate(problem, own, tuned, 6, 0)
+    found, cloud = diagnostics.validate(problem, own, tuned, 6, 0)
     costs = []
     for lane in lanes:
         costs.append(
@@ -305,7 +305,7 @@ def test_validation_is_of_runs_the_search_never_saw(case):
     assert found["objective"]["after"]["p50"] == pytest.approx(np.median(costs[:, 1]), rel=1e-9)
     assert found["better_share"] == np.mean(costs[:, 1] < costs[:, 0]) and found["failed"] == 0
     np.testing.assert_allclose(cloud["objective"], costs, rtol=1e-9)
-    assert found == evidence.validate(problem, own, tuned, 6, 0)[0] != evidence.validate(problem, own, tuned, 6, 1)[0]
+    assert found == diagnostics.validate(problem, own, tuned, 6, 0)[0] != diagnostics.validate(problem, own, tuned, 6, 1)[0]
 
 
 class Quadratic:
@@ -330,7 +330,7 @@ def test_curvature_and_the_flattest_direction():
     problem = Quadratic([[4.0, -1.9], [-1.9, 1.0]], [0.5, 0.5])
     best = problem.point(np.array([0.5, 0.5]))
     search = Search(problem, best, lambda s: None)
-    found = evidence.curvature(problem, search, best)
+    found = diagnostics.curvature(problem, search, best)
     values, vectors = np.linalg.eigh(problem.H)
     np.testing.assert_allclose(found["eigenvalues"], values, rtol=1e-6)
     first = np.array([found["directions"][0][n] for n in ("k", "l")])
@@ -340,7 +340,7 @@ def test_curvature_and_the_flattest_direction():
     assert found["flattest"]["changes_percent"] == pytest.approx(50 * said @ problem.H @ said, rel=1e-9)
     assert 50 * said @ problem.H @ said == pytest.approx(50 * step @ problem.H @ step, rel=0.05)  # what rounding may cost
     assert found["flattest"]["factors"]["l"] == 1.1
-    words = evidence.flat_words(problem, found)
+    words = diagnostics.flat_words(problem, found)
     assert "k x 1.0" in words and "l x 1.1" in words
 
 
@@ -353,7 +353,7 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
         tuning.Bound("controller.k1", 0.0, 5.0, "linear", "-"),
     ]
     best = problem.point(np.array([0.5, 0.5]))
-    words = evidence.flat_words(problem, evidence.curvature(problem, Search(problem, best, lambda s: None), best))
+    words = diagnostics.flat_words(problem, diagnostics.curvature(problem, Search(problem, best, lambda s: None), best))
     said = re.fullmatch(
         r"flattest direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective by (\S+) %", words
     )
@@ -368,7 +368,7 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
 def test_directions_that_limits_hold_are_left_out():
     problem = Quadratic([[2.0, 0.0], [0.0, 6.0]], [0.9, 0.5], a=[[1.0, 0.0]], b=[0.5])
     at = problem.point(np.array([0.5, 0.5]))
-    found = evidence.curvature(problem, Search(problem, at, lambda s: None), at)
+    found = diagnostics.curvature(problem, Search(problem, at, lambda s: None), at)
     np.testing.assert_allclose(found["eigenvalues"], [6.0 / at.cost], rtol=1e-6)
 
 
@@ -377,14 +377,14 @@ def test_the_least_violation_of_limits_that_exclude_each_other():
     problem = Quadratic(np.eye(2), [0.1, 0.2], a=[[1.0, 0.0], [-1.0, 0.0]], b=[0.3, -0.7])
     search = Search(problem, problem.point(np.array([0.1, 0.2])), lambda s: None)
     search.take(search.last_finite)
-    solvers.restore(search, np.array([0.1, 0.2]), 50)
+    methods.restore(search, np.array([0.1, 0.2]), 50)
     assert search.violation(search.best) == pytest.approx(0.2, abs=1e-5)
 
 
 def test_trf_on_a_quadratic_is_one_step_from_its_answer():
     problem = Quadratic([[4.0, -1.9], [-1.9, 1.0]], [0.4, 0.7])
     search = Search(problem, problem.point(np.array([0.2, 0.2])), lambda s: None)
-    assert solvers.trf(search, np.array([0.2, 0.2]), 20)
+    assert methods.trf(search, np.array([0.2, 0.2]), 20)
     np.testing.assert_allclose(search.best.z, (0.4, 0.7), atol=1e-5)
     assert len(search.history) < 12
 
@@ -399,9 +399,9 @@ def test_mirror_images_are_named_and_counted_once():
     # calofir notes S10: the ridge of least error
     assert 0.0205 <= min(a, b) <= 0.024 and max(a, b) >= 0.1
     # an image outside the ranges, and a case without one
-    assert evidence.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0}) is None
+    assert diagnostics.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0}) is None
     other = Problem(case.replace(mirror=Mirror("none", lambda v: {})))
-    assert evidence.mirror_of(other, [], result.problem.values(result.problem.start())) is None
+    assert diagnostics.mirror_of(other, [], result.problem.values(result.problem.start())) is None
 
 
 def test_the_trade_off_of_a_limit(case):
@@ -449,6 +449,6 @@ def test_choices_are_tried_one_by_one(case):
 def test_functions_keep_their_names_beside_their_modules():
     import importlib
 
-    importlib.import_module("tuning.tradeoff")
+    importlib.import_module("tuning.search.pareto")
     importlib.import_module("tuning.optimal_input.perfect_information")
     assert callable(tuning.tradeoff) and callable(tuning.bound)

@@ -14,9 +14,11 @@ from tuning.problem import problem as objective
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.problem.scenarios import coarse_clock
-from tuning.screening import distinct_starts, screen, sobol, spectral_radius
-from tuning.search import run_measures
-from tuning.solvers import METHODS, Search, optimality
+from tuning.search.baseline import run_measures
+from tuning.search.driver import Search
+from tuning.search.kkt import optimality
+from tuning.search.methods import METHODS
+from tuning.search.screening import distinct_starts, screen, sobol, spectral_radius
 from tuning.storage.evaluation_log import Memo
 
 LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
@@ -349,8 +351,8 @@ def test_a_slice_of_the_landscape_is_drawn_where_there_are_more_parameters(gouta
 
 def test_chatter_is_told_and_drawn(gouta):
     """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every sample."""
-    from tuning.result import message
     from tuning.saving import run_for_people
+    from tuning.search.result import message
 
     wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})
     assert np.abs(np.diff(run_for_people(wild).u, axis=0)).max() > 5.0  # and not the same sample of every pair

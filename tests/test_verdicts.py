@@ -15,7 +15,9 @@ from jaxtank.signals.setpoints import ramps
 from tuning import cli
 from tuning.problem.limits import Limit, resolve_limits, room_of
 from tuning.problem.problem import Point
-from tuning.solvers import Search, downhill, slsqp
+from tuning.search.driver import Search
+from tuning.search.kkt import downhill
+from tuning.search.methods import slsqp
 
 
 class Valley:

@@ -15,8 +15,8 @@ import types
 _HOMES = {
     "Bound": "tuning.problem.bounds",
     "Problem": "tuning.problem.problem",
-    "TuningResult": "tuning.result",
-    "Certificate": "tuning.robust",
+    "TuningResult": "tuning.search.result",
+    "Certificate": "tuning.search.robust",
     "Correlated": "tuning.uncertainty.distributions",
     "Discrete": "tuning.uncertainty.distributions",
     "Ensemble": "tuning.uncertainty.study",
@@ -34,10 +34,10 @@ _HOMES = {
     "identify_many": "tuning.identification.batch",
     "log": "tuning.identification.experiment",
     "read_log": "tuning.identification.csv_log",
-    "tune_robust": "tuning.robust",
+    "tune_robust": "tuning.search.robust",
     "sensitivity": "tuning.uncertainty.sensitivity_study",
-    "tradeoff": "tuning.tradeoff",
-    "tune": "tuning.search",
+    "tradeoff": "tuning.search.pareto",
+    "tune": "tuning.search.tuner",
 }
 
 __all__ = list(_HOMES)

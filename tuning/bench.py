@@ -17,7 +17,7 @@ from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from tuning import tables
 from tuning.manual import noisy
-from tuning.search import provenance
+from tuning.search.provenance import provenance
 
 MEASURES = ("rms_error_total", "max_level")
 CASES = ("gouta2015/backstepping", "gouta2015/ngpc", "gouta2015/backstepping-ff", "gouta2015/ngpc-boxqp")

@@ -6,6 +6,7 @@ from jaxtank.core.errors import InputError
 from tuning.arguments import open_case, whole
 from tuning.arguments import seed as seed_of
 from tuning.options import tell_written
+from tuning.search import baseline, provenance
 
 
 def list_cases(args):
@@ -80,12 +81,12 @@ def simulate(args):
 
     from jaxtank import measures as ms
     from jaxtank.loop import run, step_size
-    from tuning import manual, saving, search, tables
+    from tuning import manual, saving, tables
 
     key = jax.random.key(seed) if manual.noisy(case) else None
     if step_size.doubts(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
-    values = {m: v for m, v in search.run_measures(case.loop, case.clock, key).items()}
+    values = {m: v for m, v in baseline.run_measures(case.loop, case.clock, key).items()}
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),
@@ -93,7 +94,7 @@ def simulate(args):
         "reasons": tables.reasons(values),
         "clock": manual.clock(case.clock),
         "parameters": tables.clean(run.parameters(case.loop)),
-        "provenance": search.provenance(case, seed),
+        "provenance": provenance.provenance(case, seed),
     }
     written = saving.save_run(case, saving.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
     if args.json:

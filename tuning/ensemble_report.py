@@ -9,7 +9,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
-from tuning import page, saving, search, tables
+from tuning import page, saving, tables
+from tuning.search import provenance
 from tuning.storage import batch_store
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
@@ -34,7 +35,7 @@ def json_of(ensemble):
         "units": {m: ms.unit(m, ensemble.case.loop.units) for m in ensemble.measures},
         "violations": tables.clean(ensemble.violations()),
         "wall_s": ensemble.wall_s,
-        "provenance": search.provenance(ensemble.case, ensemble.seed),
+        "provenance": provenance.provenance(ensemble.case, ensemble.seed),
     }
     if ensemble.method != "random":
         found["intervals"] = INTERVALS
@@ -215,7 +216,7 @@ def page_of(ensemble, drawn, command=None):
         page.drawings(drawn, CAPTIONS),
         parts_of(ensemble),
         command,
-        search.provenance(ensemble.case, ensemble.seed),
+        provenance.provenance(ensemble.case, ensemble.seed),
     )
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.core.files import check_folder
 from jaxtank.core.units import local
-from tuning import page, pictures, saving, search, tables
+from tuning import page, pictures, saving, tables
 from tuning.identification import confidence as idf
 from tuning.identification.confidence import stopped
+from tuning.search import provenance
 
 FEW = 0.5
 """Share of the starts that must agree for the answer not to say that few did."""
@@ -184,7 +185,7 @@ def json_of(found):
         "data": [{"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())} for one in est.logs],
         "substeps": est.substeps,
         "wall_s": found.wall_s,
-        "provenance": search.provenance(found.case, found.seed),
+        "provenance": provenance.provenance(found.case, found.seed),
     }
 
 
@@ -305,7 +306,7 @@ def page_of(found, drawn, command=None):
         page.drawings(drawn, captions),
         [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
         command,
-        search.provenance(found.case, found.seed),
+        provenance.provenance(found.case, found.seed),
         {} if found.status == "not_identifiable" else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)},
     )
 

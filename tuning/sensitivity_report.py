@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
-from tuning import page, saving, search, tables
+from tuning import page, saving, tables
+from tuning.search import provenance
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
 
@@ -111,7 +112,7 @@ def json_of(result):
         "measures": {c.label: _column_json(result, c) for c in result.columns},
         "notes": notes_of(result),
         "wall_s": result.wall_s,
-        "provenance": search.provenance(result.case, result.seed),
+        "provenance": provenance.provenance(result.case, result.seed),
     }
 
 
@@ -269,7 +270,7 @@ def page_of(result, drawn, command=None):
         page.drawings(drawn, dict.fromkeys(drawn, TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")),
         parts_of(result)[1:],
         command,
-        search.provenance(result.case, result.seed),
+        provenance.provenance(result.case, result.seed),
     )
 
 

@@ -24,7 +24,8 @@ def tune(args):
 def _tune(args):
     seed, case = seed_of(args), open_case(args)
     from jaxtank.rig import check_objective
-    from tuning import report, search, tables
+    from tuning import report, tables
+    from tuning.search import tuner
 
     free = once("--free", [pair("--free", text, span) for text in args.free])
     objective = once("--objective", [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective])
@@ -36,9 +37,9 @@ def _tune(args):
     only = (args.samples, args.fresh, args.back_off)
     if (varied is not None or any(v is not None for v in only)) and args.robust is None:
         raise InputError("--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust")
-    finder, more = search.tune, {"choices": choices}
+    finder, more = tuner.tune, {"choices": choices}
     if args.robust is not None:
-        from tuning.robust import tune_robust
+        from tuning.search.robust import tune_robust
 
         if choices or scenarios:
             raise InputError("--robust makes scenarios of its own: no --choose and no --scenario but none beside it")
@@ -75,7 +76,7 @@ def _tune(args):
     if not args.quiet and sys.stderr.isatty():
         print(file=sys.stderr)
     if sweep and not progress.stop and result.status != "interrupted":
-        from tuning.tradeoff import tradeoff
+        from tuning.search.pareto import tradeoff
 
         answer = {n: p["after"] for n, p in result.parameters.items()}
         options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}

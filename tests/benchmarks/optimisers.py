@@ -35,8 +35,9 @@ from jaxtank.signals.setpoints import ramps
 from tuning import tables
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import rough_clock
-from tuning.screening import distinct_starts, screen
-from tuning.solvers import METHODS, Search
+from tuning.search.driver import Search
+from tuning.search.methods import METHODS
+from tuning.search.screening import distinct_starts, screen
 
 NEAR = 1e-3
 """A search has arrived within this share above the best cost found [-]."""

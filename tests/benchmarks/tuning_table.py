@@ -21,8 +21,8 @@ from tuning_rows import BOUNDS, ROWS, case_of
 import jaxtank  # noqa: F401  (before jax starts)
 import tuning
 from jaxtank.core.files import write_atomic
-from tuning import search
-from tuning.result import constraint_rows
+from tuning.search import provenance
+from tuning.search.result import constraint_rows
 
 HERE = Path(__file__).parent
 STORE, README = HERE / "tuning_table.json", HERE.parents[1] / "README.md"
@@ -108,7 +108,7 @@ def best_inputs(name):
     asked = BOUNDS[name]
     case = case_of(asked)
     found = tuning.bound(case, asked.objective, asked.limits)
-    provenance = search.provenance(case, 0)
+    provenance = provenance.provenance(case, 0)
     told = found.to_json()
     kept = ("cost", "objective", "holds", "closed_loop", "source", "interval_s", "grids", "wall_s")
     return {"case": case.name, **{n: told[n] for n in kept}, "versions": {n: provenance[n] for n in VERSIONS}}

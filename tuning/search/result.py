@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.evidence import flat_words
 from tuning.problem.problem import EXPLODED
-from tuning.solvers import SLOPING, UNSTABLE
+from tuning.search.diagnostics import flat_words
+from tuning.search.kkt import SLOPING, UNSTABLE
 from tuning.tables import ABSENT, REASONS
 
 BARELY = 0.5

@@ -30,7 +30,7 @@ def tune_choices(case, method, choices, *, log=None, resume=False, **options):
     One that holds every limit is preferred to one that does not, then the smaller violation, then the lower objective. log: folder with a log of
     its own for every combination, which resume=True continues. Raises InputError for a choice that the case cannot have.
     """
-    from tuning.search import tune
+    from tuning.search.tuner import tune
 
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:

@@ -9,8 +9,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.measures.catalogue import check_names
 from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
-from tuning.screening import best_screened, screen
-from tuning.solvers import Search, approach, restore, slsqp
+from tuning.search.driver import Search
+from tuning.search.methods import approach, restore, slsqp
+from tuning.search.screening import best_screened, screen
 
 MANY = 50
 """Values of the limit at most."""

@@ -10,10 +10,11 @@ from jaxtank.case import Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
-from tuning.evidence import HELD_OUT, summary_of, validate
 from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
-from tuning.search import own_values, tune
+from tuning.search.baseline import own_values
+from tuning.search.diagnostics import HELD_OUT, summary_of, validate
+from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
 from tuning.uncertainty.study import ensemble

@@ -1,29 +1,25 @@
 """tune: better gains for a case, found through the simulation and checked at its own step."""
 
-import hashlib
-import os
-import platform
 import time
 
 import jax
 import numpy as np
 
-import jaxtank
 from jaxtank import measures as ms
-from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
-from jaxtank.xla.flags import KEY
-from tuning import evidence
-from tuning.evidence import REPORTED
-from tuning.long_steps import of_answer
-from tuning.problem import scenarios
 from tuning.problem.problem import Problem
-from tuning.problem.scenarios import coarse_clock
-from tuning.result import STATUSES, TuningResult, constraint_rows, message
-from tuning.screening import best_screened, distinct_starts, screen
-from tuning.solvers import METHODS, SETTLED, UNSTABLE, Search, approach, downhill, minibatches, optimality, restore, slsqp
+from tuning.search import diagnostics
+from tuning.search.baseline import own_values, run_measures
+from tuning.search.diagnostics import of_answer
+from tuning.search.driver import SETTLED, Search
+from tuning.search.first_order import minibatches
+from tuning.search.kkt import UNSTABLE, downhill, optimality
+from tuning.search.methods import METHODS, approach, restore, slsqp
+from tuning.search.provenance import fingerprint, noisy, provenance
+from tuning.search.result import STATUSES, TuningResult, constraint_rows, message
+from tuning.search.screening import best_screened, distinct_starts, screen
 from tuning.storage.evaluation_log import Log
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
@@ -94,7 +90,7 @@ def tune(
         progress=progress,
     )
     if choices:
-        from tuning.choices import tune_choices
+        from tuning.search.discrete import tune_choices
 
         return tune_choices(case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
@@ -148,8 +144,8 @@ def tune(
         if search.best is not None:
             held = search.violation(search.best) == 0
             settled = held and _at_rest(search, iterations)
-            idle = evidence.unexercised(problem, search, first)
-            curved = evidence.curvature(problem, search, search.best, idle) if held else None
+            idle = diagnostics.unexercised(problem, search, first)
+            curved = diagnostics.curvature(problem, search, search.best, idle) if held else None
     except KeyboardInterrupt:
         interrupted = True
     best = search.best if search and search.best else None
@@ -158,24 +154,24 @@ def tune(
     if best is not None and np.array_equal(z, first):
         values = own_values(problem)
     values |= {n: v for (n, v), still in zip(own_values(problem).items(), idle) if still}
-    felt = [None] * len(z) if interrupted or best is None else evidence.felt(problem, z)
+    felt = [None] * len(z) if interrupted or best is None else diagnostics.felt(problem, z)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
-        tables = {"before": evidence.table_of(problem, own_values(problem)), "after": evidence.table_of(problem, values)}
+        tables = {"before": diagnostics.table_of(problem, own_values(problem)), "after": diagnostics.table_of(problem, values)}
     checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
     status = "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
     assert status in STATUSES
-    mirrored = None if interrupted or best is None else evidence.mirror_of(problem, outcomes, values)
+    mirrored = None if interrupted or best is None else diagnostics.mirror_of(problem, outcomes, values)
     validated, cloud = None, None
     if (
         validation
         and not interrupted
         and (case.uncertain or case.covariance or any(lane.key is not None for lane in problem.lanes))
     ):
-        validated, cloud = evidence.validate(problem, own_values(problem), values, validation, seed)
+        validated, cloud = diagnostics.validate(problem, own_values(problem), values, validation, seed)
     result = TuningResult(
         case=case,
         tuned=tuned,
@@ -248,11 +244,6 @@ def _find_feasible(search, zs, margins, iterations):
     return any(ended)
 
 
-def own_values(problem):
-    """{name: value} of the case itself."""
-    return {b.name: float(get_value(problem.loop, b.name)) for b in problem.bounds}
-
-
 def _check_options(**counts):
     if jax.numpy.result_type(float) != np.float64:
         raise InputError(
@@ -292,18 +283,6 @@ def _method(method, problem, batch):
             f"method {method} needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)}) in the objective: use slsqp"
         )
     return method
-
-
-def noisy(case):
-    """True if a run of the case draws noise."""
-    return scenarios.noisy(case)
-
-
-def run_measures(loop, clock, key):
-    """{measure: value} of everything that is reported of a run, and when the highest and lowest levels were reached."""
-    names = tuple(m for m in REPORTED if ms.serves(m, loop))
-    values = lp.evaluate(loop, clock, (*names, *ms.TIMES.values()), key)
-    return {m: np.asarray(v) for m, v in values.items()}
 
 
 def _outcome(search, z, count, converged):
@@ -374,49 +353,3 @@ def _reporter(progress, problem, starts):
             )
 
     return report
-
-
-def fingerprint(problem, method, options):
-    """What two runs must share for one to go on where the other ended: {what: text}."""
-    try:
-        text = rig.dump(problem.case)
-    except InputError:  # a rig of one's own, that no file describes
-        leaves, structure = jax.tree.flatten((problem.loop, problem.clock))
-        text = f"{structure} {[np.asarray(v).tolist() for v in leaves]}"
-    return {
-        "case": hashlib.sha256(text.encode()).hexdigest(),
-        "free": repr([tuple(b) for b in problem.bounds]),
-        "objective": repr(problem.objective),
-        "limits": repr([tuple(limit) for limit in problem.limits]),
-        "scenarios": repr([(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]),
-        "method": method,
-        "risk": problem.risk,
-        **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation", "tolerance")},
-        "jaxtank": jaxtank.__version__,
-        "jax": jax.__version__,
-        "xla_option": repr(KEY in os.environ.get("XLA_FLAGS", "")),
-    }
-
-
-def provenance(case, seed):
-    """Versions and settings that a result depends on."""
-    import optax
-    import scipy
-
-    return {
-        "jaxtank": jaxtank.__version__,
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "jaxlib": jax.lib.__version__,
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "optax": optax.__version__,
-        "backend": jax.default_backend(),
-        "dtype": str(jax.numpy.result_type(float)),
-        "xla_option": KEY in os.environ.get("XLA_FLAGS", ""),
-        "seed": seed,
-        "dt_s": case.clock.dt,
-        "coarse_dt_s": coarse_clock(case.clock).dt,
-        "integrator": case.clock.integrator,
-        "rims_are_physics": case.loop.plant.overflow,
-    }

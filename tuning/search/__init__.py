@@ -1,0 +1,1 @@
+"""The tuner: starts, local methods, verdicts, discrete choices, robust tuning, trade-offs."""

@@ -1,0 +1,20 @@
+"""TODO docstring of tuning.search.baseline."""
+
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.core.tree import get_value
+from jaxtank.loop import run as lp
+from tuning.search.diagnostics import REPORTED
+
+
+def own_values(problem):
+    """{name: value} of the case itself."""
+    return {b.name: float(get_value(problem.loop, b.name)) for b in problem.bounds}
+
+
+def run_measures(loop, clock, key):
+    """{measure: value} of everything that is reported of a run, and when the highest and lowest levels were reached."""
+    names = tuple(m for m in REPORTED if ms.serves(m, loop))
+    values = lp.evaluate(loop, clock, (*names, *ms.TIMES.values()), key)
+    return {m: np.asarray(v) for m, v in values.items()}

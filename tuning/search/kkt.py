@@ -1,0 +1,60 @@
+"""TODO docstring of tuning.search.kkt."""
+
+import numpy as np
+import scipy
+
+SLOPING = 0.05
+
+
+def optimality(search, point):
+    """(gradient norm, KKT residual, multipliers of the limits) at a point, all of the scaled cost per unit of z.
+
+    The residual is what is left of the gradient after the best non-negative combination of the slopes of active limits and bounds.
+    """
+    residual, multipliers = _left(search, point)
+    return float(np.linalg.norm(point.gradient / search.scale)), float(np.linalg.norm(residual)), multipliers
+
+
+def _left(search, point):
+    """(what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
+    g = point.gradient / search.scale
+    columns, owners = [], []
+    room = point.margins / search.room - search.backoff
+    for i, (m, slope) in enumerate(zip(room, point.margin_slopes / search.room[:, None])):
+        if m < 1e-4:
+            columns.append(slope)
+            owners.append(i)
+    for p, z in enumerate(point.z):
+        if z < 1e-6 or z > 1 - 1e-6:
+            columns.append(np.eye(len(g))[p] * (1.0 if z < 0.5 else -1.0))
+            owners.append(None)
+    multipliers = np.zeros(len(point.margins))
+    residual = g
+    if columns:
+        matrix = np.array(columns).T
+        found, _ = scipy.optimize.nnls(matrix, g)
+        residual = g - matrix @ found
+        for owner, value in zip(owners, found):
+            if owner is not None:
+                multipliers[owner] = value
+    return residual, multipliers
+
+
+STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+
+UNSTABLE = 1.0 / STRIDES[-1]
+
+LOWER_BY = 1e-4
+
+
+def downhill(search, point):
+    """A Point within the limits that is lower than `point` by more than the cost can be trusted to, found along the slope that is left of it;
+    None where there is none: the point is an optimum, or at a kink."""
+    residual, _ = _left(search, point)
+    if np.linalg.norm(residual) <= SLOPING:
+        return None
+    for stride in STRIDES:
+        other = search.point(point.z - stride * residual / np.linalg.norm(residual))
+        if other.finite and search.violation(other) == 0.0 and other.cost < point.cost - LOWER_BY * abs(point.cost):
+            return other
+    return None
