@@ -42,9 +42,9 @@ def prepare(cache):
 
     matplotlib.use("Agg")
 
-    import tuning.ensemble_report
     import tuning.identification.fit
-    import tuning.identify_report
+    import tuning.report.identification
+    import tuning.report.uncertainty
     import tuning.search.tuner  # noqa: F401
     from tuning import cli
 

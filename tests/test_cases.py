@@ -11,7 +11,7 @@ from jaxtank.core.tree import get_value, walk
 from jaxtank.loop.run import _evaluate
 from tuning import cli
 from tuning.bench import is_one_function
-from tuning.compare import measure
+from tuning.report.papers import measure
 
 NAMES = presets.names()
 NEW = [name for name in NAMES if not name.startswith("gouta2015")]

@@ -566,7 +566,7 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
 
 def test_distributions_are_told_in_words():
     from tuning import Correlated, Normal, Uniform
-    from tuning.ensemble_report import _words
+    from tuning.report.uncertainty import _words
 
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
     assert _words(Uniform(relative=0.1)) == "+-10 % (even)"

@@ -76,12 +76,12 @@ def test_two_draws_have_a_spread(case):
 
 
 def test_a_fan_of_some_draws_says_of_which(case, monkeypatch):
-    from tuning import ensemble_report
+    from tuning.report import uncertainty
 
     monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
     for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):
         found = tuning.ensemble(case, samples=samples, key=0)
-        drawn = ensemble_report.figures(found)
+        drawn = uncertainty.figures(found)
         title = drawn["fan"].get_suptitle() or drawn["fan"].axes[0].get_title()
         assert title == f"{case.name}: {words}"
         for figure in drawn.values():

@@ -19,7 +19,8 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
-from tuning import cli, pictures
+from tuning import cli
+from tuning.report import figures
 from tuning.storage import batch_store, evaluation_log, folder_lock
 
 HERE = Path(__file__).parent
@@ -171,7 +172,7 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     whole = old_result(folder, words, capsys)
-    plot, broken = (responses, "responses") if name == "simulate" else (pictures, "rig")
+    plot, broken = (responses, "responses") if name == "simulate" else (figures, "rig")
     usual = getattr(plot, broken)
 
     def unset(*args):

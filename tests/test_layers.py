@@ -72,11 +72,11 @@ RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for 
 # Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
 DOORS = {
     ("jaxtank.__main__", "tuning.cli"),
-    ("tuning.search.result", "tuning.report"),
-    ("tuning.search.result", "tuning.tune_report"),
-    ("tuning.uncertainty.sensitivity_study", "tuning.sensitivity_report"),
-    ("tuning.uncertainty.study", "tuning.ensemble_report"),
-    ("tuning.identification.fit", "tuning.identify_report"),
+    ("tuning.search.result", "tuning.report.tuning"),
+    ("tuning.search.result", "tuning.report.tuning_figures"),
+    ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),
+    ("tuning.uncertainty.study", "tuning.report.uncertainty"),
+    ("tuning.identification.fit", "tuning.report.identification"),
 }
 
 

@@ -12,7 +12,8 @@ import pytest
 from jaxtank import presets, rig
 from jaxtank.core.tree import walk
 from jaxtank.plots.equations import equations
-from tuning import cli, manual
+from tuning import cli
+from tuning.report import case as manual
 
 NAMES = list(
     {

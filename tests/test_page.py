@@ -15,8 +15,10 @@ import pytest
 import tuning
 from jaxtank import rig
 from jaxtank.plots import responses
-from tuning import cli, compare, page, pictures, tables
+from tuning import cli
 from tuning.identification.csv_log import read_log
+from tuning.report import figures as pictures
+from tuning.report import html, papers, tables
 
 NASTY = "a <b>\"rig\"</b> & $\\x{$ 'y' </style><script>alert(1)</script>"
 KINDS = ("tune", "uncertainty", "sensitivity", "identify", "compare")
@@ -92,7 +94,7 @@ def results(case, tmp_path_factory):
         "uncertainty": (cloud.save, ["fan", "violations", "rig"]),
         "sensitivity": (felt.save, ["tornado"]),
         "identify": (found.save, ["fit", "residuals", "rig"]),
-        "compare": (lambda *a: compare.save(pages, *a), ["rig-calofir"]),
+        "compare": (lambda *a: papers.save(pages, *a), ["rig-calofir"]),
     }
 
 
@@ -220,7 +222,7 @@ def test_ids_of_two_equal_figures_do_not_clash():
         ax.plot([0, 1], [0, 1], "o-")
         return figure
 
-    one, other = (page.svg(drawn(), name) for name in ("one", "other"))
+    one, other = (html.svg(drawn(), name) for name in ("one", "other"))
     plt.close("all")
     ids = [set(re.findall(r' id="([^"]+)"', text)) for text in (one, other)]
     assert all(ids) and not ids[0] & ids[1]
@@ -231,14 +233,14 @@ def test_a_picture_of_very_many_points_is_kept_small():
     figure, ax = plt.subplots()
     angle = np.linspace(0.0, 1000.0, 200_000)
     ax.plot(np.cos(angle) * np.sin(1.7 * angle), np.sin(3.1 * angle), linewidth=0.2)
-    text = page.svg(figure, "dense")
+    text = html.svg(figure, "dense")
     plt.close(figure)
-    assert "data:image/png" in text and len(text) < page.LARGEST
+    assert "data:image/png" in text and len(text) < html.LARGEST
 
 
 def test_compare_and_show_write_where_they_are_told(tmp_path, monkeypatch, capsys):
     row = {"quantity": "q", "unit": "m", "where": "eq. 1", "published": 1.0, "measured": 1.0, "verdict": "reproduced", "reason": ""}
-    monkeypatch.setattr(compare, "measure", lambda paper: {"paper": paper, "citation": "C", "rows": [row]})
+    monkeypatch.setattr(papers, "measure", lambda paper: {"paper": paper, "citation": "C", "rows": [row]})
     assert cli.main(["compare", "calofir", "--out", str(tmp_path / "one"), "--quiet"]) == 0
     assert {p.name for p in (tmp_path / "one").iterdir()} == {"report.html", "result.json", "rig-calofir.png"}
     assert json.loads((tmp_path / "one" / "result.json").read_text())["rows"] == [row]
@@ -255,7 +257,7 @@ def test_compare_and_show_write_where_they_are_told(tmp_path, monkeypatch, capsy
 
 def test_parts_become_tables_lists_and_paragraphs():
     table = tables.table([["x<1", 2], ["y", "-"]], ["name", "value"])
-    text = page.document("t", "", "s", True, [], [], [], ["a line", "- first", "- second", "", table, "one   two\n---------"])
+    text = html.document("t", "", "s", True, [], [], [], ["a line", "- first", "- second", "", table, "one   two\n---------"])
     read = Reader(text)
     tags = [tag for tag, _ in read.tags]
     assert tags.count("li") == 2 and tags.count("ul") == 1 and tags.count("td") == 4 and tags.count("th") == 2 and "pre" in tags
@@ -300,7 +302,7 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
     row = {"quantity": "RMS error of CHADPC against ENMPC, paper-like rig", "unit": "cm^3/(s V)", "where": "sec. 5.1, 5.3, Table 2"}
     row |= {"published": words, "measured": words, "verdict": "not reproduced", "reason": words}
     listed = row | {"published": tuple(0.123456 + k for k in range(16)), "measured": tuple(0.654321 + k for k in range(16))}
-    compare.save({"calofir": {"paper": "calofir", "citation": "C", "rows": [row, listed]}}, tmp_path)
+    papers.save({"calofir": {"paper": "calofir", "citation": "C", "rows": [row, listed]}}, tmp_path)
     whole = (tmp_path / "report.html").read_text()
     probe = "Math.max(...[...document.querySelectorAll('.scroll, main')].map(e => e.scrollWidth - e.clientWidth))"
     (tmp_path / "probe.html").write_text(whole.replace("</body>", f"<script>document.title = 'cut ' + {probe}</script></body>"))
@@ -314,8 +316,8 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
 def test_cells_of_a_table_of_texts_carry_their_headings():
     """A narrow window shows them one below the other."""
     table = tables.table([["x", 2, "w" * 80], ["y", 3, ""]], ["name", "value", 'why "so"'])
-    read = page.document("t", "", "s", True, [], [], [], [table])
+    read = html.document("t", "", "s", True, [], [], [], [table])
     assert '<div class="scroll texts">' in read and read.count('data-head="name"') == 2
     assert 'data-head="why &quot;so&quot;"' in read
-    plain = page.document("t", "", "s", True, [], [], [], [tables.table([["x", 2]], ["name", "value"])])
+    plain = html.document("t", "", "s", True, [], [], [], [tables.table([["x", 2]], ["name", "value"])])
     assert "data-head=" not in plain and '<div class="scroll">' in plain

@@ -34,7 +34,7 @@ SAME = (
 
 
 def told(result):
-    from tuning import report
+    from tuning.report import tuning as report
 
     page = report.json_of(result)
     return json.dumps({k: page[k] for k in SAME}, sort_keys=True)

@@ -7,7 +7,7 @@ import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.presets import Scenario
-from tuning import report
+from tuning.report import tuning as report
 from tuning.search.robust import Certificate, _words
 
 SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}

@@ -19,8 +19,9 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning import cli, sensitivity_report
+from tuning import cli
 from tuning.problem.scenarios import Lane, groups_of, values_of
+from tuning.report import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.sensitivity_study import sensitivity, what_varies
@@ -370,7 +371,7 @@ def test_command(tmp_path, method, samples, picture):
     assert json.loads((tmp_path / "found" / "result.json").read_text()) == said
     rows = list(csv.DictReader((tmp_path / "found" / "sensitivity.csv").open()))
     assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
-    index = sensitivity_report.HEADS[method]
+    index = sensitivity_tables.HEADS[method]
     (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
     for row in rows:
         value = said["measures"][row["measure"]]["parameters"][row["parameter"]][key]
@@ -487,7 +488,7 @@ def test_pictures():
     ],
 )
 def test_the_unit_of_a_derivative(unit, of, words):
-    assert sensitivity_report.per(unit, of) == words
+    assert sensitivity_tables.per(unit, of) == words
 
 
 def test_numbers_with_a_unit_say_it(tmp_path):

@@ -63,7 +63,7 @@ READ = {
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
-    ("tuning.saving", "save_run", "read_bytes"): "the picture that it has just drawn",
+    ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",

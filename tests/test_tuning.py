@@ -351,7 +351,7 @@ def test_a_slice_of_the_landscape_is_drawn_where_there_are_more_parameters(gouta
 
 def test_chatter_is_told_and_drawn(gouta):
     """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every sample."""
-    from tuning.saving import run_for_people
+    from tuning.report.artifacts import run_for_people
     from tuning.search.result import message
 
     wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})

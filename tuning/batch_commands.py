@@ -67,7 +67,7 @@ def _ensemble(args, **options):
 
 def _told(found, args):
     """Write, print and end with an Ensemble."""
-    from tuning import tables
+    from tuning.report import tables
 
     try:
         written = found.save(args.out, args.line) if args.out else []
@@ -94,7 +94,7 @@ def sensitivity(args):
     devices = devices_of(args)
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
-    from tuning import sensitivity_report, tables
+    from tuning.report import sensitivity_tables, tables
     from tuning.uncertainty.sensitivity_study import MOST, sensitivity
 
     terminal, told = sys.stderr.isatty(), [0]
@@ -121,6 +121,6 @@ def sensitivity(args):
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:
-        print(tables.dumps(sensitivity_report.json_of(result)) if args.json else result.text())
+        print(tables.dumps(sensitivity_tables.json_of(result)) if args.json else result.text())
     tell_written(written, args)
     return 0

@@ -11,7 +11,7 @@ from tuning.search import baseline, provenance
 
 def list_cases(args):
     from jaxtank import presets
-    from tuning import tables
+    from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
     print(tables.dumps(cases) if args.json else tables.table([[n, t] for n, t in cases.items()], ["case", ""]))
@@ -20,23 +20,25 @@ def list_cases(args):
 
 def show(args):
     case = open_case(args)
-    from tuning import manual, saving, tables
+    from tuning.report import artifacts, tables
+    from tuning.report import case as manual
 
     written = []
     if args.out:
         from pathlib import Path
 
-        from tuning import page, pictures
+        from tuning.report import figures
+        from tuning.report import html as page
 
         try:
-            drawn = pictures.rig(case.loop, None, case.name)
+            drawn = figures.rig(case.loop, None, case.name)
             alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
         except Exception as error:
-            pictures.failed("rig", error)
+            figures.failed("rig", error)
             for name in ("rig.svg", "rig.png"):  # of another rig
                 Path(args.out, name).unlink(missing_ok=True)
         else:
-            written = saving.write_files(Path(args.out), alone | saving.pngs(drawn))
+            written = artifacts.write_files(Path(args.out), alone | artifacts.pngs(drawn))
     print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
     tell_written(written, args)
     return 0
@@ -47,7 +49,7 @@ def init(args):
         raise InputError("--short and --tanks: the short file names its preset; give one of the two")
     case = open_case(args)
     from jaxtank import rig
-    from tuning import tables
+    from tuning.report import tables
 
     text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
     print(tables.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
@@ -60,14 +62,14 @@ def export_law(args):
 
     from jaxtank.export.printer import function_name
     from jaxtank.export.source import export
-    from tuning import saving, tables
+    from tuning.report import artifacts, tables
 
     text = export(case, args.lang, args.precision, args.name)
     name = args.name or function_name(case)
     if args.json:
         print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:
-        tell_written(saving.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
+        tell_written(artifacts.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
     elif not args.json:
         print(text, end="")
     return 0
@@ -81,7 +83,8 @@ def simulate(args):
 
     from jaxtank import measures as ms
     from jaxtank.loop import run, step_size
-    from tuning import manual, saving, tables
+    from tuning.report import artifacts, tables
+    from tuning.report import case as manual
 
     key = jax.random.key(seed) if manual.noisy(case) else None
     if step_size.doubts(case.loop, case.clock):
@@ -96,7 +99,7 @@ def simulate(args):
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
-    written = saving.save_run(case, saving.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
+    written = artifacts.save_run(case, artifacts.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
     if args.json:
         print(tables.dumps(payload))
     else:
@@ -116,7 +119,8 @@ def compare(args):
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import presets
-    from tuning import compare, tables
+    from tuning.report import papers as compare
+    from tuning.report import tables
 
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
@@ -140,7 +144,8 @@ def bench(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning import bench, tables
+    from tuning import bench
+    from tuning.report import tables
 
     if args.cases:
         from jaxtank import presets, rig

@@ -73,9 +73,9 @@ def run(args):
             raise InputError(f"{option} {given!r}: is of an experiment that is planned, with --plan")
     if not args.data:
         raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
-    from tuning import identify_report, tables
     from tuning.identification.csv_log import read_log
     from tuning.identification.fit import identify
+    from tuning.report import identification, tables
     from tuning.storage.evaluation_log import discard
 
     given = arguments.once("--column", [arguments.pair("--column", text, _column) for text in args.column])
@@ -128,7 +128,7 @@ def run(args):
         print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in written), file=sys.stderr)
         tell_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
-        words = "; ".join(f"cannot tell {identify_report.untold(d)}" for d in found.directions)
+        words = "; ".join(f"cannot tell {identification.untold(d)}" for d in found.directions)
         print(f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written; {_advice(found, free)}", file=sys.stderr)
     elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
         print(_next(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
@@ -187,8 +187,8 @@ def plan(args, case, free):
         raise InputError(f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)")
     import numpy as np
 
-    from tuning import tables
     from tuning.identification.design import compare_experiments, most_telling
+    from tuning.report import tables
 
     duration = 300.0 if args.duration is None else arguments.number("--duration", args.duration)
     if not 0 < duration <= LONGEST:

@@ -32,9 +32,9 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
-from tuning import tables
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import rough_clock
+from tuning.report import tables
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS
 from tuning.search.screening import distinct_starts, screen

@@ -15,9 +15,9 @@ def table():
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import presets
-    from tuning import compare
+    from tuning.report import papers
 
-    return compare.markdown({paper: compare.measure(paper) for paper in presets.PAPERS})
+    return papers.markdown({paper: papers.measure(paper) for paper in presets.PAPERS})
 
 
 if __name__ == "__main__":

@@ -27,8 +27,9 @@ from jaxtank.core.tree import with_values
 from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.xla import flags
-from tuning import bench, tables
-from tuning.manual import noisy
+from tuning import bench
+from tuning.report import tables
+from tuning.report.case import noisy
 
 README = Path(__file__).parents[2] / "README.md"
 BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"

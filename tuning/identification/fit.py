@@ -60,35 +60,35 @@ class Identification:
     @property
     def message(self):
         """In words: how it ended."""
-        from tuning import identify_report
+        from tuning.report import identification
 
-        return identify_report.message(self)
+        return identification.message(self)
 
     def __repr__(self):
-        from tuning import identify_report
+        from tuning.report import identification
 
-        return identify_report.text(self)
+        return identification.text(self)
 
     def to_json(self):
         """The JSON object of `jaxtank identify --json`."""
-        from tuning import identify_report
+        from tuning.report import identification
 
-        return identify_report.json_of(self)
+        return identification.json_of(self)
 
     def plot(self):
         """{name: matplotlib Figure}."""
-        from tuning import identify_report
+        from tuning.report import identification
 
-        return identify_report.figures(self)
+        return identification.figures(self)
 
     def save(self, folder, command=None):
         """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and report.html; returns the paths.
 
         command: the line that made it, for the report, where there is one.
         """
-        from tuning import identify_report
+        from tuning.report import identification
 
-        return identify_report.save(self, folder, command)
+        return identification.save(self, folder, command)
 
 
 def identify(

@@ -121,3 +121,13 @@ def undefined(measure, case):
         why = f"no setpoint is stepped within its {clock.duration:g} s; add a step (reference.changes)"
         return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
     return "", [False] * ms.entries(measure, loop.plant)
+
+
+REASONS = {
+    "overshoot_percent": "the reference does not change",
+    "rise_time": "no change of the setpoint was followed to 90 % of its height",
+    "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
+    "recovery_time": "an output was still outside the band when it was watched no longer",
+}
+
+ABSENT = "the value is not a finite number"

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from tuning.problem.limits import ABSENT, REASONS
 from tuning.problem.problem import EXPLODED
 from tuning.search.diagnostics import flat_words
 from tuning.search.kkt import SLOPING, UNSTABLE
-from tuning.tables import ABSENT, REASONS
 
 BARELY = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the answer says that the parameter is barely felt."""
@@ -73,18 +73,18 @@ class TuningResult:
 
     def save(self, folder, command=None):
         """Write result.json, rig.toml, trajectory.csv, the pictures and report.html, which says the line `command`, to a folder."""
-        from tuning.tune_report import save
+        from tuning.report.tuning_figures import save
 
         return save(self, folder, command)
 
     def plot(self):
         """Matplotlib figures {name: figure}: responses before and after, convergence, landscape, and what else there is to show."""
-        from tuning.tune_report import figures
+        from tuning.report.tuning_figures import figures
 
         return figures(self)
 
     def __repr__(self):
-        from tuning.report import text
+        from tuning.report.tuning import text
 
         return text(self)
 

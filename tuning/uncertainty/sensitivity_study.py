@@ -65,25 +65,25 @@ class SensitivityResult:
 
     def to_json(self):
         """The JSON object of `jaxtank sensitivity --json`."""
-        from tuning.sensitivity_report import json_of
+        from tuning.report.sensitivity_tables import json_of
 
         return json_of(self)
 
     def text(self):
         """The result as a page of text."""
-        from tuning.sensitivity_report import text
+        from tuning.report.sensitivity_tables import text
 
         return text(self)
 
     def figures(self):
         """Matplotlib figures {"tornado" or "sobol": figure}."""
-        from tuning.sensitivity_report import figures
+        from tuning.report.sensitivity_tables import figures
 
         return figures(self)
 
     def save(self, folder, command=None):
         """Write result.json, sensitivity.csv, the picture and report.html, which says the line `command`, to a folder; returns their paths."""
-        from tuning.sensitivity_report import save
+        from tuning.report.sensitivity_tables import save
 
         return save(self, folder, command)
 

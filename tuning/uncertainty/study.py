@@ -133,18 +133,18 @@ class Ensemble:
 
     def to_json(self):
         """The JSON object of `jaxtank uncertainty --json`."""
-        from tuning.ensemble_report import json_of
+        from tuning.report.uncertainty import json_of
 
         return json_of(self)
 
     def save(self, folder, command=None):
         """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
-        from tuning.ensemble_report import save
+        from tuning.report.uncertainty import save
 
         return save(self, folder, command)
 
     def __repr__(self):
-        from tuning.ensemble_report import text
+        from tuning.report.uncertainty import text
 
         return text(self)
 

@@ -11,8 +11,8 @@ from jaxtank.core.files import check_folder, write_together
 from jaxtank.core.units import DEFAULT
 from jaxtank.interop.python_control import columns
 from jaxtank.loop import run as lp
-from tuning.pictures import failed
-from tuning.tables import dumps
+from tuning.report.figures import failed
+from tuning.report.tables import dumps
 
 
 def trajectory_csv(run, rig_units=DEFAULT):

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.problem.limits import LOWER
 from tuning.problem.problem import TAIL
-from tuning.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
+from tuning.report.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
 
 SHOWN = (
     "rms_error",

@@ -7,15 +7,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.units import DEFAULT
-
-REASONS = {
-    "overshoot_percent": "the reference does not change",
-    "rise_time": "no change of the setpoint was followed to 90 % of its height",
-    "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
-    "recovery_time": "an output was still outside the band when it was watched no longer",
-}
-
-ABSENT = "the value is not a finite number"
+from tuning.problem.limits import ABSENT, REASONS
 
 UNSERVED = {
     "overshoot_percent": "the reference has no changes that end",

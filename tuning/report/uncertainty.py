@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
-from tuning import page, saving, tables
+from tuning.report import artifacts, html, tables
 from tuning.search import provenance
 from tuning.storage import batch_store
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
@@ -152,7 +152,7 @@ def draws_csv(ensemble):
 def figures(ensemble):
     """Matplotlib figures {name: figure}: "fan" of the levels, "violations", "rig"."""
     from jaxtank.plots import responses
-    from tuning import pictures
+    from tuning.report import figures as pictures
 
     drawn = {}
     if ensemble.fan is not None:
@@ -206,14 +206,14 @@ def page_of(ensemble, drawn, command=None):
         status = f"{failed} of {ensemble.samples} runs left the numbers"
     elif any(v["count"] for v in broken):
         status = "some draws break a limit"
-    return page.document(
+    return html.document(
         f"{ensemble.case.name}: uncertainty",
         ensemble.case.title,
         status,
         status.startswith("no "),
         facts,
         said,
-        page.drawings(drawn, CAPTIONS),
+        html.drawings(drawn, CAPTIONS),
         parts_of(ensemble),
         command,
         provenance.provenance(ensemble.case, ensemble.seed),
@@ -228,8 +228,12 @@ def save(ensemble, folder, command=None):
     check_folder(folder)
     folder = Path(folder)
     files = {"result.json": tables.dumps(json_of(ensemble)) + "\n", "draws.csv": draws_csv(ensemble)}
-    written = saving.write_result(
-        folder, files, lambda: figures(ensemble), lambda drawn: page_of(ensemble, drawn, command), saving.earlier(folder, CAPTIONS)
+    written = artifacts.write_result(
+        folder,
+        files,
+        lambda: figures(ensemble),
+        lambda drawn: page_of(ensemble, drawn, command),
+        artifacts.earlier(folder, CAPTIONS),
     )
     if (folder / batch_store.MANIFEST).exists():
         for path in folder.glob("part-*.npz"):

@@ -9,9 +9,9 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
-from tuning.report import json_of, parts_of, worst_of_scenarios
-from tuning.saving import earlier, run_for_people, trajectory_csv, write_result
-from tuning.tables import dumps, number, objective_unit
+from tuning.report.artifacts import earlier, run_for_people, trajectory_csv, write_result
+from tuning.report.tables import dumps, number, objective_unit
+from tuning.report.tuning import json_of, parts_of, worst_of_scenarios
 
 
 def result_key(result):
@@ -26,7 +26,7 @@ def figures(result, runs=None):
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import responses
-    from tuning import pictures
+    from tuning.report import figures as pictures
 
     key = result_key(result)
     runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
@@ -91,7 +91,7 @@ CAPTIONS = {
 
 def page_of(result, drawn, command=None):
     """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the line that made it."""
-    from tuning import page
+    from tuning.report import html
 
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
@@ -107,14 +107,14 @@ def page_of(result, drawn, command=None):
     ]
     if np.isfinite(before) and before and not broken:
         facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
-    return page.document(
+    return html.document(
         f"{result.tuned.name}: tuned",
         result.case.title,
         result.status.replace("_", " ") + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
         facts,
         result.message.split("; "),
-        page.drawings(drawn, CAPTIONS),
+        html.drawings(drawn, CAPTIONS),
         parts_of(result)[1:],
         command,
         result.provenance,

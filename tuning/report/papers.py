@@ -14,9 +14,9 @@ from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.presets.paper import Claim
-from tuning import pictures, saving, tables
-from tuning.manual import noisy
-from tuning.page import document, drawings
+from tuning.report import artifacts, figures, tables
+from tuning.report.case import noisy
+from tuning.report.html import document, drawings
 
 QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
 
@@ -152,7 +152,7 @@ def save(pages, folder, command=None):
                 if drawing not in seen:  # cases of one paper share their rig, but for some
                     seen.append(drawing)
                     of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
-                    drawn[of] = pictures.rig(case.loop, None, f"{paper}/{name}")["rig"]
+                    drawn[of] = figures.rig(case.loop, None, f"{paper}/{name}")["rig"]
                     captions[of] = f"The rig of {paper}/{name}. {found['citation']}"
         return drawn
 
@@ -175,9 +175,9 @@ def save(pages, folder, command=None):
         )
 
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
-    stale = saving.earlier(folder, old)
+    stale = artifacts.earlier(folder, old)
     table = pages if len(pages) > 1 else next(iter(pages.values()))
-    return saving.write_result(folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale)
+    return artifacts.write_result(folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale)
 
 
 def _in_full(found):

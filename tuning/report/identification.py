@@ -8,9 +8,10 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.core.files import check_folder
 from jaxtank.core.units import local
-from tuning import page, pictures, saving, tables
 from tuning.identification import confidence as idf
 from tuning.identification.confidence import stopped
+from tuning.report import artifacts, html, tables
+from tuning.report import figures as pictures
 from tuning.search import provenance
 
 FEW = 0.5
@@ -296,14 +297,14 @@ def page_of(found, drawn, command=None):
         facts.append((f"residual of {name}", f"{rmse:.3g} {unit}" + ("" if share is None else f" ({share:.1f} %)")))
     captions = {n: CAPTIONS[n.split("_")[0]] for n in drawn}
     said = message(found)
-    return page.document(
+    return html.document(
         f"{found.case.name}: identified",
         ", ".join(one.name for one in found.estimation.logs),
         found.status.replace("_", " "),
         found.status == "converged",
         facts,
         said.split("; "),
-        page.drawings(drawn, captions),
+        html.drawings(drawn, captions),
         [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
         command,
         provenance.provenance(found.case, found.seed),
@@ -320,12 +321,12 @@ def save(found, folder, command=None):
     files = {"result.json": tables.dumps(json_of(found)), "fit.csv": fit_csv(found)}
     if identifiable(found):
         files["rig.toml"] = rigs.dump(found.identified)
-    stale = [*_left_over(Path(folder), files), *saving.earlier(folder, ["residuals", "rig"])]
+    stale = [*_left_over(Path(folder), files), *artifacts.earlier(folder, ["residuals", "rig"])]
 
     def draw():
         return figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
 
-    return saving.write_result(folder, files, draw, lambda drawn: page_of(found, drawn, command), stale)
+    return artifacts.write_result(folder, files, draw, lambda drawn: page_of(found, drawn, command), stale)
 
 
 def _left_over(folder, files):

@@ -7,7 +7,7 @@ import html
 import io
 import re
 
-from tuning.pictures import failed
+from tuning.report.figures import failed
 
 LARGEST = 500_000
 """Characters of one picture as lines, above which its dense lines become dots of a fixed number."""

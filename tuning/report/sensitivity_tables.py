@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
-from tuning import page, saving, tables
+from tuning.report import artifacts, html, tables
 from tuning.search import provenance
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
@@ -258,7 +258,7 @@ def page_of(result, drawn, command=None):
     facts = [("parameters", str(len(result.parameters))), ("runs", str(result.runs)), ("time", f"{result.wall_s:.1f} s")]
     if first is not None:
         facts.insert(0, (f"what moves {first.label} most", result.parameters[result.order(first)[0]]))
-    return page.document(
+    return html.document(
         f"{result.case.name}: sensitivity",
         result.case.title,
         f"{result.method}: {result.failed} runs stopped being finite"
@@ -267,7 +267,7 @@ def page_of(result, drawn, command=None):
         not result.failed,
         facts,
         notes_of(result),
-        page.drawings(drawn, dict.fromkeys(drawn, TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")),
+        html.drawings(drawn, dict.fromkeys(drawn, TITLES[result.method][0].upper() + TITLES[result.method][1:] + ".")),
         parts_of(result)[1:],
         command,
         provenance.provenance(result.case, result.seed),
@@ -281,5 +281,5 @@ def save(result, folder, command=None):
     """
     check_folder(folder)
     files = {"result.json": tables.dumps(json_of(result)) + "\n", "sensitivity.csv": table_csv(result)}
-    stale = saving.earlier(folder, ["tornado", "sobol"])
-    return saving.write_result(folder, files, lambda: figures(result), lambda drawn: page_of(result, drawn, command), stale)
+    stale = artifacts.earlier(folder, ["tornado", "sobol"])
+    return artifacts.write_result(folder, files, lambda: figures(result), lambda drawn: page_of(result, drawn, command), stale)
