@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, walk
 from jaxtank.loop.run import _evaluate
 from tuning import cli
-from tuning.bench import is_one_function
+from tuning.bench.bench import is_one_function
 from tuning.report.papers import measure
 
 NAMES = presets.names()

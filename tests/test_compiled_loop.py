@@ -18,7 +18,7 @@ from jaxtank.loop.run import _evaluate, evaluate_for_reverse
 from jaxtank.xla import flags as _xla
 from jaxtank.xla import hoist
 from jaxtank.xla.barrier import materialised
-from tuning import bench
+from tuning.bench import bench
 
 MEASURES = ("rms_error_total", "max_level")
 ONE_FUNCTION = 'xla_cpu_small_call="true"'

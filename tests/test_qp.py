@@ -323,7 +323,7 @@ def test_the_loop_of_a_large_programme_is_one_compiled_function():
     discretised, there is some."""
     from jaxtank import presets, rig
     from jaxtank.loop import run as loop
-    from tuning.bench import is_one_function
+    from tuning.bench.bench import is_one_function
 
     case = presets.find("khalid/gpc-nc30-constrained")
     changes = {"controller.Nc": 44, "controller.Np": 50, "clock.duration": 80 * case.clock.dt}

@@ -33,8 +33,8 @@ SUSPECT = {
     "subprocess", "ctypes", "cffi", "multiprocessing", "pty",
 }  # fmt: skip
 IMPORTED = {
-    ("tuning.bench", "subprocess"): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
-    ("tuning.bench", "ctypes"): "and calls it",
+    ("tuning.bench.bench", "subprocess"): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
+    ("tuning.bench.bench", "ctypes"): "and calls it",
 }
 
 # Calls that run text, and those that open a file to read it.
@@ -64,7 +64,7 @@ READ = {
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
-    ("tuning.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
+    ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",

@@ -144,7 +144,7 @@ def bench(args):
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from tuning import bench
+    from tuning.bench import bench
     from tuning.report import tables
 
     if args.cases:

@@ -22,7 +22,7 @@ import numpy as np
 
 import tuning
 from jaxtank import presets, rig
-from tuning import bench
+from tuning.bench import bench
 from tuning.uncertainty.distributions import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 

@@ -26,7 +26,7 @@ import numpy as np
 import jaxtank
 from jaxtank import presets
 from jaxtank.core.files import write_atomic
-from tuning import bench
+from tuning.bench import bench
 from tuning.report import tables
 
 README = Path(__file__).parents[2] / "README.md"

@@ -27,7 +27,7 @@ from jaxtank.core.tree import with_values
 from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.xla import flags
-from tuning import bench
+from tuning.bench import bench
 from tuning.report import tables
 from tuning.report.case import noisy
 
