@@ -46,7 +46,7 @@ def prepare(cache):
     import tuning.report.identification
     import tuning.report.uncertainty
     import tuning.search.tuner  # noqa: F401
-    from tuning import cli
+    from tuning.cli import main as cli
 
     jax.config.update("jax_compilation_cache_dir", cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

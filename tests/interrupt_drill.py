@@ -23,7 +23,7 @@ from pathlib import Path
 from jaxtank.core import files
 
 # what the console script `jaxtank` does
-JAXTANK = [sys.executable, "-c", "import sys; from tuning.cli import main; sys.exit(main())"]
+JAXTANK = [sys.executable, "-c", "import sys; from tuning.cli.main import main; sys.exit(main())"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 COLUMNS = ["t=t [s]", "pump1=u1 [V]", "h1=y1 [V]", "h2=y2 [V]"]
 COMMANDS = {

@@ -80,9 +80,9 @@ def test_what_is_no_gif_or_another_rig_is_refused(short, tmp_path):
 
 
 def test_simulate_writes_one_where_asked(tmp_path, capsys):
-    from tuning import cli
+    from tuning.cli import main
 
     asked = ["simulate", "gouta2015/backstepping", "--set", "clock.duration=60", "--dt", "0.1", "--gif"]
-    assert cli.main(asked) == 2 and "--out DIR" in capsys.readouterr().err
-    assert cli.main([*asked, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert main.main(asked) == 2 and "--out DIR" in capsys.readouterr().err
+    assert main.main([*asked, "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert matplotlib.image.imread(tmp_path / "out" / "run.gif").size > 0

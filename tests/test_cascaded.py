@@ -18,7 +18,7 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop.run import _evaluate
 from jaxtank.presets import cascaded
 from jaxtank.signals.base import Table
-from tuning import cli
+from tuning.cli import main
 
 CASES = presets.load("cascaded").cases
 RECORD = pathlib.Path(__file__).parents[2] / "shared" / "data" / "cascaded_tanks.csv"
@@ -204,7 +204,7 @@ def test_with_the_pump_off_the_lower_tank_empties_through_its_own_outlet(substep
 def test_what_an_inflow_could_not_take_is_counted(capsys):
     """With the pump off for good: what is drawn from the upper tank after it has run empty. By the command."""
     words = ["simulate", "cascaded/pi", "--set", "actuator.high=1e-9", "--set", "x0=0,0", "--set", "clock.duration=100", "--json"]
-    assert cli.main(words) == 0
+    assert main.main(words) == 0
     counted = json.loads(capsys.readouterr().out)["measures"]["inflow_shortfall"]
     # 26 samples of 4 s
     np.testing.assert_allclose(counted, [-cascaded.K_PUMP * cascaded.OFFSET * 104.0, 0.0], rtol=1e-6)

@@ -9,8 +9,8 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, walk
 from jaxtank.loop.run import _evaluate
-from tuning import cli
 from tuning.bench.bench import is_one_function
+from tuning.cli import main
 from tuning.report.papers import measure
 
 NAMES = presets.names()
@@ -83,7 +83,7 @@ def test_what_a_case_frees_is_a_leaf_within_its_range(name):
 
 @pytest.mark.parametrize("name", NEW)
 def test_a_case_is_shown(name, capsys):
-    assert cli.main(["show", name]) == 0
+    assert main.main(["show", name]) == 0
     said = capsys.readouterr().out
     assert "departures from the paper" in said and "controller." in said
 
@@ -99,7 +99,7 @@ def test_a_case_is_one_function(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_case_is_simulated_by_the_command(name, tmp_path, capsys):
-    assert cli.main(["simulate", name, "--out", str(tmp_path), "--quiet"]) == 0
+    assert main.main(["simulate", name, "--out", str(tmp_path), "--quiet"]) == 0
     assert (tmp_path / "responses.png").stat().st_size > 10_000
 
 
@@ -114,7 +114,7 @@ def test_a_paper_is_compared_and_every_difference_has_a_reason(paper):
 
 
 def test_printed_units_follow_the_rig(capsys):
-    assert cli.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
+    assert main.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
     said = capsys.readouterr().out
     assert " m " in said and "m^3/s" in said and "cm" not in said
     assert jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"] == "m^3/(s U0)"

@@ -19,7 +19,8 @@ import tuning
 from jaxtank import measures, presets, rig
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import parameters
-from tuning import cli, tune_command
+from tuning.cli import main
+from tuning.cli.commands import tuning as tune_command
 
 CASE = "gouta2015/backstepping"
 SHORT = ("--set", "clock.duration=200", "--dt", "0.1")
@@ -77,7 +78,7 @@ def say(*args):
     """Run the command here, in this process."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(list(args))
+        code = main.main(list(args))
     return Said(code, out.getvalue(), err.getvalue())
 
 
@@ -180,7 +181,7 @@ def test_version_and_help():
     assert done("--version").out.strip() == jaxtank.__version__
     for args in (["--help"], ["tune", "--help"]):
         with pytest.raises(SystemExit) as caught, contextlib.redirect_stdout(io.StringIO()) as out:
-            cli.main(args)
+            main.main(args)
         assert caught.value.code == 0 and "usage: jaxtank" in out.getvalue()
 
 

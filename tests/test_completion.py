@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from tuning import cli, completion
-from tuning.parser import parser
+from tuning.cli import completion, main
+from tuning.cli.parser import parser
 
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}
 
@@ -72,7 +72,7 @@ def test_bash_registers_it(script):
 def test_commands_options_cases_parameters_and_measures(script, shell, tmp_path):
     asked = lambda line: READ[shell](script(shell), line, cwd=tmp_path)
     assert set(asked("jaxtank s")) == {"show", "simulate", "sensitivity"}
-    assert set(asked("jaxtank ")) >= set(cli.COMMANDS)
+    assert set(asked("jaxtank ")) >= set(main.COMMANDS)
     wanted = {f"gouta2015/backstepping-ff-table1{more}" for more in ("", "-slow", "-boxqp", "-boxqp-slow")}
     assert set(asked("jaxtank tune gouta2015/backstepping-ff-t")) - {"files"} == wanted
     assert set(asked("jaxtank tune calofir/backstepping --s")) == {
@@ -104,7 +104,7 @@ def test_it_knows_what_the_parser_and_the_library_have():
         "python -c 'from tuning.completion import refresh; refresh()'"
     )
     found = completion.commands_of(parser())
-    assert set(found) - {""} == set(cli.COMMANDS) and all(c.help for n, c in found.items() if n)
+    assert set(found) - {""} == set(main.COMMANDS) and all(c.help for n, c in found.items() if n)
     for (command, option), values in completion.FEW.items():
         assert any(option in o.flags and o.value == " ".join(values) for o in found[command].options)
     for action in (a for p in parser()._subparsers._group_actions[0].choices.values() for a in p._actions):
@@ -120,5 +120,5 @@ def test_help_and_completion_do_not_start_jax(capsys):
     )
     for shell in completion.SHELLS:
         assert subprocess.run([sys.executable, "-c", code, shell], capture_output=True, text=True).stdout.strip() == "[]"
-    assert cli.main(["completion", "bahs"]) == 2
+    assert main.main(["completion", "bahs"]) == 2
     assert "unknown shell 'bahs'; nearest: bash" in capsys.readouterr().err

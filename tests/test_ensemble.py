@@ -550,7 +550,7 @@ def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
 
 @pytest.mark.slow
 def test_sigkill_and_resume_of_the_command(tmp_path):
-    command = [sys.executable, "-m", "tuning.cli", "uncertainty", "gouta2015/ngpc", "--samples", "3000", "--quiet", "--json"]
+    command = [sys.executable, "-m", "tuning.cli.main", "uncertainty", "gouta2015/ngpc", "--samples", "3000", "--quiet", "--json"]
     alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     folder = tmp_path / "run"
     process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL)

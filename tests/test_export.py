@@ -22,7 +22,7 @@ from jaxtank.core.tree import component
 from jaxtank.export.source import export
 from jaxtank.plants.network import network
 from jaxtank.rig import schema as rig_words
-from tuning import cli
+from tuning.cli import main
 
 SAMPLES = 10_000
 GCC = shutil.which("gcc")
@@ -316,12 +316,14 @@ def test_what_cannot_be_exported_is_told():
 
 
 def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
-    assert cli.main(["export", "gouta2015/backstepping", "--set", "controller.k1=0.01", "--lang", "c", "--out", str(tmp_path)]) == 0
+    assert (
+        main.main(["export", "gouta2015/backstepping", "--set", "controller.k1=0.01", "--lang", "c", "--out", str(tmp_path)]) == 0
+    )
     text = (tmp_path / "gouta2015_backstepping.c").read_text()
     assert "controller.k1 = 0.01 1/s" in text and "measured levels [cm]" in text and "pump inputs [V]" in text
-    assert cli.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
+    assert main.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
     assert capsys.readouterr().out.startswith("function [u, s] = gouta2015_backstepping(")
-    assert cli.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
+    assert main.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
 
 
 HOSTILE_RIG = """
@@ -363,7 +365,7 @@ def exported(folder, name, language):
     """The text that `jaxtank export` writes of a rig with a hostile name."""
     (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_words.toml(name)))
     words = ["export", str(folder / "rig.toml"), "--lang", language, "--name", "law", "--out", str(folder / "out"), "--quiet"]
-    assert cli.main(words) == 0
+    assert main.main(words) == 0
     return (folder / "out" / f"law.{language}").read_text()
 
 
@@ -409,7 +411,7 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(separator):
 def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
     text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
     (tmp_path / "rig.toml").write_text(text)
-    assert cli.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert main.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
     said = capsys.readouterr()
     assert said.out == "" and said.err.count("\n") == 1 and "units: entry = " in said.err and not (tmp_path / "out").exists()
 
@@ -423,5 +425,5 @@ def test_units_of_rigs_are_taken():
 
 @pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])
 def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
-    assert cli.main(["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]) == (2 if name else 0)
+    assert main.main(["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]) == (2 if name else 0)
     assert (tmp_path / "out").exists() is not bool(name)

@@ -19,7 +19,7 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
-from tuning import cli
+from tuning.cli.main import main
 from tuning.report import figures
 from tuning.storage import batch_store, evaluation_log, folder_lock
 
@@ -28,7 +28,7 @@ SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 SIMULATE = ["simulate", *SHORT, "--quiet"]
 SEARCH = ["tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0", "--iterations", "3", "--quiet"]
 SPREAD = ["uncertainty", *SHORT, "--samples", "20", "--quiet"]
-JAXTANK = [sys.executable, "-m", "tuning.cli"]
+JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 WRITERS = {
     "simulate": SIMULATE,
     "uncertainty": SPREAD,
@@ -47,7 +47,7 @@ def contents(folder):
 
 def say(words, capsys):
     """(exit code, stdout, lines of stderr) of a command."""
-    code = cli.main([str(w) for w in words])
+    code = main.main([str(w) for w in words])
     said = capsys.readouterr()
     return code, said.out, said.err.splitlines()
 
@@ -367,12 +367,12 @@ class Interrupting:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupting())
-from tuning.cli import main
+from tuning.cli.main import main
 sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("module", ["tuning.parser", "numpy", "jax"])
+@pytest.mark.parametrize("module", ["tuning.cli.parser", "numpy", "jax"])
 def test_ctrl_c_in_an_import_ends_the_program_at_once(module):
     command = [sys.executable, "-c", ENTRY.format(module=module), "simulate", *SHORT]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
@@ -382,7 +382,7 @@ def test_ctrl_c_in_an_import_ends_the_program_at_once(module):
 def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     """The first is answered while an evaluation is compiled that takes for ever."""
     code = (
-        "import os, signal, sys, time; from tuning import interrupts; interrupts.listen(); search = interrupts.Interrupts()\n"
+        "import os, signal, sys, time; from tuning.cli import interrupts; interrupts.listen(); search = interrupts.Interrupts()\n"
         "search.check(); os.kill(os.getpid(), signal.SIGINT)\n"
         "while not search.stop: time.sleep(0.01)\n"
         "os.kill(os.getpid(), signal.SIGINT); time.sleep(60); print('went on')"
@@ -396,8 +396,8 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
 def test_importing_the_library_leaves_signals_alone():
     code = (
         "import signal; before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\n"
-        "import jaxtank, tuning, tuning.cli, tuning.interrupts, tuning.search, tuning.tune_command\n"
-        "tuning.cli.main(['list'])\n"
+        "import jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts, tuning.search.tuner, tuning.cli.commands.tuning\n"
+        "tuning.cli.main.main(['list'])\n"
         "assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\n"
         "assert signal.set_wakeup_fd(-1) == -1"
     )

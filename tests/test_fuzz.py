@@ -15,7 +15,7 @@ import pytest
 
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from tuning import cli
+from tuning.cli import main
 from tuning.identification.csv_log import read_log
 
 RIGS = Path(__file__).parent / "rigs"
@@ -135,7 +135,7 @@ def told(words, capsys):
     """(exit code, lines of stderr) of a command that is meant to be refused before it runs anything."""
     began = time.perf_counter()
     try:
-        code = cli.main(words)
+        code = main.main(words)
     except SystemExit as stop:  # --help
         code = stop.code
     found = capsys.readouterr()

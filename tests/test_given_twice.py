@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from tuning import cli, parser
+from tuning.cli import main, parser
 
 CASE = "cascaded/pi"
 IDENTIFY = ("identify", "mirakhorli/sfc")
@@ -16,7 +16,7 @@ def refused(tmp_path, monkeypatch, capsys):
 
     def run(*words):
         monkeypatch.chdir(tmp_path)
-        code = cli.main(list(words))
+        code = main.main(list(words))
         said = capsys.readouterr()
         (line,) = said.err.splitlines()
         assert code == 2 and said.out == "" and list(tmp_path.iterdir()) == []

@@ -17,7 +17,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
-from tuning import cli
+from tuning.cli import main
 from tuning.identification import confidence, simulation
 from tuning.identification.design import candidates, compare_experiments, settled
 from tuning.identification.parametrisation import coordinates
@@ -659,7 +659,7 @@ def command(*words):
     """(exit code, stdout, stderr) of the command line."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(list(words))
+        code = main.main(list(words))
     return code, out.getvalue(), err.getvalue()
 
 

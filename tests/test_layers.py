@@ -71,7 +71,7 @@ RANK |= {f"tuning.{room}": len(LAYERS) + i for i, layer in enumerate(ABOVE) for 
 
 # Doors that look up: `python -m jaxtank`, and methods of a result that draw and write it.
 DOORS = {
-    ("jaxtank.__main__", "tuning.cli"),
+    ("jaxtank.__main__", "tuning.cli.main"),
     ("tuning.search.result", "tuning.report.tuning"),
     ("tuning.search.result", "tuning.report.tuning_figures"),
     ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),

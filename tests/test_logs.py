@@ -10,7 +10,7 @@ import pytest
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
-from tuning import cli
+from tuning.cli import main
 from tuning.identification import experiment
 from tuning.identification.csv_log import read_log, split_header
 
@@ -305,7 +305,7 @@ def command(*words):
     """(exit code, stdout, stderr) of the command line."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(list(words))
+        code = main.main(list(words))
     return code, out.getvalue(), err.getvalue()
 
 

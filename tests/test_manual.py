@@ -12,7 +12,7 @@ import pytest
 from jaxtank import presets, rig
 from jaxtank.core.tree import walk
 from jaxtank.plots.equations import equations
-from tuning import cli
+from tuning.cli import main
 from tuning.report import case as manual
 
 NAMES = list(
@@ -106,7 +106,7 @@ def test_what_is_set_is_what_is_said():
 
 
 def test_a_rig_of_ones_own_is_shown(capsys):
-    assert cli.main(["show", str(Path(__file__).parent / "rigs" / "two_tanks.toml")]) == 0
+    assert main.main(["show", str(Path(__file__).parent / "rigs" / "two_tanks.toml")]) == 0
     page = capsys.readouterr().out
     assert "A2 h2' = s12 q(h1) - a2 q(h2)" in page and "The law: PID" in page and "departures" not in page
 

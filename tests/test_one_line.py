@@ -5,7 +5,7 @@ import pytest
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import MOST, one_line, printable
-from tuning import cli
+from tuning.cli import main
 
 RED = "a\033[31m.csv"
 ESCAPED = r"a\x1b[31m.csv"
@@ -20,7 +20,7 @@ def say(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        code = cli.main(list(words))
+        code = main.main(list(words))
         return code, *capsys.readouterr()
 
     return run

@@ -15,7 +15,7 @@ import pytest
 import tuning
 from jaxtank import rig
 from jaxtank.plots import responses
-from tuning import cli
+from tuning.cli import main
 from tuning.identification.csv_log import read_log
 from tuning.report import figures as pictures
 from tuning.report import html, papers, tables
@@ -241,17 +241,17 @@ def test_a_picture_of_very_many_points_is_kept_small():
 def test_compare_and_show_write_where_they_are_told(tmp_path, monkeypatch, capsys):
     row = {"quantity": "q", "unit": "m", "where": "eq. 1", "published": 1.0, "measured": 1.0, "verdict": "reproduced", "reason": ""}
     monkeypatch.setattr(papers, "measure", lambda paper: {"paper": paper, "citation": "C", "rows": [row]})
-    assert cli.main(["compare", "calofir", "--out", str(tmp_path / "one"), "--quiet"]) == 0
+    assert main.main(["compare", "calofir", "--out", str(tmp_path / "one"), "--quiet"]) == 0
     assert {p.name for p in (tmp_path / "one").iterdir()} == {"report.html", "result.json", "rig-calofir.png"}
     assert json.loads((tmp_path / "one" / "result.json").read_text())["rows"] == [row]
     assert f"jaxtank compare calofir --out {tmp_path / 'one'}" in (tmp_path / "one" / "report.html").read_text()
-    assert cli.main(["show", "mirakhorli/sfc", "--out", str(tmp_path / "two"), "--quiet"]) == 0
+    assert main.main(["show", "mirakhorli/sfc", "--out", str(tmp_path / "two"), "--quiet"]) == 0
     drawn = xml.etree.ElementTree.parse(tmp_path / "two" / "rig.svg").getroot()  # a file of its own needs its namespace
     assert drawn.tag == "{http://www.w3.org/2000/svg}svg"
     assert {"pump 1", "tank 3", "42 %"} <= {t.strip() for t in drawn.itertext()}
     (tmp_path / "file").write_text("")
     for asked in (["compare", "calofir"], ["show", "mirakhorli/sfc"]):
-        assert cli.main([*asked, "--out", str(tmp_path / "file")]) == 2
+        assert main.main([*asked, "--out", str(tmp_path / "file")]) == 2
     assert capsys.readouterr().err.count("is a file") == 2
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tuning import cli, identify_command, tune_command
-from tuning.parser import parser
+from tuning.cli import main
+from tuning.cli.commands import identification, tuning
+from tuning.cli.parser import parser
 
 README = Path(__file__).parent.parent / "README.md"
 pytestmark = pytest.mark.skipif(not README.exists(), reason="the README is not beside the tests")
@@ -39,14 +40,14 @@ def test_commands_parse():
     assert len(COMMANDS) >= 10
     for words in COMMANDS:
         args, rest = parser().parse_known_args(words)
-        assert not rest and args.command in cli.COMMANDS
+        assert not rest and args.command in main.COMMANDS
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_commands_run(words, tmp_path_factory, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path_factory.getbasetemp())
-    assert cli.main(words) == 0, capsys.readouterr().err
+    assert main.main(words) == 0, capsys.readouterr().err
 
 
 def test_the_picture_is_there_and_small():
@@ -58,4 +59,4 @@ def test_every_exit_code_is_told():
     """Those of a search, of an identification, of refused input and of refused data."""
     told = re.search(r"Exit codes: (.*?)\. Results", README.read_text(), re.DOTALL)[1]
     codes = {int(code) for code in re.findall(r"(?:^|, )(\d+) ", told.replace("\n", " "))}
-    assert codes == {*tune_command.EXIT.values(), *identify_command.STATUS.values(), 2}
+    assert codes == {*tuning.EXIT.values(), *identification.STATUS.values(), 2}

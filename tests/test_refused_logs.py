@@ -6,7 +6,7 @@ import pytest
 import tuning
 from jaxtank import presets
 from jaxtank.core.errors import DataError
-from tuning import cli
+from tuning.cli import main
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 FREE = {"plant.pump_gain": (0.5, 10.0)}
@@ -43,7 +43,7 @@ def refused(tmp_path, capsys, monkeypatch):
         monkeypatch.chdir(tmp_path)
         if content is not None:
             (tmp_path / name).write_text(content)
-        code = cli.main(
+        code = main.main(
             ["identify", "mirakhorli/sfc", "--data", name, "--free", "plant.pump_gain=0.5:10", "--starts", "1", *options]
         )
         said = capsys.readouterr()

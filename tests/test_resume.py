@@ -144,7 +144,7 @@ def test_what_is_asked_decides(tmp_path):
 @pytest.mark.parametrize("wait", [8.0, 11.0, 15.0])
 def test_the_command_killed_and_resumed(tmp_path, wait):
     """SIGKILL at some moment of the search; the result is that of a run left alone."""
-    command = [sys.executable, "-m", "tuning.cli", "tune", "gouta2015/backstepping", "--quiet", "--json", "--starts", "2"]
+    command = [sys.executable, "-m", "tuning.cli.main", "tune", "gouta2015/backstepping", "--quiet", "--json", "--starts", "2"]
     command += ["--screening", "8", "--validation", "8", "--set", "clock.dt=0.1"]
     alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     process = subprocess.Popen([*command, "--out", str(tmp_path / "run")], stdout=subprocess.DEVNULL)

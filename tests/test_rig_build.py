@@ -15,7 +15,7 @@ from jaxtank import controllers, parameters, presets, rig, with_values
 from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
 from jaxtank.plots import equations
-from tuning import cli
+from tuning.cli import main
 
 RIGS = Path(__file__).parent / "rigs"
 FOUR = """
@@ -183,7 +183,7 @@ def test_what_is_wrong_is_named(changes, words):
 
 def test_neither_case_nor_tanks(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text("[values]\n")
-    assert cli.main(["simulate", str(tmp_path / "rig.toml")]) == 2
+    assert main.main(["simulate", str(tmp_path / "rig.toml")]) == 2
     assert "[[tank]]" in capsys.readouterr().err
 
 
@@ -341,7 +341,7 @@ def test_spills_are_weighed_wherever_their_shares_are_given(tmp_path, capsys):
     out = 0.01 * 0.1 * np.sqrt(2 * 981 * np.asarray(run.x[:-1])).sum()
     np.testing.assert_allclose([gained + out, np.abs(run.spilled).max()], [5.0 * 10.0 * 20.0, 0.0], atol=0.5)
     (tmp_path / "rig.toml").write_text(text)
-    assert cli.main(["simulate", str(tmp_path / "rig.toml"), "--set", "plant.caught=0.8,0.3"]) == 2
+    assert main.main(["simulate", str(tmp_path / "rig.toml"), "--set", "plant.caught=0.8,0.3"]) == 2
     assert "plant.caught: the 2 spills of tank 1 catch 0.8 + 0.3 = 1.1 of" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"catch 0.7 \+ 0.9 = 1.6"):
         jaxtank.simulate(with_values(case.loop, {"plant.caught[1]": 0.9}), case.clock)

@@ -17,7 +17,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
 from jaxtank.measures.catalogue import MEASURES, TIMES
-from tuning import cli, options
+from tuning.cli import main, options
 
 HEAD = 'case = "gouta2015/backstepping"\n'
 # one case of each law, reference, disturbance and fault
@@ -300,13 +300,13 @@ def test_what_is_wrong_is_named_with_its_unit_and_range(text, words):
 
 def test_init_of_the_command(tmp_path, capsys):
     def said(*args):
-        code = cli.main(["init", "gouta2015/backstepping", *args])
+        code = main.main(["init", "gouta2015/backstepping", *args])
         return code, capsys.readouterr().out
 
     case = presets.find("gouta2015/backstepping")
     assert said() == (0, rig.complete(case)) and said("--short") == (0, rig.short(case))
     assert said("--tanks") == (0, rig.complete(case, tankwise=True))
-    assert cli.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
+    assert main.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
     assert parameters(case.loop)
 
 
@@ -343,12 +343,12 @@ def test_names_of_tanks_and_pumps_are_kept():
 def test_show_tells_what_tanks_and_pumps_are_called(tmp_path, capsys):
     text = TANK.replace("[[tank]]", '[[tank]]\nname = "left"').replace("[[pump]]", '[[pump]]\nname = "P-101"')
     (tmp_path / "rig.toml").write_text(text)
-    assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
     said = capsys.readouterr().out
     assert "controlled: h1 (left)" in said and "The names of its file: tank 1 is 'left', pump 1 is 'P-101'." in said
-    assert cli.main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
+    assert main.main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["names"] == {"tank": ["left"], "pump": ["P-101"]}
-    assert cli.main(["show", "gouta2015/ngpc"]) == 0
+    assert main.main(["show", "gouta2015/ngpc"]) == 0
     said = capsys.readouterr().out
     assert "controlled: h1, h2\n" in said and "names of its file" not in said
 
@@ -367,7 +367,7 @@ def test_a_large_whole_number_of_a_tank_is_the_float_next_to_it(line):
 @pytest.mark.parametrize("option", ["--dt", "--set", "--free"])
 def test_a_whole_number_that_no_float_holds_is_refused_in_one_line(option, capsys):
     said = {"--dt": "", "--set": "controller.k=", "--free": "controller.k=0.1:"}[option] + "9" * 400
-    assert cli.main(["tune" if option == "--free" else "show", "gouta2015/backstepping", option, said]) == 2
+    assert main.main(["tune" if option == "--free" else "show", "gouta2015/backstepping", option, said]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -417,7 +417,7 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
     (tmp_path / "rig.toml").write_text(text + change, encoding="utf-8")
     (sentence,) = rig.doubts(rig.load(tmp_path / "rig.toml"))
     assert words in sentence
-    assert cli.main(["show", str(tmp_path / "rig.toml")]) == 0
+    assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "runs empty" not in line]  # of steps: test_step_length.py
     assert told == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
 
@@ -426,13 +426,13 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
     "options", [["--set", "clock.dt=7", "--set", "clock.duration=300"], ["--dt", "7", "--set", "clock.duration=300"]]
 )
 def test_a_run_of_another_length_than_asked_for_is_told(options, capsys, tmp_path):
-    assert cli.main(["simulate", "mirakhorli/sfc", *options, "--json", "--out", str(tmp_path)]) == 0
+    assert main.main(["simulate", "mirakhorli/sfc", *options, "--json", "--out", str(tmp_path)]) == 0
     said, told = capsys.readouterr()
     note = "jaxtank: note: clock.duration = 300 s is no whole number of samples of clock.dt = 7 s: the run ends at 301 s"
     assert told.splitlines()[0] == note
     assert (tmp_path / "trajectory.csv").read_text().splitlines()[-1].startswith("301,")
     assert json.loads(said)["clock"]["duration"] == 300.0
-    assert cli.main(["show", "mirakhorli/sfc", *options, "--quiet"]) == 0
+    assert main.main(["show", "mirakhorli/sfc", *options, "--quiet"]) == 0
     assert capsys.readouterr().err == ""
 
 

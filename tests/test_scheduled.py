@@ -23,7 +23,7 @@ from jaxtank.loop.derivatives import _sensitivities
 from jaxtank.loop.run import _evaluate, evaluate_and_flag, evaluate_for_reverse
 from jaxtank.rig.schedule import schedule
 from jaxtank.xla.reachability import use_of
-from tuning import cli
+from tuning.cli import main
 
 # 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within rounding of the others, where the slope would
 # be that of one side and a difference that of both (at one sample of 24,001: 6e-4 of that slope).
@@ -449,7 +449,7 @@ def test_a_bad_schedule_in_a_file_is_told_in_one_line(text, words, tmp_path):
 def say(*args):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(list(args))
+        code = main.main(list(args))
     return code, out.getvalue(), err.getvalue()
 
 

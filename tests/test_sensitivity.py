@@ -19,7 +19,7 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning import cli
+from tuning.cli import main
 from tuning.problem.scenarios import Lane, groups_of, values_of
 from tuning.report import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
@@ -340,7 +340,7 @@ def test_defaults_are_the_cases_own(case):
 def say(*args):
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(["sensitivity", *args])
+        code = main.main(["sensitivity", *args])
     return code, out.getvalue(), err.getvalue()
 
 

@@ -17,7 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.loop import step_size
 from jaxtank.plants.faults import faults
 from jaxtank.signals.inflows import pours
-from tuning import cli
+from tuning.cli import main
 
 ONE = """
 [[tank]]
@@ -85,16 +85,16 @@ def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, ca
         jaxtank.check(fast, Clock(dt=30.0, duration=300.0))
     file = tmp_path / "one.toml"
     file.write_text(ONE.format(drain=0.1))
-    assert cli.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
+    assert main.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
     assert "runs empty" not in capsys.readouterr().err
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         out = tmp_path / "out"
-        assert cli.main(["simulate", str(file), "--set", "clock.duration=20", "--set", "plant.drain=2", "--out", str(out)]) == 2
+        assert main.main(["simulate", str(file), "--set", "clock.duration=20", "--set", "plant.drain=2", "--out", str(out)]) == 2
         said = capsys.readouterr().err
         assert said.count("note: tank 1 runs empty") == 1 and "threw its level up after t = 0 s: clock.dt of at most" in said
         assert not out.exists()
-        assert cli.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
+        assert main.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
     assert "tank 1 runs empty in 2 s, within one step" in capsys.readouterr().err
 
 
@@ -132,7 +132,7 @@ def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
         with pytest.raises(InputError, match=r"threw its level up after t = 0\.3"):
             step_size.check_run(case.loop, case.clock, run)
         (tmp_path / "deep.toml").write_text(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
-        assert cli.main(["simulate", str(tmp_path / "deep.toml")]) == 2
+        assert main.main(["simulate", str(tmp_path / "deep.toml")]) == 2
         assert "threw its level up" in capsys.readouterr().err
 
 

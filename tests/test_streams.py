@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from tuning import streams
+from tuning.cli import terminal
 
-JAXTANK = [sys.executable, "-m", "tuning.cli"]
+JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 SEARCH = ["tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0", "--iterations", "3"]
 
@@ -54,7 +54,7 @@ def test_progress_that_cannot_be_told_ends_no_run():
 def test_ctrl_c_where_nobody_can_be_told_of_it():
     """The handler of the signal speaks, too."""
     code = (
-        "import os, signal, sys; from tuning import interrupts, streams; streams.guard(); found = interrupts.Interrupts(); found.check()\n"
+        "import os, signal, sys; from tuning.cli import interrupts, terminal; terminal.guard(); found = interrupts.Interrupts(); found.check()\n"
         "os.kill(os.getpid(), signal.SIGINT)\n"
         "print(found.stop)"
     )
@@ -65,7 +65,7 @@ def test_ctrl_c_where_nobody_can_be_told_of_it():
 
 def test_a_forgiving_stream_writes_what_is_taken(tmp_path):
     with open(tmp_path / "told", "w+b") as file:
-        raw = streams.Forgiving(file.fileno())
+        raw = terminal.Forgiving(file.fileno())
         assert raw.write(b"start 1/8\n") == 10 and not raw.isatty() and raw.fileno() == file.fileno()
         assert (tmp_path / "told").read_bytes() == b"start 1/8\n"
-    assert streams.Forgiving(10**6).write(b"lost") == 4  # no descriptor has that number
+    assert terminal.Forgiving(10**6).write(b"lost") == 4  # no descriptor has that number

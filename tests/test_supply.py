@@ -56,7 +56,7 @@ READS = {
 MADE = {
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
-    ("tuning.cli", "_run", "import_module"): "modules of its own table of commands",
+    ("tuning.cli.main", "_run", "import_module"): "modules of its own table of commands",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -65,7 +65,7 @@ READ = {
     ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
-    ("tuning.completion", "words", "read_text"): "names.txt of the package",
+    ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
@@ -73,8 +73,8 @@ READ = {
     ("tuning.storage.batch_store", "read_part", "ZipFile"): "after `refusal`; unpacked sizes are added up first",
     ("tuning.storage.batch_store", "read_part", "load"): "after that; allow_pickle=False",
     ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
-    ("tuning.cli", "_drop_output", "open"): "/dev/null, to write",
-    ("tuning.streams", "guard", "open"): "/dev/null, in place of a stream that was closed",
+    ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
+    ("tuning.cli.terminal", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.storage.folder_lock", "_locked", "open"): "its own lock, of which 20 bytes are read",
     ("tuning.storage.folder_lock", "release", "open"): "its own lock, of which nothing is read",
 }
@@ -253,7 +253,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
     }
     assert packed == there and {"tuning/floor.c", "tuning/names.txt"} <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "txt"}
-    assert license_there and "METADATA" in info and "jaxtank = tuning.cli:main" in entry
+    assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 
 def test_the_sdist_holds_what_builds_and_tests_it(built):

@@ -7,7 +7,7 @@ import pytest
 from jaxtank.core.units import local
 from jaxtank.measures.catalogue import MEASURES
 from jaxtank.measures.catalogue import unit as measure_unit
-from tuning import cli
+from tuning.cli import main
 
 FLOW = ("m", "m^3/s")
 
@@ -37,10 +37,10 @@ def test_a_unit_in_those_of_a_rig(unit, units, printed):
 
 
 def test_squares_of_a_flow_are_printed_as_such(capsys):
-    assert cli.main(["simulate", "calofir/backstepping", "--dt", "2", "--json"]) == 0
+    assert main.main(["simulate", "calofir/backstepping", "--dt", "2", "--json"]) == 0
     units = json.loads(capsys.readouterr().out)["units"]
     assert units["mean_square_travel"] == "(m^3/s)^2" and units["input_travel"] == "m^3/s"
-    assert cli.main(["show", "calofir/backstepping"]) == 0
+    assert main.main(["show", "calofir/backstepping"]) == 0
     shown = capsys.readouterr().out
     assert "(m^3/s)^2" in shown and "m^3/s^2" not in shown
     assert measure_unit("input_deviation", FLOW) == "(m^3/s)^2 s"
@@ -55,11 +55,11 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
         '[law]\nkind = "lqi"\nR = [1.0]\n'
         "[reference]\ninitial = [0.2]\n"
     )
-    assert cli.main(["simulate", str(file)]) == 2
+    assert main.main(["simulate", str(file)]) == 2
     told = capsys.readouterr().err
     assert "needs Q" in told and "cm" not in told and told.count("\n") == 1
     file.write_text(file.read_text().replace("R = [1.0]", "Q = [1.0, 1.0]"))
-    assert cli.main(["simulate", str(file)]) == 2
+    assert main.main(["simulate", str(file)]) == 2
     assert "needs R [1/(m^3/s)^2]" in capsys.readouterr().err
 
 
@@ -73,13 +73,13 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
         "[reference]\ninitial = [10.0]\nchanges = [[5.0, 1, 12.0]]\n"
     )
     for language in ("c", "m"):
-        assert cli.main(["export", str(file), "--lang", language, "--out", str(tmp_path / language)]) == 0
+        assert main.main(["export", str(file), "--lang", language, "--out", str(tmp_path / language)]) == 0
         (source,) = (tmp_path / language).glob(f"*.{language}")
         text = source.read_text()
         assert "controller.Kc = [1.] (L/min)/cm" in text and "controller.bias = [" in text
         assert "V/cm" not in text and "] V\n" not in text
     capsys.readouterr()
-    assert cli.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
+    assert main.main(["simulate", str(file), "--set", "clock.duration=20"]) == 0
     (line,) = (row for row in capsys.readouterr().out.splitlines() if row.startswith("rms_input"))
     assert "L/min" in line and "voltage" not in line
     assert not any("voltage" in each.doc for each in MEASURES.values())

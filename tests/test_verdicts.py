@@ -12,7 +12,7 @@ import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.signals.setpoints import ramps
-from tuning import cli
+from tuning.cli import main
 from tuning.problem.limits import Limit, resolve_limits, room_of
 from tuning.problem.problem import Point
 from tuning.search.driver import Search
@@ -118,7 +118,7 @@ def test_a_staircase_is_not_called_an_optimum(quick):
     ],
 )
 def test_what_is_given_twice_or_empty_is_refused(words, capsys):
-    assert cli.main(["tune", "gouta2015/backstepping", *words]) == 2
+    assert main.main(["tune", "gouta2015/backstepping", *words]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1 and words[0] in told
 
@@ -135,7 +135,7 @@ def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     words = ["--choose", "controller.pairing=cross,same", "--free", "controller.b=0.5:3", "--scenario", "none", "--dt", "0.5"]
     words += ["--starts", "1", "--screening", "2", "--iterations", "3", "--validation", "0", "--quiet", "--json"]
     whole, halted = tmp_path / "whole", tmp_path / "halted"
-    cli.main(["tune", "mirakhorli/hybrid", *words, "--out", str(whole)])
+    main.main(["tune", "mirakhorli/hybrid", *words, "--out", str(whole)])
     first = json.loads(capsys.readouterr().out)
     seen = []
 
@@ -150,7 +150,7 @@ def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     with pytest.raises(RuntimeError):
         tuning.tune(case, log=halted, progress=stop, **options)
     assert list(halted.glob("choice_*"))
-    cli.main(["tune", "mirakhorli/hybrid", *words, "--resume", str(halted)])
+    main.main(["tune", "mirakhorli/hybrid", *words, "--resume", str(halted)])
     again = json.loads(capsys.readouterr().out)
     assert again["parameters"] == first["parameters"] and again["objective"] == first["objective"]
     assert not list(halted.glob("choice_*"))
@@ -162,7 +162,7 @@ WATERTANK = str(Path(__file__).parent / "rigs" / "watertank.toml")
 def told(capsys, *words):
     """(exit code, JSON object or None, stderr) of a command with --json and --quiet."""
     capsys.readouterr()
-    code = cli.main([*words, "--json", "--quiet"])
+    code = main.main([*words, "--json", "--quiet"])
     out = capsys.readouterr()
     return code, json.loads(out.out) if out.out else None, out.err
 
@@ -242,7 +242,7 @@ def test_robust_tuning_with_one_start_leaves_an_unstable_one(capsys):
 )
 def test_a_limit_that_no_run_can_be_measured_by_is_refused(capsys, tmp_path, command, limit, why):
     path = edited(tmp_path, changes="[]")
-    assert cli.main([command[0], path, *command[1:], "--limit", "none", "--limit", limit]) == 2
+    assert main.main([command[0], path, *command[1:], "--limit", "none", "--limit", limit]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1
     assert err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ") and "undefined on this run" in err and why in err

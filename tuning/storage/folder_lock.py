@@ -7,7 +7,6 @@ from pathlib import Path
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import LOCK, check_folder, sweep
-from tuning.interrupts import before_leaving
 
 try:
     import fcntl
@@ -19,7 +18,7 @@ PATIENCE = 0.2
 
 
 @contextlib.contextmanager
-def hold(folder, shared=False):
+def hold(folder, shared=False, leaving=contextlib.nullcontext):
     """Hold `folder`, made if need be, against other runs; shared=True: against all but those that share it.
 
     The lock is the system's own (flock on a file with the process id in it): it ends with its process however that ends, so that what a
@@ -48,7 +47,7 @@ def hold(folder, shared=False):
                 path.rmdir()
 
     try:
-        with before_leaving(release):
+        with leaving(release):
             folder.mkdir(parents=True, exist_ok=True)
             file = _locked(folder, shared, opened)
             try:

@@ -5,9 +5,9 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning.arguments import open_case, whole
-from tuning.arguments import seed as seed_of
-from tuning.options import devices_of, distributions_of, limits_of, tell_written
+from tuning.cli.options import devices_of, distributions_of, limits_of, tell_written
+from tuning.cli.values import open_case, whole
+from tuning.cli.values import seed as seed_of
 
 
 def uncertainty(args):

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from jaxtank.core.errors import InputError, nearest
-from tuning import identify_command
+from tuning.cli.commands import identification
 
 
 class Once(argparse.Action):
@@ -203,7 +203,7 @@ def parser():
         metavar="NAME",
         help="a measure to look at (default: those of the objective, rms_error_total, max_level); repeatable",
     )
-    identify_command.add(commands, [common, case, run])
+    identification.add(commands, [common, case, run])
     init = commands.add_parser(
         "init", parents=[common, case], help="print a complete rig file to edit: every key, its unit and range"
     )

@@ -5,10 +5,10 @@ import functools
 import sys
 
 from jaxtank.core.errors import InputError
-from tuning.arguments import number, once, open_case, pair, span, whole
-from tuning.arguments import seed as seed_of
-from tuning.interrupts import Interrupts, put_back
-from tuning.options import choices_of, distributions_of, limits_of, scenarios_of, tell_unreachable, tell_written, tradeoff_of
+from tuning.cli.interrupts import Interrupts, put_back
+from tuning.cli.options import choices_of, distributions_of, limits_of, scenarios_of, tell_unreachable, tell_written, tradeoff_of
+from tuning.cli.values import number, once, open_case, pair, span, whole
+from tuning.cli.values import seed as seed_of
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 

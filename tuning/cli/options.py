@@ -5,7 +5,7 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning.arguments import number, once, pair, parse_value, plain_number, settings, whole
+from tuning.cli.values import number, once, pair, parse_value, plain_number, settings, whole
 
 
 def limits_of(args, case):

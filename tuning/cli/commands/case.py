@@ -3,9 +3,9 @@
 import sys
 
 from jaxtank.core.errors import InputError
-from tuning.arguments import open_case, whole
-from tuning.arguments import seed as seed_of
-from tuning.options import tell_written
+from tuning.cli.options import tell_written
+from tuning.cli.values import open_case, whole
+from tuning.cli.values import seed as seed_of
 from tuning.search import baseline, provenance
 
 
@@ -160,8 +160,8 @@ def bench(args):
 
 
 def completion(args):
-    from tuning import completion
-    from tuning.parser import parser
+    from tuning.cli import completion
+    from tuning.cli.parser import parser
 
     print(completion.script(args.shell, parser()), end="")
     return 0

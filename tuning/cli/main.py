@@ -9,22 +9,22 @@ import importlib
 import os
 import sys
 
-from tuning import interrupts, streams
+from tuning.cli import interrupts, terminal
 
 COMMANDS = {
-    "list": "case_commands.list_cases",
-    "show": "case_commands.show",
-    "simulate": "case_commands.simulate",
-    "tune": "tune_command.tune",
-    "sensitivity": "batch_commands.sensitivity",
-    "identify": "identify_command.run_interruptibly",
-    "init": "case_commands.init",
-    "export": "case_commands.export_law",
-    "uncertainty": "batch_commands.uncertainty",
-    "merge": "batch_commands.merge",
-    "compare": "case_commands.compare",
-    "completion": "case_commands.completion",
-    "bench": "case_commands.bench",
+    "list": "case.list_cases",
+    "show": "case.show",
+    "simulate": "case.simulate",
+    "tune": "tuning.tune",
+    "sensitivity": "studies.sensitivity",
+    "identify": "identification.run_interruptibly",
+    "init": "case.init",
+    "export": "case.export_law",
+    "uncertainty": "studies.uncertainty",
+    "merge": "studies.merge",
+    "compare": "case.compare",
+    "completion": "case.completion",
+    "bench": "case.bench",
 }
 """{command: module and function that runs it}."""
 
@@ -32,7 +32,7 @@ COMMANDS = {
 def main(argv=None):
     """Run the command; returns the exit code. argv None: a program of its own, by sys.argv."""
     if argv is None:
-        streams.guard()
+        terminal.guard()
         interrupts.listen()  # before anything that takes time is imported
     return _run(argv)
 
@@ -43,8 +43,8 @@ def _run(argv):
 
     from jaxtank.core.errors import DataError, InputError, NonFiniteError, nearest
     from jaxtank.core.text import one_line
-    from tuning.arguments import folder_of
-    from tuning.parser import parser
+    from tuning.cli.parser import parser
+    from tuning.cli.values import folder_of
     from tuning.storage.folder_lock import hold
 
     if argv is None:
@@ -74,9 +74,9 @@ def _run(argv):
         folder = folder_of(args)
         if getattr(args, "resume", None) and not os.path.isdir(folder):
             raise InputError(f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder")
-        with hold(folder, shared=getattr(args, "shard", None) is not None):
+        with hold(folder, shared=getattr(args, "shard", None) is not None, leaving=interrupts.before_leaving):
             module, name = COMMANDS[args.command].split(".")
-            code = getattr(importlib.import_module(f"tuning.{module}"), name)(args)
+            code = getattr(importlib.import_module(f"tuning.cli.commands.{module}"), name)(args)
         sys.stdout.flush()
         return code
     except (InputError, NonFiniteError) as error:

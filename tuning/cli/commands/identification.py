@@ -4,9 +4,9 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning import arguments
-from tuning.interrupts import Interrupts, put_back
-from tuning.options import tell_unreachable
+from tuning.cli import values
+from tuning.cli.interrupts import Interrupts, put_back
+from tuning.cli.options import tell_unreachable
 
 LONGEST = 1e7
 """Longest experiment that is planned [s]: four months."""
@@ -64,8 +64,8 @@ def add(commands, parents):
 def run(args):
     """Run the command; returns the exit code."""
     args.out = args.resume or args.out
-    seed, case = arguments.seed(args), arguments.open_case(args)
-    free = arguments.once("--free", [arguments.pair("--free", text, arguments.span) for text in args.free])
+    seed, case = values.seed(args), values.open_case(args)
+    free = values.once("--free", [values.pair("--free", text, values.span) for text in args.free])
     if args.plan:
         return plan(args, case, free)
     for option, given in (("--duration", args.duration), ("--voltage", args.voltage), ("--measure", args.measure)):
@@ -78,19 +78,19 @@ def run(args):
     from tuning.report import identification, tables
     from tuning.storage.evaluation_log import discard
 
-    given = arguments.once("--column", [arguments.pair("--column", text, _column) for text in args.column])
+    given = values.once("--column", [values.pair("--column", text, _column) for text in args.column])
     columns = dict(case.log) | (given or {})
     logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
-    hold = arguments.number("--hold-back", args.hold_back)
+    hold = values.number("--hold-back", args.hold_back)
     if not 0 <= hold < min(one.samples for one in logs):
         raise InputError(f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of samples of the log")
     noise = None
     if args.noise is not None:
-        noise = arguments.parse_value(args.noise, "--noise")
+        noise = values.parse_value(args.noise, "--noise")
         entries = noise if isinstance(noise, list) else [noise]
         if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
             raise InputError(f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel")
-    gap = arguments.number("--gap", args.gap)
+    gap = values.number("--gap", args.gap)
     if not gap >= 1:
         raise InputError(f"--gap {args.gap!r}: must be at least 1")
 
@@ -104,13 +104,13 @@ def run(args):
         logs,
         free,
         start=args.start,
-        starts=arguments.whole("--starts", args.starts, 1, 1000),
+        starts=values.whole("--starts", args.starts, 1, 1000),
         seed=seed,
         hold_back=hold if hold < 1 else _samples(args.hold_back),
         noise=noise,
         loss=args.loss,
         profile=args.profile,
-        iterations=arguments.whole("--iterations", args.iterations, 1, 100_000),
+        iterations=values.whole("--iterations", args.iterations, 1, 100_000),
         gap=gap,
         folder=args.out,
         resume=args.resume is not None,
@@ -190,7 +190,7 @@ def plan(args, case, free):
     from tuning.identification.design import compare_experiments, most_telling
     from tuning.report import tables
 
-    duration = 300.0 if args.duration is None else arguments.number("--duration", args.duration)
+    duration = 300.0 if args.duration is None else values.number("--duration", args.duration)
     if not 0 < duration <= LONGEST:
         raise InputError(f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s")
     dt = duration / 300
@@ -203,7 +203,7 @@ def plan(args, case, free):
         tanks = sorted({names.index(w.strip()) for w in args.measure.split(",")})
     voltage = None
     if args.voltage is not None:
-        voltage = [arguments.number("--voltage", text) for text in args.voltage.split(",")]
+        voltage = [values.number("--voltage", text) for text in args.voltage.split(",")]
         high = np.asarray(case.loop.actuator.high)
         if len(voltage) != high.size or not all(0 < v <= top for v, top in zip(voltage, high)):
             tops = ", ".join(f"{v:g}" for v in high)
@@ -212,7 +212,7 @@ def plan(args, case, free):
             )
     length = case.loop.units[0]
     own = float(np.max(np.asarray(case.loop.sensor.noise)))
-    noise = arguments.number("--noise", args.noise) if args.noise else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
+    noise = values.number("--noise", args.noise) if args.noise else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
     if not noise > 0:
         raise InputError(f"--noise {args.noise!r}: must be above 0")
     found = compare_experiments(case, free, noise=noise, duration=duration, dt=dt, levels=tanks, start="known", voltage=voltage)
