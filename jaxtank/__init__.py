@@ -24,7 +24,7 @@ __version__ = "0.1.0"
 flags.enable_small_loop_compilation()
 
 # Names are imported when they are first used: `jaxtank --help` must not wait for jax.
-_HOMES = {
+_NAMES = {
     "InputError": "jaxtank.core.errors",
     "NonFiniteError": "jaxtank.core.errors",
     "EquilibriumError": "jaxtank.core.errors",
@@ -33,45 +33,48 @@ _HOMES = {
     "component": "jaxtank.core.tree",
     "leaf": "jaxtank.core.tree",
     "static": "jaxtank.core.tree",
-    "Clock": "jaxtank.core.records",
+    "Clock": "jaxtank.core.clock",
     "Trajectory": "jaxtank.core.records",
-    "ClosedLoop": "jaxtank.loop.run",
+    "Case": "jaxtank.case",
+    "ClosedLoop": "jaxtank.loop.closed_loop",
     "simulate": "jaxtank.loop.run",
     "evaluate": "jaxtank.loop.run",
     "sensitivities": "jaxtank.loop.run",
-    "check": "jaxtank.loop.run",
+    "check": "jaxtank.loop.validation",
 }
-_ROOMS = (
+_FOLDERS = (
     "analysis",
-    "animation",
-    "actuators",
     "controllers",
+    "core",
+    "instruments",
     "loop",
     "measures",
-    "numerics",
     "observers",
     "plants",
-    "plotting",
+    "plots",
     "presets",
-    "records",
     "rig",
-    "scheduling",
-    "schematic",
-    "sensors",
     "signals",
-    "tree",
+    "xla",
 )
+# Not in __all__: `import *` must not need gymnasium.
+_OPTIONAL = {
+    "export": "jaxtank.export",
+    "interop": "jaxtank.interop",
+    "neighbours": "jaxtank.interop.python_control",
+    "environment": "jaxtank.interop.gymnasium",
+}
 
-_OPTIONAL = ("environment", "export", "neighbours")  # not in __all__: `import *` must not need gymnasium
-
-__all__ = [*_HOMES, *_ROOMS]
+__all__ = [*_NAMES, *_FOLDERS]
 
 
 def __getattr__(name):
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    if name in _ROOMS or name in _OPTIONAL:
+    if name in _NAMES:
+        return getattr(importlib.import_module(_NAMES[name]), name)
+    if name in _FOLDERS:
         return importlib.import_module(f"jaxtank.{name}")
+    if name in _OPTIONAL:
+        return importlib.import_module(_OPTIONAL[name])
     raise AttributeError(f"module 'jaxtank' has no attribute {name!r}")
 
 

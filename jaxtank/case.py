@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.case."""
+"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it."""
 
 import dataclasses
 from collections.abc import Callable, Mapping

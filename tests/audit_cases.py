@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.signals.setpoints import Ramps
 
 MEASURES = ("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level", "min_level")
@@ -139,7 +139,7 @@ def carried(name, lanes):
     at = lambda theta: with_values(loop, dict(zip(order, unravel(theta))))
 
     def forwards(theta):
-        slopes = _sensitivities(loop, clock, MEASURES, order, unravel(theta), None, lanes=lanes)[1]
+        slopes = sensitivities_compiled(loop, clock, MEASURES, order, unravel(theta), None, lanes=lanes)[1]
         return jnp.concatenate([slopes[m].reshape(-1, theta.size) for m in MEASURES])
 
     return Subject(

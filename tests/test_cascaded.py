@@ -15,7 +15,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, with_values
-from jaxtank.loop.run import _evaluate
+from jaxtank.loop.run import evaluate_compiled
 from jaxtank.presets import cascaded
 from jaxtank.signals.base import Table
 from tuning.cli import main
@@ -111,7 +111,7 @@ def test_the_loop_compiles_to_one_function(name):
     from test_compiled_loop import loops_in
 
     case = CASES[name]
-    assert loops_in(_evaluate.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()) >= 1
+    assert loops_in(evaluate_compiled.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()) >= 1
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.25, 1.0, 4.0])
@@ -203,7 +203,7 @@ def test_with_the_pump_off_the_lower_tank_empties_through_its_own_outlet(substep
 
 def test_what_an_inflow_could_not_take_is_counted(capsys):
     """With the pump off for good: what is drawn from the upper tank after it has run empty. By the command."""
-    words = ["simulate", "cascaded/pi", "--set", "actuator.high=1e-9", "--set", "x0=0,0", "--set", "clock.duration=100", "--json"]
+    words = ["simulate", "cascaded/pi", "--set", "actuator.high=1e-9", "--set", "x0=[0,0]", "--set", "clock.duration=100", "--json"]
     assert main.main(words) == 0
     counted = json.loads(capsys.readouterr().out)["measures"]["inflow_shortfall"]
     # 26 samples of 4 s

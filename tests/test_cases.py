@@ -8,7 +8,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, walk
-from jaxtank.loop.run import _evaluate
+from jaxtank.loop.run import evaluate_compiled
 from tuning.bench.bench import is_one_function
 from tuning.cli import main
 from tuning.report.papers import measure
@@ -92,7 +92,7 @@ def test_a_case_is_shown(name, capsys):
 @pytest.mark.parametrize("name", [n for n in NEW if n not in NOT_ONE_FUNCTION])
 def test_a_case_is_one_function(name):
     case = presets.find(name)
-    program = _evaluate.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile().as_text()
+    program = evaluate_compiled.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile().as_text()
     assert is_one_function(program, case.clock.samples)
 
 

@@ -13,8 +13,8 @@ import pytest
 import jaxtank
 from jaxtank.core.clock import Clock
 from jaxtank.core.kahan import nothing, plus, totals
-from jaxtank.loop.derivatives import _sensitivities
-from jaxtank.loop.run import _evaluate, evaluate_for_reverse
+from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.run import evaluate_compiled, evaluate_for_reverse
 from jaxtank.xla import flags as _xla
 from jaxtank.xla import hoist
 from jaxtank.xla.barrier import materialised
@@ -34,7 +34,7 @@ def loops_in(compiled):
 @pytest.mark.parametrize("name", ["ngpc", "backstepping", "backstepping-ff", "ngpc-boxqp"])
 def test_the_loop_compiles_to_one_function(gouta, name):
     case = gouta(name)
-    assert loops_in(_evaluate.lower(case.loop, case.clock, MEASURES, None, False).compile()) >= 1
+    assert loops_in(evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile()) >= 1
 
 
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
@@ -46,22 +46,25 @@ def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_functio
         "ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12}
     )
     names = tuple(m for m in every if serves(m, case.loop))
-    assert loops_in(_evaluate.lower(case.loop, case.clock, names, jax.random.key(0), False).compile()) >= 2
+    assert loops_in(evaluate_compiled.lower(case.loop, case.clock, names, jax.random.key(0), False).compile()) >= 2
 
 
 def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
     case = gouta("backstepping")
-    assert loops_in(_sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile()) >= 1
+    assert (
+        loops_in(sensitivities_compiled.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile())
+        >= 1
+    )
 
 
 def test_other_gains_do_not_recompile(gouta):
     case = gouta("backstepping", {"clock.duration": 20.0})
     jaxtank.evaluate(case.loop, case.clock, MEASURES)
-    before = _evaluate._cache_size()
+    before = evaluate_compiled._cache_size()
     for k in (0.01, 0.2, 3):
         jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17}), case.clock, MEASURES)
     jaxtank.evaluate(gouta("backstepping-table1", {"clock.duration": 20.0}).loop, case.clock, MEASURES)
-    assert _evaluate._cache_size() == before
+    assert evaluate_compiled._cache_size() == before
 
 
 def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
@@ -69,7 +72,7 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
     sizes = []
     for duration in (100.0, 1200.0):
         case = gouta("backstepping", {"clock.duration": duration})
-        stats = _evaluate.lower(case.loop, case.clock, MEASURES, None, False).compile().memory_analysis()
+        stats = evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile().memory_analysis()
         sizes.append(stats.temp_size_in_bytes / case.clock.samples)
     assert max(sizes) < 8 * 8  # bytes per sample: at most eight float64 arrays of inputs
 
@@ -77,7 +80,9 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
 def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
     case = gouta("backstepping")
     stats = (
-        _sensitivities.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile().memory_analysis()
+        sensitivities_compiled.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None)
+        .compile()
+        .memory_analysis()
     )
     assert stats.temp_size_in_bytes < 10e6
     reverse = jax.jit(
@@ -205,7 +210,7 @@ def test_the_option_is_set_on_import_and_can_be_switched_off():
 
 
 def test_a_late_import_warns_once():
-    late = "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop, tuning"
+    late = "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop.run, tuning"
     assert python(late)[1].count("jax had started before jaxtank") == 1
     assert "jax had started" not in python("import jax; import jaxtank")[1]
 
@@ -254,7 +259,7 @@ def test_what_several_read_is_made_once(gouta):
     """Without the walls the parts of this loop repeat most of the step: about 1000 operations on every lane instead of 550."""
     case = gouta("backstepping", {"clock.duration": 2.0})
     gains = {"controller.k": np.full(64, 0.03), "plant.drain": np.tile(case.loop.plant.drain, (64, 1))}
-    run = jax.vmap(lambda v: _evaluate(jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False))
+    run = jax.vmap(lambda v: evaluate_compiled(jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False))
     count, walls = operations_in_lanes(jax.jit(run).lower(gains).compile(), 64)
     assert walls == 4  # the voltages, and the rates of three Runge-Kutta stages
     assert 250 < count < 650
@@ -313,7 +318,8 @@ def test_loops_over_lanes_stay_loops():
     """LLVM would unroll sixteen lanes into sixteen single runs, 36 against 11 ns per step and lane: the program is longer, and says so."""
     assert "xla_cpu_disable_loop_unrolling" in python("import jaxtank, os; print(os.environ['XLA_FLAGS'])")[0]
     code = (
-        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank import presets, loop, Clock\n"
+        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank import presets, Clock\n"
+        "from jaxtank.loop import run as loop\n"
         "case = presets.find('gouta2015/backstepping'); clock = Clock(duration=2.0)\n"
         "run = jax.vmap(lambda k: loop.evaluate_and_flag(jaxtank.with_values(case.loop, {'controller.k1': k}), clock, ('ise',)))\n"
         "print(len(jax.jit(run).lower(np.linspace(0.1, 0.2, 16)).compile().runtime_executable().serialize()))"

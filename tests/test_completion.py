@@ -101,7 +101,7 @@ def test_bash_completes_rig_files_and_folders(script, tmp_path):
 
 def test_it_knows_what_the_parser_and_the_library_have():
     assert completion.NAMES.read_text(encoding="utf-8") == completion.gather(), (
-        "python -c 'from tuning.completion import refresh; refresh()'"
+        "python -c 'from tuning.cli.completion import refresh; refresh()'"
     )
     found = completion.commands_of(parser())
     assert set(found) - {""} == set(main.COMMANDS) and all(c.help for n, c in found.items() if n)
@@ -114,7 +114,7 @@ def test_it_knows_what_the_parser_and_the_library_have():
 
 def test_help_and_completion_do_not_start_jax(capsys):
     code = (
-        "import sys, contextlib, io; from tuning import cli\n"
+        "import sys, contextlib, io; from tuning.cli import main as cli\n"
         "with contextlib.redirect_stdout(io.StringIO()):\n    assert cli.main(['completion', sys.argv[1]]) == 0\n"
         "print([m for m in ('jax', 'numpy', 'scipy', 'matplotlib') if m in sys.modules])"
     )

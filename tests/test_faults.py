@@ -241,7 +241,7 @@ def test_output_that_cannot_be_written_is_one_line():
 
 HOLDER = """
 import sys, time
-from tuning.holds import hold
+from tuning.storage.folder_lock import hold
 with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
     print("held", flush=True)
     time.sleep(60)

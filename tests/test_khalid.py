@@ -24,7 +24,7 @@ from jaxtank.controllers.incremental import EXACT, incremental_model
 from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop.run import _evaluate
+from jaxtank.loop.run import evaluate_compiled
 from jaxtank.presets import khalid
 
 DT = 2.0
@@ -730,7 +730,7 @@ def test_the_loop_compiles_to_one_function(name):
     slopes are solved for with LAPACK: their outer loop does not, only that of the iterations does."""
     case = PRESET.cases[name]
     text = (
-        _evaluate.lower(case.loop, dataclasses.replace(case.clock, substeps=1), ("rms_error_total",), None, False)
+        evaluate_compiled.lower(case.loop, dataclasses.replace(case.clock, substeps=1), ("rms_error_total",), None, False)
         .compile()
         .as_text()
     )

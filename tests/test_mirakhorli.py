@@ -828,10 +828,10 @@ def test_the_printed_law_has_no_useful_slopes():
 def test_each_case_compiles_to_one_loop(name):
     from test_compiled_loop import loops_in
 
-    from jaxtank.loop.run import _evaluate
+    from jaxtank.loop.run import evaluate_compiled
 
     case = load("mirakhorli").cases[name]
-    compiled = _evaluate.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()
+    compiled = evaluate_compiled.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile()
     assert loops_in(compiled) >= 1
 
 

@@ -174,7 +174,7 @@ import sys
 sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
 import jaxtank
 from jaxtank import *
-assert not {"jaxtank.neighbours", "jaxtank.environment", "jaxtank.export"} & set(sys.modules)
+assert not {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"} & set(sys.modules)
 assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
 assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
 try:

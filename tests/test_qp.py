@@ -301,7 +301,7 @@ import os
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import jaxtank
-from jaxtank import qp
+from jaxtank.analysis import qp
 jax.config.update("jax_enable_x64", True)
 n = 48
 root, limit = np.random.default_rng(0).normal(size=(n, n)), np.full(n, 0.5)

@@ -59,4 +59,4 @@ def test_every_exit_code_is_told():
     """Those of a search, of an identification, of refused input and of refused data."""
     told = re.search(r"Exit codes: (.*?)\. Results", README.read_text(), re.DOTALL)[1]
     codes = {int(code) for code in re.findall(r"(?:^|, )(\d+) ", told.replace("\n", " "))}
-    assert codes == {*tuning.EXIT.values(), *identification.STATUS.values(), 2}
+    assert codes == {*tuning.EXIT.values(), *identification.STATUS.values(), 2, 143}

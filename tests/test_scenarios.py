@@ -71,7 +71,7 @@ def test_forward_and_reverse_agree_over_scenarios(case, monkeypatch):
     make = lambda: Problem(case, objective=SQUARES, limits={"max_level": 34.0}, scenarios=SEVERAL, seed=7)
     z = np.array([0.45, 0.62])
     forward = make().point(z)
-    monkeypatch.setattr("tuning.objective.FORWARD_LIMIT", 1)
+    monkeypatch.setattr("tuning.problem.problem.FORWARD_LIMIT", 1)
     reverse = make().point(z)
     assert reverse.cost == pytest.approx(forward.cost, rel=1e-12)
     np.testing.assert_allclose(reverse.gradient, forward.gradient, rtol=1e-8)

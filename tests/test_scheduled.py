@@ -19,8 +19,8 @@ from jaxtank.controllers.gain_schedule import interpolate
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import portion
 from jaxtank.core.tree import component, describe, get_value, leaf, parameters, with_values
-from jaxtank.loop.derivatives import _sensitivities
-from jaxtank.loop.run import _evaluate, evaluate_and_flag, evaluate_for_reverse
+from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.run import evaluate_and_flag, evaluate_compiled, evaluate_for_reverse
 from jaxtank.rig.schedule import schedule
 from jaxtank.xla.reachability import use_of
 from tuning.cli import main
@@ -137,7 +137,7 @@ def test_the_anti_windup_has_them_too():
 )
 def test_the_loop_is_still_one_function(name, gains, variable):
     case = on(presets.find(name), gains, variable)
-    text = _evaluate.lower(case.loop, case.clock, MEASURES, None, False).compile().as_text()
+    text = evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile().as_text()
     assert 'xla_cpu_small_call="true"' in text
 
 
@@ -145,17 +145,17 @@ def test_so_is_that_of_ten_derivatives(gouta):
     case = on(gouta("backstepping"), ("k", "k1"), "r1", (3.0, 6.0, 9.0, 12.0, 16.0))
     names = tuple(case.free)
     point = tuple(np.float64(get_value(case.loop, n)) for n in names)
-    compiled = _sensitivities.lower(case.loop, case.clock, MEASURES, names, point, None).compile()
+    compiled = sensitivities_compiled.lower(case.loop, case.clock, MEASURES, names, point, None).compile()
     assert len(names) == 10 and 'xla_cpu_small_call="true"' in compiled.as_text()
 
 
 def test_other_values_and_knots_do_not_recompile(gouta):
     case = on(gouta("backstepping", {"clock.duration": 20.0}), ("k",), "r1")
     jaxtank.evaluate(case.loop, case.clock, MEASURES)
-    before = _evaluate._cache_size()
+    before = evaluate_compiled._cache_size()
     for values in ({"controller.values[0,1]": 0.5}, {"controller.knots": [1.0, 2.0, 3.0, 4.0]}):
         jaxtank.evaluate(with_values(case.loop, values), case.clock, MEASURES)
-    assert _evaluate._cache_size() == before
+    assert evaluate_compiled._cache_size() == before
 
 
 def test_vmap_equals_a_python_loop(gouta):

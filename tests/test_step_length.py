@@ -204,7 +204,7 @@ changes = [[2.0, 1, 12.0], [8.0, 1, {last}]]
 "clock.duration" = 15.0
 "clock.substeps" = {substeps}
 [free]
-"controller.Kc" = [0.01, 10.0]
+"controller.Kc" = [0.4, 0.6]
 [uncertain]
 "plant.pump_gain" = 0.05
 """

@@ -251,8 +251,8 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         for path in root.rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert packed == there and {"tuning/floor.c", "tuning/names.txt"} <= packed
-    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "txt"}
+    assert packed == there and {"tuning/bench/floor.c", "tuning/cli/names.txt"} <= packed
+    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 
@@ -266,7 +266,8 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
         "CHANGELOG.md",
         "LICENSE",
         "jaxtank/__init__.py",
-        "tuning/floor.c",
+        "tuning/bench/floor.c",
+        "CITATION.cff",
         "tests/conftest.py",
     } <= names
     assert {"tests/rigs/watertank.toml", "tests/slow.txt", "tests/versions.sh", "notebooks/run.py"} <= names

@@ -9,10 +9,8 @@ result.save("tuned")
 """
 
 import importlib
-import sys
-import types
 
-_HOMES = {
+_NAMES = {
     "Bound": "tuning.problem.bounds",
     "Problem": "tuning.problem.problem",
     "TuningResult": "tuning.search.result",
@@ -40,23 +38,12 @@ _HOMES = {
     "tune": "tuning.search.tuner",
 }
 
-__all__ = list(_HOMES)
-
-
-class _Package(types.ModuleType):
-    """A package in which a function and the module it lives in share a name: the name stays the function's, whichever is imported first."""
-
-    def __setattr__(self, name, value):
-        if not (name in _HOMES and isinstance(value, types.ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+__all__ = list(_NAMES)
 
 
 def __getattr__(name):
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
+    if name in _NAMES:
+        return getattr(importlib.import_module(_NAMES[name]), name)
     raise AttributeError(f"module 'tuning' has no attribute {name!r}")
 
 

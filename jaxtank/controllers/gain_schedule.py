@@ -142,7 +142,7 @@ class Scheduled(Controller):
 
     gains: names of leaves of the law, "k" or an entry "Kc[0]", "K[0,1]". A scheduled leaf that is a number is absent (None) in `law`; of
     an array the scheduled entries are not used. variable: "r1", the setpoint of output 1, or "h2", the estimated level of tank 2,
-    counted from 1 as on the rig. Build one with `jaxtank.scheduling.schedule`.
+    counted from 1 as on the rig. Build one with `jaxtank.rig.schedule.schedule`.
 
     A gain of which the law makes anything before the loop (`prepare`, `inputs`, `init`), or from which it designs matrices or runs a
     loop in `step` (weights of a Riccati equation or of a predictive law, the order of a fractional integral), is refused by `check`:

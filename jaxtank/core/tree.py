@@ -152,9 +152,9 @@ def check_leaves(tree, names=None, vacant=()):
 def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
     if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
-        raise InputError(f"{name} = {_short(value)}: must be a number or an array, np.array(...)")
+        raise InputError(f"{name} = {shortened(value)}: must be a number or an array, np.array(...)")
     if not is_real(value):
-        raise InputError(f"{name} = {_short(value)}: must be a real number or an array of real numbers")
+        raise InputError(f"{name} = {shortened(value)}: must be a real number or an array of real numbers")
     array, low, high = np.asarray(value), meta["low"], meta["high"]
     array = number(value) if array.dtype == object else array  # whole numbers of 2^64 and more are no numbers to numpy
     good = np.isfinite(array)
@@ -174,7 +174,7 @@ def check_value(name, value, meta):
     raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
 
 
-def _short(value):
+def shortened(value):
     """`value` for a message, cut where it would fill the screen."""
     try:
         text = repr(value)
@@ -224,11 +224,11 @@ def _fitted(old, index, value, name):
     on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
     wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
     if not is_real(value):  # numpy would make 1 of True, 3 of "3", and drop what is imaginary
-        raise InputError(f"{name} = {_short(value)}: {wanted}")
+        raise InputError(f"{name} = {shortened(value)}: {wanted}")
     try:
         value = jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} = {_short(value)}: {wanted}") from None
+        raise InputError(f"{name} = {shortened(value)}: {wanted}") from None
     shape = np.shape(old)
     if index:
         _entry(old, index, name)

@@ -1,11 +1,11 @@
-"""TODO docstring of jaxtank.export.c."""
+"""Statements as C99."""
 
 import re
 
 import numpy as np
 
 from jaxtank.export import lowering as cg
-from jaxtank.export.printer import MATHS, _about, _as_real, _every, _has, _wrapped
+from jaxtank.export.printer import MATHS, as_real, every, has, header, wrapped
 
 INFIX = {
     "add": "+",
@@ -85,7 +85,7 @@ class C:
                 out.append(f"{indent}const {C_TYPES[s.kind]} {s.name} = {self.right(s.op, s.args)};")
             elif isinstance(s, cg.Array):
                 fixed = "static const" if not any(isinstance(e, cg.Ref) for e in s.entries) else "const"
-                out += _wrapped(f"{indent}{fixed} real {s.name}[{len(s.entries)}] = {{", map(self.value, s.entries), indent, "};")
+                out += wrapped(f"{indent}{fixed} real {s.name}[{len(s.entries)}] = {{", map(self.value, s.entries), indent, "};")
             elif isinstance(s, cg.Matrix):
                 size = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}.get(s.op, lambda n, k: n * k)(*s.sizes)
                 out.append(f"{indent}real {s.name}[{size}];")
@@ -146,7 +146,7 @@ static void backward(int n, int k, const real *a, const real *b, real *out)
 """
 
 
-def _c(law, case, name, precision):
+def print_c(law, case, name, precision):
     short = "f" if precision == "float" else ""
     sizes = {"state": law.state, "tanks": law.tanks, "outputs": law.outputs, "pumps": law.pumps}
     upper = name.upper()
@@ -161,19 +161,19 @@ def _c(law, case, name, precision):
         return f"y[{k}]" if k < law.tanks else f"u[{k - law.tanks}]"
 
     head = [
-        *_about(law, case, " *", name, f"{name}_init takes the levels and inputs before the first period."),
+        *header(law, case, " *", name, f"{name}_init takes the levels and inputs before the first period."),
     ]
     lines = ["/*", *head, " */", "#include <math.h>", "", f"typedef {precision} real;", "#define R(x) ((real)(x))"]
     lines += [f"#define {m.upper()} {m}{short}" for m in MATHS]
     lines += ["#define MAX(a, b) ((a) > (b) ? (a) : (b))", "#define MIN(a, b) ((a) < (b) ? (a) : (b))", ""]
     lines += [f"#define {upper}_DT {case.clock.dt!r}", *(f"#define {upper}_{n.upper()} {max(v, 1)}" for n, v in sizes.items())]
     lines += ["", f"typedef struct {{ real s[{upper}_STATE]; }} {name}_state;"]
-    if _has(law.step, cg.Matrix):
-        used = {s.op for s in _every(law.step) if isinstance(s, cg.Matrix)}
+    if has(law.step, cg.Matrix):
+        used = {s.op for s in every(law.step) if isinstance(s, cg.Matrix)}
         lines += [b for b in MATRIX_C.strip("\n").split("\n\n") if re.search(r"void (\w+)", b).group(1) in used]
     printer = C(begun)
     lines += ["", f"void {name}_init({name}_state *state, const real *y, const real *u)", "{", "    (void)y; (void)u;"]
-    lines += printer.lines(law.begin) + [f"    state->s[{i}] = {_as_real(printer, e)};" for i, e in enumerate(law.begun)]
+    lines += printer.lines(law.begin) + [f"    state->s[{i}] = {as_real(printer, e)};" for i, e in enumerate(law.begun)]
     lines += ["}" if law.state else "    state->s[0] = R(0.0);\n}"]
     printer = C(stepped)
     lines += [
@@ -183,7 +183,7 @@ def _c(law, case, name, precision):
     ]
     lines += ["    (void)t; (void)y; (void)r; (void)dr; (void)ddr; (void)state;", *printer.lines(law.step)]
     # a state that is only handed on must be read before it is written
-    lines += [f"    const real next{i} = {_as_real(printer, e)};" for i, e in enumerate(law.after)]
+    lines += [f"    const real next{i} = {as_real(printer, e)};" for i, e in enumerate(law.after)]
     lines += [f"    u[{j}] = {printer.value(e)};" for j, e in enumerate(law.u)]
     lines += [f"    state->s[{i}] = next{i};" for i in range(law.state)] + ["}", ""]
     return "\n".join(lines)

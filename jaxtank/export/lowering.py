@@ -519,7 +519,7 @@ def _weighted(writer, g, weight):
 
 
 NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
-"""Functions of `jaxtank.qp` whose loops go through arrays by an index: written as matrix operations."""
+"""Functions of `jaxtank.analysis.qp` whose loops go through arrays by an index: written as matrix operations."""
 
 
 def _scan(writer, eqn, operands):

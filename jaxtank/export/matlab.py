@@ -1,10 +1,10 @@
-"""TODO docstring of jaxtank.export.matlab."""
+"""Statements as a MATLAB function."""
 
 import numpy as np
 
 from jaxtank.export import lowering as cg
 from jaxtank.export.c import INFIX, C
-from jaxtank.export.printer import SAME_NAME, _about, _every, _wrapped
+from jaxtank.export.printer import SAME_NAME, every, header, wrapped
 
 
 class Matlab(C):
@@ -56,7 +56,7 @@ class Matlab(C):
             if isinstance(s, cg.Define):
                 out.append(f"{indent}{s.name} = {self.right(s.op, s.args)};")
             elif isinstance(s, cg.Array):
-                out += _wrapped(f"{indent}{s.name} = [", map(self.value, s.entries), indent, "];", more=" ...")
+                out += wrapped(f"{indent}{s.name} = [", map(self.value, s.entries), indent, "];", more=" ...")
             elif isinstance(s, cg.Matrix):
                 out.append(f"{indent}{s.name} = {s.op}_({', '.join([*map(str, s.sizes), *s.operands])});")
             elif isinstance(s, cg.Until):
@@ -104,7 +104,7 @@ function out = pick(condition, yes, no)
 end"""
 
 
-def _matlab(law, case, name, precision):
+def print_matlab(law, case, name, precision):
     ends = np.cumsum([law.state, 1, law.tanks, law.outputs, law.outputs, law.outputs])
 
     def stepped(k):
@@ -116,7 +116,7 @@ def _matlab(law, case, name, precision):
         return f"y({k + 1})" if k < law.tanks else f"u({k - law.tanks + 1})"
 
     lines = [f"function [u, s] = {name}(s, t, y, r, dr, ddr, u)"]
-    lines += _about(law, case, "%", name, "s: state; give [] in the first period, and u, the inputs before it.")
+    lines += header(law, case, "%", name, "s: state; give [] in the first period, and u, the inputs before it.")
     printer = Matlab(begun)
     lines += ["    if isempty(s)", *printer.lines(law.begin, "        ")]
     lines += [f"        s = zeros(1, {max(law.state, 1)});"]
@@ -126,7 +126,7 @@ def _matlab(law, case, name, precision):
     lines += [f"    next{i + 1} = {printer.value(e)};" for i, e in enumerate(law.after)]
     lines += [f"    u = zeros(1, {law.pumps});", *(f"    u({j + 1}) = {printer.value(e)};" for j, e in enumerate(law.u))]
     lines += [f"    s({i + 1}) = next{i + 1};" for i in range(law.state)] + ["end"]
-    used = {s.op for s in _every(law.step) if isinstance(s, cg.Matrix)}
-    picks = any(isinstance(s, cg.Define) and s.op == "select" for s in _every([*law.step, *law.begin]))
+    used = {s.op for s in every(law.step) if isinstance(s, cg.Matrix)}
+    picks = any(isinstance(s, cg.Define) and s.op == "select" for s in every([*law.step, *law.begin]))
     lines += [MATRIX_M[op] for op in MATRIX_M if op in used] + ([PICK_M] if picks else [])
     return "\n".join(lines) + "\n"

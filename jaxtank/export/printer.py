@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.export.printer."""
+"""A controller and its observer as statements, and what the printers of all languages share."""
 
 import functools
 import re
@@ -100,7 +100,7 @@ SAME_NAME = (
 )
 
 
-def _wrapped(head, items, indent, tail, width=130, more=""):
+def wrapped(head, items, indent, tail, width=130, more=""):
     rows, line = [], head
     for item in items:
         if len(line) + len(item) > width:
@@ -113,7 +113,7 @@ def _wrapped(head, items, indent, tail, width=130, more=""):
 MATHS = ("sqrt", "fabs", "exp", "log", "tanh", "sin", "cos", "floor", "pow", "rint", "fmod", "cbrt", "exp2", *SAME_NAME)
 
 
-def _about(law, case, mark, name, begin):
+def header(law, case, mark, name, begin):
     """What the file says of itself."""
     length, drive = case.loop.units
     gains = [(n, v) for n, v in sorted(_shown(case).items())]
@@ -145,17 +145,17 @@ def _shown(case):
     return found
 
 
-def _as_real(printer, e):
+def as_real(printer, e):
     text = printer.value(e)
     return f"(real)({text})" if not isinstance(e, float) else text
 
 
-def _every(statements):
+def every(statements):
     for s in statements:
         yield s
         if isinstance(s, cg.Loop):
-            yield from _every(s.body)
+            yield from every(s.body)
 
 
-def _has(statements, kind):
-    return any(isinstance(s, kind) for s in _every(statements))
+def has(statements, kind):
+    return any(isinstance(s, kind) for s in every(statements))

@@ -4,8 +4,8 @@ import re
 
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
-from jaxtank.export.c import C_CALLS, _c
-from jaxtank.export.matlab import _matlab
+from jaxtank.export.c import C_CALLS, print_c
+from jaxtank.export.matlab import print_matlab
 from jaxtank.export.printer import SAME_NAME, Code, function_name
 
 LANGUAGES = ("c", "m")
@@ -34,7 +34,7 @@ def export(case, language="c", precision="double", name=None):
             f"--name {name!r}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51"
         )
     law = Code(case)
-    return (_c if language == "c" else _matlab)(law, case, name, precision)
+    return (print_c if language == "c" else print_matlab)(law, case, name, precision)
 
 
 """Functions that C and MATLAB have by the same name."""

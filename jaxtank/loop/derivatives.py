@@ -22,7 +22,7 @@ anew for each entry (20 parameters, one run: 62 of 80 ms, with the product 5 of 
 @functools.partial(
     jax.jit, static_argnames=("clock", "names", "order", "squares", "lanes")
 )  # a dict would come back with its keys sorted
-def _sensitivities(loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),), lanes=False):
+def sensitivities_compiled(loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),), lanes=False):
     """What `loop.sensitivities` returns, unchecked. `lanes`: this will be one of several runs side by side."""
     flat, unflatten = ravel_pytree(values)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))

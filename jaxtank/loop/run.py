@@ -18,7 +18,7 @@ from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.records import Trajectory
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of, zero_of
-from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
@@ -33,7 +33,7 @@ def simulate(loop, clock, key=None, save_every=1):
     check(loop, clock, key)
     if not isinstance(save_every, int) or save_every < 1:
         raise InputError(f"save_every = {save_every!r}: must be a whole number of at least 1 sample")
-    trajectory, broken = _simulate(loop, clock, key, min(save_every, clock.samples))
+    trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
     return trajectory
 
@@ -47,14 +47,14 @@ def evaluate(loop, clock, measures, key=None):
     """
     names = _names(measures)
     check(loop, clock, key)
-    values, broken = _evaluate(loop, clock, names, key, False)
+    values, broken = evaluate_compiled(loop, clock, names, key, False)
     _report_broken(broken, loop, clock, key)
     return values
 
 
 def evaluate_and_flag(loop, clock, measures, key=None):
     """(`evaluate`'s values, True if the run stopped being finite); checks nothing, raises nothing: for batches and searches."""
-    return _evaluate(loop, clock, _names(measures), key, False)
+    return evaluate_compiled(loop, clock, _names(measures), key, False)
 
 
 def evaluate_for_reverse(loop, clock, measures, key=None):
@@ -65,7 +65,7 @@ def evaluate_for_reverse(loop, clock, measures, key=None):
     """
     names = _names(measures)
     check(loop, clock, key)
-    return _evaluate(loop, clock, names, key, True)[0]
+    return evaluate_compiled(loop, clock, names, key, True)[0]
 
 
 def sensitivities(loop, clock, measures, values, key=None, squares=None):
@@ -86,7 +86,7 @@ def sensitivities(loop, clock, measures, values, key=None, squares=None):
         if not ms.MEASURES[name].residual:
             raise InputError(f"squares: {name} is not a sum of squares; those are {', '.join(ms.SQUARES)}")
     chosen = tuple((m, float(w)) for m, w in squares.items())
-    return _sensitivities(loop, clock, _names(measures), tuple(values), tuple(values.values()), key, chosen)
+    return sensitivities_compiled(loop, clock, _names(measures), tuple(values), tuple(values.values()), key, chosen)
 
 
 def _names(measures):
@@ -96,7 +96,7 @@ def _names(measures):
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "names", "checkpoint"))
-def _evaluate(loop, clock, names, key, checkpoint):
+def evaluate_compiled(loop, clock, names, key, checkpoint):
     loop = keyed(loop, key)
     run = run_of(loop, clock)
 
@@ -107,7 +107,7 @@ def _evaluate(loop, clock, names, key, checkpoint):
 
     carry = (initial(loop, clock), ms.start(run, names))
     if checkpoint:
-        state, acc = _checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
+        state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
     elif clock.samples > PIECE and is_pointwise(loop):
         whole, rest = divmod(clock.samples, PIECE)
         piece = lambda c, number, samples=PIECE: (scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0], None)
@@ -118,7 +118,7 @@ def _evaluate(loop, clock, names, key, checkpoint):
     return ms.read(run, acc, names), is_broken(state)
 
 
-def _checkpointed_scan(body, carry, xs, length):
+def checkpointed_scan(body, carry, xs, length):
     """A scan over about sqrt(length) pieces, each recomputed in the reverse pass."""
     inner = math.isqrt(length)
     outer = length // inner
@@ -130,7 +130,7 @@ def _checkpointed_scan(body, carry, xs, length):
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "save_every"))
-def _simulate(loop, clock, key, save_every):
+def simulate_compiled(loop, clock, key, save_every):
     loop = keyed(loop, key)
     rows = (clock.samples - 1) // save_every + 1
     xs = inputs(loop, clock, (), key)
@@ -165,7 +165,7 @@ def _report_broken(broken, loop, clock, key):
     if isinstance(broken, jax.core.Tracer) or np.ndim(broken) or not broken:
         return
     loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same
-    run = _simulate(loop, clock, key, 1)[0]
+    run = simulate_compiled(loop, clock, key, 1)[0]
     bad = ~np.isfinite(np.asarray(run.x))
     if not bad.any():  # only the step after the last sample
         return

@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.loop.step."""
+"""One sample of the closed loop: what it needs, and what it hands to the next."""
 
 from typing import Any, NamedTuple
 

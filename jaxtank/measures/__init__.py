@@ -22,9 +22,9 @@ from jaxtank.measures.catalogue import (
 
 __all__ = [
     "MEASURES",
-    "Run",
     "SQUARES",
     "TIMES",
+    "Run",
     "check_names",
     "entries",
     "needs",

@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.measures.accumulators."""
+"""What the time loop carries for each measure: running sums, extremes and times."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -96,14 +96,14 @@ def _update_settling(run, state, sample, window):
     """Per output (target now, time since its change ended at the last sample outside the band [s], 1 if still outside, worst so far)."""
     new = []
     for (old, last, outside, worst), (target, step, since, band), r, e in zip(state, window, sample.r, sample.e):
-        worst = jnp.where((target != old) & (_settled(last, outside) > worst), _settled(last, outside), worst)
+        worst = jnp.where((target != old) & (settled(last, outside) > worst), settled(last, outside), worst)
         last = jnp.where(target != old, -1e9, last)
         out = (step != 0.0) & (jnp.abs(r + e - target) > band)
         new.append((target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst))
     return tuple(new)
 
 
-def _settled(last, outside):
+def settled(last, outside):
     """Settling time of a change that is over: infinite if its last sample was outside the band."""
     return jnp.where(outside > 0, jnp.inf, last)
 
@@ -132,7 +132,7 @@ def _update_recovery(run, state, sample, since):
     new = []
     for (last, outside, worst), r, e in zip(state, sample.r, sample.e):
         fresh = since < last
-        done = _settled(last, outside)
+        done = settled(last, outside)
         worst = jnp.where(fresh & (done > worst), done, worst)
         out, watched = jnp.abs(e) > BAND * jnp.abs(r), since >= 0.0
         last = jnp.where(watched, jnp.where(out, since, jnp.where(fresh, 0.0, last)), last)
@@ -140,8 +140,8 @@ def _update_recovery(run, state, sample, since):
     return tuple(new)
 
 
-def _recovery(run, acc):
-    return _list([jnp.maximum(worst, _settled(last, outside)) for last, outside, worst in acc["recovery"]])
+def recovery(run, acc):
+    return as_list([jnp.maximum(worst, settled(last, outside)) for last, outside, worst in acc["recovery"]])
 
 
 def _deviation(run, sample, rest):
@@ -223,13 +223,13 @@ RESIDUALS = {
 }
 
 
-def _mean(run, values):
+def mean(run, values):
     return tuple(v / run.samples for v in values)
 
 
-def _list(values):
+def as_list(values):
     return jnp.stack([jnp.asarray(v) for v in values])
 
 
-def _root_mean(name):
-    return lambda run, acc: root_of_mean(_list(_mean(run, acc[name])))
+def root_mean(name):
+    return lambda run, acc: root_of_mean(as_list(mean(run, acc[name])))

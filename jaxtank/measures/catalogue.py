@@ -13,7 +13,7 @@ from jaxtank.core.errors import unknown
 from jaxtank.core.kahan import totals
 from jaxtank.core.numerics import at_least, root_of_mean
 from jaxtank.core.units import DEFAULT, local
-from jaxtank.measures.accumulators import ACCUMULATORS, RESIDUALS, _list, _mean, _recovery, _root_mean, _settled
+from jaxtank.measures.accumulators import ACCUMULATORS, RESIDUALS, as_list, mean, recovery, root_mean, settled
 
 """Half width of the recovery band, as a share of the setpoint [-]."""
 
@@ -39,20 +39,20 @@ class Measure(NamedTuple):
 
 
 def _extremes(name, index=0):
-    return lambda run, acc: _list([pair[index] for pair in acc[name]])
+    return lambda run, acc: as_list([pair[index] for pair in acc[name]])
 
 
 def _per_run(name, scale):
-    return lambda run, acc: _list([s * scale(run) for s in acc[name]])
+    return lambda run, acc: as_list([s * scale(run) for s in acc[name]])
 
 
 def _settling(run, acc):
-    worst = _list([jnp.maximum(worst, _settled(last, outside)) for _, last, outside, worst in acc["settling"]])
+    worst = as_list([jnp.maximum(worst, settled(last, outside)) for _, last, outside, worst in acc["settling"]])
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
 def _rise(run, acc):
-    longest = _list([state[3] for state in acc["rise"]])
+    longest = as_list([state[3] for state in acc["rise"]])
     return jnp.where(longest > 0, longest, jnp.nan)
 
 
@@ -61,12 +61,12 @@ def _overshoot_percent(run, acc):
 
 
 MEASURES = {
-    "rms_error": Measure("cm", "output", ("e2",), _root_mean("e2"), "root mean square tracking error"),
+    "rms_error": Measure("cm", "output", ("e2",), root_mean("e2"), "root mean square tracking error"),
     "rms_error_total": Measure(
         "cm",
         "run",
         ("e2",),
-        lambda run, acc: root_of_mean(sum(_mean(run, acc["e2"]))),
+        lambda run, acc: root_of_mean(sum(mean(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
     ),
     "mean_square_error": Measure(
@@ -99,19 +99,19 @@ MEASURES = {
         residual="past2",
         scale=lambda run: 1.0 / run.samples,
     ),
-    "rms_input": Measure("V", "pump", ("u2",), _root_mean("u2"), "root mean square input"),
+    "rms_input": Measure("V", "pump", ("u2",), root_mean("u2"), "root mean square input"),
     "input_travel": Measure(
         "V",
         "pump",
         ("travel",),
-        lambda run, acc: _list(acc["travel"][1]),
+        lambda run, acc: as_list(acc["travel"][1]),
         "sum of the absolute changes of the input",
     ),
     "mean_square_travel": Measure(
         "V^2",
         "pump",
         ("changes2",),
-        lambda run, acc: _list(acc["changes2"][1]) / run.samples,
+        lambda run, acc: as_list(acc["changes2"][1]) / run.samples,
         "mean of the squared changes of the input from sample to sample",
         residual="changes2",
         scale=lambda run: 1.0 / run.samples,
@@ -148,7 +148,7 @@ MEASURES = {
         "cm",
         "run",
         ("over_rim2",),
-        lambda run, acc: root_of_mean(sum(_mean(run, acc["over_rim2"]))),
+        lambda run, acc: root_of_mean(sum(mean(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
     ),
     "mean_square_over_rim": Measure(
@@ -160,12 +160,12 @@ MEASURES = {
         residual="over_rim2",
         scale=lambda run: 1.0 / run.samples,
     ),
-    "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: _list(acc["spilled"]), "volume lost over the rim"),
+    "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: as_list(acc["spilled"]), "volume lost over the rim"),
     "inflow_shortfall": Measure(
         "cm^3",
         "tank",
         ("shortfall",),
-        lambda run, acc: _list(acc["shortfall"]),
+        lambda run, acc: as_list(acc["shortfall"]),
         "volume that a negative inflow could not take from an empty tank",
     ),
     "overshoot_percent": Measure(
@@ -188,13 +188,11 @@ MEASURES = {
         "s",
         "output",
         ("recovery",),
-        _recovery,
+        recovery,
         "longest time from the start of a pour to the last sample outside +-5 % of the setpoint; none: never recovered",
         pours=True,
     ),
-    "estimation_rms": Measure(
-        "cm", "tank", ("estimate2",), _root_mean("estimate2"), "root mean square error of the level estimate"
-    ),
+    "estimation_rms": Measure("cm", "tank", ("estimate2",), root_mean("estimate2"), "root mean square error of the level estimate"),
     "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
     "time_of_min_level": Measure("s", "tank", ("min_level",), _extremes("min_level", 1), "when the lowest level was reached"),
 }

@@ -13,7 +13,7 @@ def integrate(plant, integrator, t, x, u, d, h):
 
 
 def change(plant, integrator, t, x, u, d, h):
-    """What the levels change by in that step, for sums that keep what rounding takes (`jaxtank.compensated`)."""
+    """What the levels change by in that step, for sums that keep what rounding takes (`jaxtank.core.kahan`)."""
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return tuple(h * k for k in rates)

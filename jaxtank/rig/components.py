@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import _short, number
+from jaxtank.core.tree import number, shortened
 from jaxtank.core.units import local
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
 from jaxtank.plants.hydraulics import in_unit
@@ -88,13 +88,13 @@ def _value(name, value, field, plant):
     if field.metadata.get("kind") == "leaf":
         array = _shaped(name, value, field.metadata, plant)
         if field.type is float and array.ndim:
-            raise InputError(f"{name} = {_short(value)}: must be one number")
+            raise InputError(f"{name} = {shortened(value)}: must be one number")
         return array
     if field.type is tuple:  # tanks, counted from 1 in a file
         if not (isinstance(value, list) and all(isinstance(i, int) and not isinstance(i, bool) for i in value)):
-            raise InputError(f"{name} = {_short(value)}: must be a list of tanks, counted from 1")
+            raise InputError(f"{name} = {shortened(value)}: must be a list of tanks, counted from 1")
         if not all(1 <= i <= plant.tanks for i in value):
-            raise InputError(f"{name} = {_short(value)}: tanks are counted from 1 to {plant.tanks}")
+            raise InputError(f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}")
         return tuple(i - 1 for i in value)
     return static_value(name, value, field.metadata, field.type)
 
@@ -104,7 +104,7 @@ def _shaped(name, value, meta, plant):
     try:
         array = number(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} = {_short(value)}: must be a number or a list of numbers") from None
+        raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers") from None
     size = size_of(meta, plant)
     return np.full(size, array) if size is not None and array.ndim == 0 else array
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import _short, describe, get_value
+from jaxtank.core.tree import describe, get_value, shortened
 
 
 def check_log(plant, table):
@@ -15,10 +15,10 @@ def check_log(plant, table):
             raise unknown("key of [log]", slot, slots)
         pair = [spec] if isinstance(spec, str) else spec
         if not (isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2 and all(isinstance(v, str) and v.strip() for v in pair)):
-            raise InputError(f"log {slot} = {_short(spec)}: must be a column's header, or [header, unit]")
+            raise InputError(f"log {slot} = {shortened(spec)}: must be a column's header, or [header, unit]")
         for other, taken in found.items():
             if (taken if isinstance(taken, str) else taken[0]).strip() == pair[0].strip() != "none":
-                raise InputError(f"log {slot} = {_short(pair[0])}: that column is {other} already")
+                raise InputError(f"log {slot} = {shortened(pair[0])}: that column is {other} already")
         found[slot] = pair[0] if len(pair) == 1 else tuple(pair)
     return found
 

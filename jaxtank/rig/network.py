@@ -7,7 +7,7 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import _short, check_value, number
+from jaxtank.core.tree import check_value, number, shortened
 from jaxtank.core.units import DEFAULT, check_unit, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -87,7 +87,7 @@ def tank_index(value, where, named, count):
             raise unknown(f"tank of {where}", value, named or ["1"])
         return named[value]
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= count:
-        raise InputError(f"{where} = {_short(value)}: must be a tank, by its name or its number from 1 to {count}")
+        raise InputError(f"{where} = {shortened(value)}: must be a tank, by its name or its number from 1 to {count}")
     return value - 1
 
 
@@ -119,10 +119,10 @@ def build(table):
     def pair(value, where, short=False):
         entries = value if isinstance(value, list) else [value]
         if not 1 + (not short) <= len(entries) <= 2:
-            raise InputError(f"{where} = {_short(value)}: must name {'one tank, or two' if short else 'two tanks'}")
+            raise InputError(f"{where} = {shortened(value)}: must name {'one tank, or two' if short else 'two tanks'}")
         found = [tank(v, where) for v in entries]
         if len(set(found)) < len(found):
-            raise InputError(f"{where} = {_short(value)}: must be two different tanks")
+            raise InputError(f"{where} = {shortened(value)}: must be two different tanks")
         return (*found, None) if len(found) == 1 else tuple(found)
 
     for i, (p, written) in enumerate(zip(pumps, table["pump"])):
@@ -135,7 +135,7 @@ def build(table):
     feeds = [pair(p["to"], f"pump {i + 1}: to", short=True) for i, p in enumerate(pumps)]
     outputs = more["outputs"] if more["outputs"] is not None else [first + 1 for first, _ in feeds]
     if not isinstance(outputs, list) or not outputs:
-        raise InputError(f"plant.outputs = {_short(outputs)}: must be a list of tanks")
+        raise InputError(f"plant.outputs = {shortened(outputs)}: must be a list of tanks")
     overflows = [pair([e["from"], e["to"]], f"spill {i + 1}") for i, e in enumerate(spills)]
     _check_shares(overflows, table.get("spill", []), spills)
     plant = network(
@@ -194,7 +194,7 @@ def build(table):
 
 def _units(value):
     if not (isinstance(value, list) and len(value) == 2 and all(isinstance(v, str) and v for v in value)):
-        raise InputError(f'units = {_short(value)}: must be [length, pump input], as ["cm", "V"]')
+        raise InputError(f'units = {shortened(value)}: must be [length, pump input], as ["cm", "V"]')
     return tuple(check_unit("units: entry", name_of("units: entry", v)) for v in value)
 
 
@@ -244,7 +244,7 @@ def _entry(kind, index, entry, fields, units):
         if not (good and is_numeric(float(value) if truth else value) and abs(value) <= 1e300):
             huge = good and abs(value) > 1e300 and value not in (float("inf"), -float("inf"))
             wanted = "true or false" if truth else "within +-1e300" if huge else "a finite number"
-            raise InputError(f"{where}: {key} = {_short(value)}: must be {wanted}")
+            raise InputError(f"{where}: {key} = {shortened(value)}: must be {wanted}")
         if not truth:
             check_value(f"{where}: {key}", value, {"low": None, "high": None, **meta, "unit": local(meta["unit"], units)})
     for key, value in fields.items():

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
-from jaxtank.core.tree import _short
+from jaxtank.core.tree import shortened
 from jaxtank.rig import components, experiment_tables, network, signals, validate
 from jaxtank.rig.schema import name_of
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
@@ -141,7 +141,7 @@ def start_of(table):
             raise unknown("key", key, TABLES)
         wanted, words = KINDS.get(key, (dict, "a table"))
         if not isinstance(value, wanted):
-            raise InputError(f"{key} = {_short(value)}: must be {words}")
+            raise InputError(f"{key} = {shortened(value)}: must be {words}")
     name_of("name", table.get("name", ""))
     if "case" in table and (given := [k for k in network.TABLES if k in table]):
         raise InputError(

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import _short, check_value
+from jaxtank.core.tree import check_value, shortened
 from jaxtank.core.units import local
 
 BARE = {"unit": "-", "doc": ""}
@@ -68,7 +68,7 @@ def toml(value):
 def name_of(where, value):
     """`value` if it can be a name: a text of one line without control characters, which a terminal would obey."""
     if not isinstance(value, str) or not value.isprintable():
-        raise InputError(f"{where} = {_short(value)}: must be a text" + " of printable characters" * isinstance(value, str))
+        raise InputError(f"{where} = {shortened(value)}: must be a text" + " of printable characters" * isinstance(value, str))
     return value
 
 
@@ -93,7 +93,7 @@ def is_finite(value):
 def plain(name, value):
     """`value` as a float; InputError, naming it `name`, unless it is a number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):
-        raise InputError(f"{name} = {_short(value)}: must be a number")
+        raise InputError(f"{name} = {shortened(value)}: must be a number")
     return float(value)
 
 
@@ -101,11 +101,11 @@ def static_value(name, value, meta, kind):
     """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is another, out of range, or no choice."""
     if meta["choices"] is not None:
         if isinstance(value, (list, dict)) or value not in meta["choices"] or isinstance(value, bool) != (kind is bool):
-            raise InputError(f"{name} = {_short(value)}: must be one of {_choices(meta['choices'])}")
+            raise InputError(f"{name} = {shortened(value)}: must be one of {_choices(meta['choices'])}")
         return value
     if kind is str:  # a text of which the component itself knows what it may be
         if not isinstance(value, str):
-            raise InputError(f"{name} = {_short(value)}: must be a text")
+            raise InputError(f"{name} = {shortened(value)}: must be a text")
         return value
     value = plain(name, value)
     check_value(name, value, meta)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import _short, check_value, number
+from jaxtank.core.tree import check_value, number, shortened
 from jaxtank.plants.faults import Faults, faults
 from jaxtank.rig.schema import is_finite, plain, static_value
 from jaxtank.signals.base import Constant, Sum
@@ -50,18 +50,18 @@ def ramps_of(where, table, old, words):
     channels = np.size(old.initial)
     initial = table.get("initial", np.asarray(old.initial).tolist())
     if not (is_finite(initial) and np.shape(initial) == (channels,)):
-        raise InputError(f"{where}.initial = {_short(initial)}: must be a list of {channels} finite {words[1]}s")
+        raise InputError(f"{where}.initial = {shortened(initial)}: must be a list of {channels} finite {words[1]}s")
     changes = table.get("changes", changes_of(old))
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
-        raise InputError(f"{where}.changes = {_short(changes)}: must be a list of {form}")
+        raise InputError(f"{where}.changes = {shortened(changes)}: must be a list of {form}")
     for change in changes:
         good = isinstance(change, list) and len(change) == 3 and all(np.ndim(v) == 0 and is_finite(v) for v in change)
         if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels):
-            raise InputError(f"{where}.changes has {_short(change)}: must be {form}, finite numbers")
+            raise InputError(f"{where}.changes has {shortened(change)}: must be {form}, finite numbers")
     for before, after in zip(changes, changes[1:]):
         if after[0] < before[0]:
-            raise InputError(f"{where}.changes has {_short(after)} after {_short(before)}: must be in order of time")
+            raise InputError(f"{where}.changes has {shortened(after)} after {shortened(before)}: must be in order of time")
     taken = set()
     for time, channel, _ in changes:
         if (time, channel) in taken:
@@ -83,7 +83,7 @@ def changes_of(signal):
 def _sine(table, old, channels):
     """The Sine of a [reference.sine] table, None of an empty one."""
     if not isinstance(table, dict):
-        raise InputError(f"reference.sine = {_short(table)}: must be a table")
+        raise InputError(f"reference.sine = {shortened(table)}: must be a table")
     if not table:
         return None
     values = {} if old is None else {k: v for k, _, v in sine_keys(old)}
@@ -96,7 +96,7 @@ def _sine(table, old, channels):
             raise InputError(f"[reference.sine] needs {key}")
     output = values.pop("output")
     if isinstance(output, bool) or not isinstance(output, int) or not 1 <= output <= channels:
-        raise InputError(f"reference.sine.output = {_short(output)}: must be an output, from 1 to {channels}")
+        raise InputError(f"reference.sine.output = {shortened(output)}: must be an output, from 1 to {channels}")
     for key, value in values.items():
         values[key] = plain(f"reference.sine.{key}", value)
         check_value(f"reference.sine.{key}", values[key], meta_of(Sine, key))
@@ -122,7 +122,9 @@ def disturbance_of(table, loop, tank):
             raise InputError("[disturbance] inflow and [[pour]]: give one of them")
         inflow = more["inflow"]
         if not (is_finite(inflow) and np.shape(inflow) == (plant.tanks,)):
-            raise InputError(f"disturbance.inflow = {_short(inflow)}: must be a list of {plant.tanks} finite flows, one per tank")
+            raise InputError(
+                f"disturbance.inflow = {shortened(inflow)}: must be a list of {plant.tanks} finite flows, one per tank"
+            )
         old = Constant(level=number(inflow))
     if "pour" in table:
         if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0) and table["pour"]:
@@ -131,7 +133,7 @@ def disturbance_of(table, loop, tank):
         events = [(e["time"], e["duration"], tank(e["tank"], f"pour {i + 1}: tank"), e["volume"]) for i, e in enumerate(entries)]
         for i, e in enumerate(entries):
             for key, meta, _ in pour_keys(None, None, None, None)[:2]:
-                check_value(f"pour {i + 1} into tank {_short(e['tank'])}: {key}", e[key], {"high": None, **meta})
+                check_value(f"pour {i + 1} into tank {shortened(e['tank'])}: {key}", e[key], {"high": None, **meta})
         if entries or isinstance(old, Pours):
             old = pours(plant.tanks, [(float(a), float(b), c, float(d)) for a, b, c, d in events]) if entries else None
     if "window" in more:
@@ -149,7 +151,7 @@ def faults_of(entries, plant):
     for i, e in enumerate(entries):
         e = _entry("fault", i, e, FAULT, ("of",))
         if not isinstance(e["of"], str):
-            raise InputError(f'fault {i + 1}: of = {_short(e["of"])}: must name an entry of the plant, as "pump_gain[0]"')
+            raise InputError(f'fault {i + 1}: of = {shortened(e["of"])}: must name an entry of the plant, as "pump_gain[0]"')
         check_value(f"fault {i + 1}: factor", float(e["factor"]), meta_of(Faults, "factor"))
         values = (float(e[k]) for k in ("start", "end", "factor", "extra"))
         try:
@@ -164,7 +166,7 @@ def _entry(kind, index, entry, fields, free):
     """`entry` of [[kind]] with what it leaves out; InputError for an unknown key, one that is missing, and what is no number."""
     where = f"{kind} {index + 1}"
     if not isinstance(entry, dict):
-        raise InputError(f"{where} = {_short(entry)}: must be a table")
+        raise InputError(f"{where} = {shortened(entry)}: must be a table")
     for key, value in entry.items():
         if key not in fields:
             raise unknown(f"key of [[{kind}]]", key, fields)

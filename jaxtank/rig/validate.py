@@ -9,7 +9,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Free, Scenario
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import _short, check_value, describe, get_value, is_component, split_index, walk
+from jaxtank.core.tree import check_value, describe, get_value, is_component, shortened, split_index, walk
 from jaxtank.loop import run as lp
 from jaxtank.measures.catalogue import check_names, entries
 from jaxtank.measures.catalogue import unit as measure_unit
@@ -162,7 +162,7 @@ def check_uncertain(loop, uncertain):
     for name, share in uncertain.items():
         get_value(loop, name)
         if not (is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
-            raise InputError(f"uncertain {name} = {_short(share)}: must be a share between 0 and 1")
+            raise InputError(f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1")
     return {name: float(share) for name, share in uncertain.items()}
 
 
@@ -188,9 +188,9 @@ def check_limits(loop, limits):
         if not (is_finite(value) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
-            raise InputError(f"limit {measure} = {_short(value)}: must be a finite number [{unit}]{many}{rim}")
+            raise InputError(f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}")
         if measure == "max_level" and np.min(value) < 0:
-            raise InputError(f"limit {measure} = {_short(value)} {unit}: must be at least 0 {unit}, no level is below empty")
+            raise InputError(f"limit {measure} = {shortened(value)} {unit}: must be at least 0 {unit}, no level is below empty")
     return dict(limits)
 
 
@@ -199,7 +199,7 @@ def check_objective(objective):
     check_names(objective)
     for measure, weight in objective.items():
         if not (is_finite(weight) and np.ndim(weight) == 0 and weight >= 0):
-            raise InputError(f"objective {measure} = {_short(weight)}: must be a finite weight at or above 0")
+            raise InputError(f"objective {measure} = {shortened(weight)}: must be a finite weight at or above 0")
     if not any(objective.values()):
         raise InputError("the objective has no measure with a weight above 0")
     return {measure: float(weight) for measure, weight in objective.items()}
@@ -232,7 +232,7 @@ def free_of(loop, table):
     for name, spec in table.items():
         good = isinstance(spec, list) and len(spec) in (2, 3) and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
-            raise InputError(f'free {name} = {_short(spec)}: must be [low, high] or [low, high, "log" or "linear"]')
+            raise InputError(f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or "linear"]')
         for own in schedule.names_of(loop, name):
             found[own] = check_free(loop, own, *spec)
     return found
@@ -241,7 +241,7 @@ def free_of(loop, table):
 def scenario(case, entry, index):
     """The Scenario of one [[scenario]] table, if it can be run."""
     if not isinstance(entry, dict):
-        raise InputError(f"scenario {index + 1} = {_short(entry)}: must be a table")
+        raise InputError(f"scenario {index + 1} = {shortened(entry)}: must be a table")
     for key in entry:
         if key not in SCENARIO_KEYS:
             raise unknown("key of [[scenario]]", key, SCENARIO_KEYS)
@@ -249,11 +249,11 @@ def scenario(case, entry, index):
     seed, weight = entry.get("seed", 0), entry.get("weight", 1.0)
     name_of(f"scenario {index + 1}: name", name)
     if not isinstance(values, dict):
-        raise InputError(f"scenario {name!r}: values = {_short(values)}: must be a table")
+        raise InputError(f"scenario {name!r}: values = {shortened(values)}: must be a table")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(f"scenario {name!r}: seed = {_short(seed)} must be a whole number from 0 to {2**31 - 1}")
+        raise InputError(f"scenario {name!r}: seed = {shortened(seed)} must be a whole number from 0 to {2**31 - 1}")
     if not (is_finite(weight) and np.ndim(weight) == 0 and weight > 0):
-        raise InputError(f"scenario {name!r}: weight = {_short(weight)} must be a finite number above 0")
+        raise InputError(f"scenario {name!r}: weight = {shortened(weight)} must be a finite number above 0")
     try:
         values = by_dotted_name(values, "scenario.values")
         set_scenario(case, values)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import _short, check_value, describe, get_value, split_index, walk, with_values
+from jaxtank.core.tree import check_value, describe, get_value, shortened, split_index, walk, with_values
 from jaxtank.rig import schedule
 from jaxtank.rig.schema import is_numeric, plain, static_value, unit
 
@@ -57,7 +57,7 @@ def set_values(case, values):
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
         if not is_numeric(value):
-            raise InputError(f"{name} = {_short(value)}: must be a number or a list of numbers{unit(meta)}")
+            raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}")
         schedule.check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         check_value(name, get_value(loop, name), meta)
@@ -176,7 +176,7 @@ def _absolute(case, name, value):
         more = ', or "steady"' if name in STEADY else ""
         numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
         raise InputError(
-            f"{name} = {_short(value)}: must be {numbers}, or relative to the case's own: "
+            f"{name} = {shortened(value)}: must be {numbers}, or relative to the case's own: "
             f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
         )
     own = np.asarray(own, dtype=float)

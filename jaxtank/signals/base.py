@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.signals.base."""
+"""The interface of a signal, and signals that hold for any purpose: constant, table, sum."""
 
 import abc
 

@@ -1,4 +1,4 @@
-"""TODO docstring of jaxtank.signals.inflows."""
+"""Inflow disturbances: volumes added to a tank for a while."""
 
 import jax.numpy as jnp
 import numpy as np

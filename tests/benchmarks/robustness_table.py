@@ -79,7 +79,7 @@ def run(law, spread):
     def one(values):
         loop = with_values(case.loop, values)
         measures, broken = lp.evaluate_and_flag(loop, case.clock, MEASURES)
-        return measures, lp._simulate(loop, case.clock, None, every)[0].e, broken
+        return measures, lp.simulate_compiled(loop, case.clock, None, every)[0].e, broken
 
     measures, errors, failed = jax.jit(jax.vmap(one))(coefficients(case.loop.plant, spread))
     return Found({m: np.asarray(v) for m, v in measures.items()}, np.asarray(errors), np.asarray(failed))

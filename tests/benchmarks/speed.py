@@ -25,7 +25,7 @@ from jaxtank import presets
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as loop
-from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla import flags
 from tuning.bench import bench
 from tuning.report import tables
@@ -163,7 +163,7 @@ def gauss_newton(rounds):
     at = lambda o: with_values(case.loop, {"plant.orifice": o})
     calls = {
         "run": compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST)),
-        "pass": compiled(lambda o: _sensitivities(at(o), case.clock, COST, names, point, None, lanes=True)),
+        "pass": compiled(lambda o: sensitivities_compiled(at(o), case.clock, COST, names, point, None, lanes=True)),
     }
     seconds = timed(calls, max(rounds // 3, 3))
     spent = f"{1e3 * statistics.median(seconds['pass']):.0f} ms"
@@ -213,7 +213,8 @@ def laws(rounds):
 COMPILE = """
 import time, jax, jaxtank, numpy as np
 jax.config.update("jax_enable_x64", True)
-from jaxtank import loop, presets
+from jaxtank import presets
+from jaxtank.loop import run as loop
 case = presets.find("gouta2015/backstepping")
 gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
 names = ("rms_error_total",)

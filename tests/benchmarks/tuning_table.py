@@ -99,7 +99,7 @@ def measure(name):
         "starts": len(result.starts),
         "evaluations": result.evaluations,
         "wall_s": result.wall_s,
-        "versions": {n: result.provenance[n] for n in VERSIONS},
+        "versions": {n: result.made_with[n] for n in VERSIONS},
     }
 
 
@@ -108,10 +108,10 @@ def best_inputs(name):
     asked = BOUNDS[name]
     case = case_of(asked)
     found = tuning.bound(case, asked.objective, asked.limits)
-    provenance = provenance.provenance(case, 0)
+    made_with = provenance.provenance(case, 0)
     told = found.to_json()
     kept = ("cost", "objective", "holds", "closed_loop", "source", "interval_s", "grids", "wall_s")
-    return {"case": case.name, **{n: told[n] for n in kept}, "versions": {n: provenance[n] for n in VERSIONS}}
+    return {"case": case.name, **{n: told[n] for n in kept}, "versions": {n: made_with[n] for n in VERSIONS}}
 
 
 def load():

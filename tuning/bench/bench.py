@@ -202,13 +202,13 @@ def measure_cases(cases, rounds=3):
     found = {}
     for name, case in cases.items():
         key = jax.random.key(0) if noisy(case) else None
-        program = lp._evaluate.lower(case.loop, case.clock, MEASURES, key, False)
+        program = lp.evaluate_compiled.lower(case.loop, case.clock, MEASURES, key, False)
         began = time.perf_counter()
         text_of_program = program.compile().as_text()
         first = time.perf_counter() - began
         seconds, results = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
         median = statistics.median(seconds[name])
-        before = lp._evaluate._cache_size()
+        before = lp.evaluate_compiled._cache_size()
         for _ in range(3):
             lp.evaluate(case.loop, case.clock, MEASURES, key)
         found[name] = {
@@ -222,7 +222,7 @@ def measure_cases(cases, rounds=3):
                 case.clock.samples,
                 provenance(case, None)["xla_option"],
                 results[name]["rms_error_total"].dtype,
-                lp._evaluate._cache_size() - before,
+                lp.evaluate_compiled._cache_size() - before,
             ),
         }
     return found

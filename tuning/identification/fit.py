@@ -126,7 +126,7 @@ def identify(
     gap: longest step between samples, in median steps; folder: where a log of the searches is kept, with which resume=True goes on after a
     kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
     KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search;
-    law: "pi" for the identified rig under a PI controller with gains from its model (see `tuning.proposal`), None for the case's own.
+    law: "pi" for the identified rig under a PI controller with gains from its model (`proposal.py`), None for the case's own.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """

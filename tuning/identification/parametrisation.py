@@ -99,7 +99,7 @@ class Coordinates:
 
 
 def coordinates(bounds, branches=True):
-    """The Coordinates of a list of tuning.bounds.Bound: a pump's gain and split, where both are free, by their branch gains (or, without
+    """The Coordinates of a list of tuning.problem.bounds.Bound: a pump's gain and split, where both are free, by their branch gains (or, without
     `branches`, by themselves)."""
     by_name = {b.name: b for b in bounds} if branches else {}
     items, done = [], set()

@@ -111,7 +111,7 @@ def _search_cost(u, loop, clock, terms, held):
     extra = ((zero,) * loop.plant.pumps if "input_travel" in soft else (), zero, zero)
     carry = (initial(loop, clock), ms.start(run, names), extra, zero)
     xs = (inputs(loop, clock, names, None), held.forces)
-    _, acc, (_, travel, absolute), penalty = lp._checkpointed_scan(body, carry, xs, clock.samples)
+    _, acc, (_, travel, absolute), penalty = lp.checkpointed_scan(body, carry, xs, clock.samples)
     measures = ms.read(run, acc, names)
     smooth = {"input_travel": travel, "iae": absolute * clock.dt}
     cost = sum(w * (smooth[m] if m in smooth else jnp.sum(measures[m])) for m, w in terms.objective)

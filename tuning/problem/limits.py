@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.problem.limits."""
+"""Limits: a measure, its bound, and the margin that is left."""
 
 from typing import NamedTuple
 

@@ -13,7 +13,7 @@ from jaxtank.case import Scenario
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.derivatives import _sensitivities
+from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla import flags
 
 MANY = 1024
@@ -170,7 +170,9 @@ def _values(leaves, keys, shape, clock, names, points):
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"), compiler_options=flags.WIDE)
 def _slopes(leaves, keys, shape, clock, names, order, values, squares):
     several = shape[-1] > 1
-    return _mapped(lambda loop, key: _sensitivities(loop, clock, names, order, values, key, squares, several), leaves, keys, shape)
+    return _mapped(
+        lambda loop, key: sensitivities_compiled(loop, clock, names, order, values, key, squares, several), leaves, keys, shape
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order"))

@@ -17,7 +17,6 @@ from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import Pours
 from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.problem.limits import LOWER
-from tuning.report import case as manual_parts
 from tuning.report import tables
 
 
@@ -185,16 +184,14 @@ def text(case):
     page, preset, loop = json_of(case), _preset(case), case.loop
     parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
     parts += [f"notes: {page['notes']}"] if preset else []
-    outputs = ", ".join(f"h{i + 1}{manual_parts.own_name(case, 'tank', i)}" for i in loop.plant.outputs)
+    outputs = ", ".join(f"h{i + 1}{own_name(case, 'tank', i)}" for i in loop.plant.outputs)
     parts += _chapter(f"The rig: {_count(loop.plant.tanks, 'tank')}, {_count(loop.plant.pumps, 'pump')}; controlled: {outputs}")
     parts += [
         line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
     ]
-    parts += ["", *_sentences([*manual_parts.called(case), *physics(loop.plant)])]
+    parts += ["", *_sentences([*called(case), *physics(loop.plant)])]
     parts += _chapter("The loop")
-    parts += _sentences(
-        [*manual_parts.sensor(loop), *manual_parts.actuator(loop), *manual_parts.moved(loop), *manual_parts.sampled(case)]
-    )
+    parts += _sentences([*sensor(loop), *actuator(loop), *moved(loop), *sampled(case)])
     parts += _chapter(f"The law: {page['law']}") + _docstring(getattr(loop.controller, "law", loop.controller))
     if hasattr(loop.controller, "law"):
         parts += ["", *_docstring(loop.controller)]

@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.search.baseline."""
+"""The values and measures that a search starts from."""
 
 import numpy as np
 

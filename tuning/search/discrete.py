@@ -24,14 +24,12 @@ MANY = 64
 """Combinations that are tried at most."""
 
 
-def tune_choices(case, method, choices, *, log=None, resume=False, **options):
+def tune_choices(tune, case, method, choices, *, log=None, resume=False, **options):
     """`tune` of every combination of `choices`, {static name: [values]}: the best TuningResult, with `choices` a row for each.
 
     One that holds every limit is preferred to one that does not, then the smaller violation, then the lower objective. log: folder with a log of
     its own for every combination, which resume=True continues. Raises InputError for a choice that the case cannot have.
     """
-    from tuning.search.tuner import tune
-
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
             raise InputError(f"choices {name}: must be a list of values to try")

@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.search.driver."""
+"""A search: its problem, counted evaluations, cached points, and the same on a coarse model."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.search.first_order."""
+"""L-BFGS and Adam on an augmented Lagrangian."""
 
 import numpy as np
 

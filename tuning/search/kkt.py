@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.search.kkt."""
+"""First-order optimality of an answer, and a step downhill where it does not hold."""
 
 import numpy as np
 import scipy

@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.search.provenance."""
+"""What a result was made with: versions, machine, seed, and the fingerprint of the problem."""
 
 import hashlib
 import os

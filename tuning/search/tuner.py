@@ -13,6 +13,7 @@ from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.baseline import own_values, run_measures
 from tuning.search.diagnostics import of_answer
+from tuning.search.discrete import tune_choices
 from tuning.search.driver import SETTLED, Search
 from tuning.search.first_order import minibatches
 from tuning.search.kkt import UNSTABLE, downhill, optimality
@@ -90,9 +91,7 @@ def tune(
         progress=progress,
     )
     if choices:
-        from tuning.search.discrete import tune_choices
-
-        return tune_choices(case, method, choices, log=log, resume=resume, **options)
+        return tune_choices(tune, case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
     _check_options(starts=starts, screening=screening, iterations=iterations, batch=batch, validation=validation)
     if tolerance is not None and not (isinstance(tolerance, float) and 0.0 < tolerance < 1.0):

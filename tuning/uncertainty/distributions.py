@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import _short, check_value, describe, get_value, is_real, split_index
+from jaxtank.core.tree import check_value, describe, get_value, is_real, shortened, split_index
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -170,7 +170,7 @@ def stated(distributions):
             given = Uniform(relative=float(given))
         if not isinstance(given, (*KINDS.values(), Correlated)):
             raise InputError(
-                f"uncertain {name} = {_short(given)}: must be a distribution, as tuning.Normal(relative=0.05), or a share between 0 and 1"
+                f"uncertain {name} = {shortened(given)}: must be a distribution, as tuning.Normal(relative=0.05), or a share between 0 and 1"
             )
         found[name] = given
     return found

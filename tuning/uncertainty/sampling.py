@@ -1,4 +1,4 @@
-"""TODO docstring of tuning.uncertainty.sampling."""
+"""Probabilities to draw at, default spreads, and the interval of a counted share."""
 
 import numpy as np
 from scipy import stats

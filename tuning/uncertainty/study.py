@@ -378,7 +378,7 @@ def _fan(case, values, seed):
 def _trajectories(loop, values, indices, seed, clock, every):
     def one(values, index):
         noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
-        run = lp._simulate(with_values(loop, values), clock, noise, every)[0]
+        run = lp.simulate_compiled(with_values(loop, values), clock, noise, every)[0]
         return run.t, run.r, run.x, run.u
 
     return jax.vmap(one)(values, indices)

@@ -6,7 +6,6 @@ from jaxtank.core.errors import InputError
 from tuning.cli.options import tell_written
 from tuning.cli.values import open_case, whole
 from tuning.cli.values import seed as seed_of
-from tuning.search import baseline, provenance
 
 
 def list_cases(args):
@@ -85,6 +84,7 @@ def simulate(args):
     from jaxtank.loop import run, step_size
     from tuning.report import artifacts, tables
     from tuning.report import case as manual
+    from tuning.search import baseline, provenance
 
     key = jax.random.key(seed) if manual.noisy(case) else None
     if step_size.doubts(case.loop, case.clock):
