@@ -565,6 +565,7 @@ RIGS = {
     "far.toml": f'case = "{CASE}"\n[reference]\nchanges = [[20.0, 1, 16.0]]\n',
     "zero.toml": f'case = "{CASE}"\n[reference]\nchanges = [[20.0, 1, 0.0]]\n',
     "limit.toml": f'case = "{CASE}"\n[limits]\nmax_levl = 3\n',
+    "still.toml": 'case = "cascaded/pi"\n[reference]\ninitial = [4.0]\nchanges = []\n',
 }
 
 
@@ -683,6 +684,7 @@ BAD = [  # arguments, words that the line must have
     (["tune", CASE, "--choose", "controller.reference_rate=true"], "unknown parameter 'controller.reference_rate'"),
     (["tune", CASE, "--choose", "controller.reference_rates=3"], "controller.reference_rates = 3: must be one of false, true"),
     (["tune", CASE, "--tradeoff", "max_level=30:20"], "--tradeoff 'max_level=30:20'"),
+    (["tune", "still.toml", "--tradeoff", "rise_time=10:20:2"], "no setpoint is stepped within its 200 s"),
     (["tune", CASE, "--tradeoff", "max_levl=20:30"], "unknown measure 'max_levl'; nearest: max_level"),
     (["tune", CASE, "--batch", "0"], "--batch '0'"),
     (["tune", CASE, "--batch", "2", "--method", "slsqp"], "only method adam"),

@@ -131,6 +131,29 @@ class Several(Controller):
         return (5.0 * tick.r[0],) * self.count if self.count else 5.0 * tick.r[0], state
 
 
+KINDS = {"vectors": True, "columns": True, "texts": True, "complex": True, "array": False, "switch": False}
+"""What Odd returns: whether it is wrong."""
+
+
+@component
+class Odd(Controller):
+    """Returns two inputs, of a kind that a run may not take."""
+
+    kind: str = static(default="array", choices=tuple(KINDS))
+
+    def step(self, state, tick, estimate):
+        r = jnp.stack(tick.r)
+        on = tick.r[0] > 8.0
+        return {
+            "vectors": (r, r),
+            "columns": r[:, None],
+            "texts": ("on", "off"),
+            "complex": (1j * r[0], r[1]),
+            "array": r,
+            "switch": (on, on),
+        }[self.kind], state
+
+
 @pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
 def test_a_controller_returns_one_input_for_each_pump(count, words):
     case = jaxtank.rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0})
@@ -146,3 +169,14 @@ def test_a_controller_returns_one_input_for_each_pump(count, words):
             run()
     right = dataclasses.replace(case.loop, controller=Several(count=2))
     assert np.asarray(jaxtank.simulate(right, case.clock).command).shape == (21, 2)
+
+
+@pytest.mark.parametrize(("kind", "wrong"), KINDS.items())
+def test_an_input_of_a_controller_is_one_real_number(kind, wrong):
+    case = jaxtank.rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0})
+    loop = dataclasses.replace(case.loop, controller=Odd(kind=kind))
+    if not wrong:
+        assert np.isfinite(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"])
+        return
+    with pytest.raises(jaxtank.InputError, match="controller Odd: its step returns an input that is no single real number"):
+        jaxtank.evaluate(loop, case.clock, ["rms_error"])

@@ -327,3 +327,9 @@ def test_keys_of_both_kinds_are_taken_traced_or_not():
     for keys in (jax.random.split(jax.random.key(0), 3), jax.random.split(jax.random.PRNGKey(0), 3)):
         jax.vmap(lambda key: check_key(key) or 0)(keys)
         jax.jit(lambda key: check_key(key))(keys[0])
+
+
+def test_a_part_of_the_structure_is_not_called_unknown():
+    loop = jaxtank.presets.find("gouta2015/backstepping").loop
+    with pytest.raises(InputError, match=r"^sensor\.bits is no number of the loop .*rig\.set_values$"):
+        with_values(loop, {"sensor.bits": 8})

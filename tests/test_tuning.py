@@ -362,3 +362,10 @@ def test_chatter_is_told_and_drawn(gouta):
     z = [float(b.to_unit(p["after"])) for b, p in zip(result.problem.bounds, result.parameters.values())]
     assert "the pumps travel" in message(result.replace(measures=told), z, [None, None], 0)
     assert "the pumps travel" not in message(result.replace(measures={"before": calm, "after": calm}), z, [None, None], 0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_objective_of_zero_gives_no_share_and_no_warning():
+    case = rig.set_values(rig.loads('case = "cascaded/pi"\n[reference]\ninitial = [4.0]\nchanges = []\n'), {"clock.duration": 40.0})
+    result = tuning.tune(case, free={"controller.Kc": (0.5, 2.0)}, starts=1, screening=4, validation=0)
+    assert result.objective["after"] == 0.0 and result.parameters["controller.Kc[0]"]["felt_percent"] is None

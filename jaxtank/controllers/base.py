@@ -45,6 +45,11 @@ class Controller(abc.ABC):
         """True if the law has an `input_metric`, so that its inputs can be allocated by box QP."""
         return type(self).input_metric is not Controller.input_metric
 
+    @property
+    def reads_model(self):
+        """True if the inputs depend on the coefficients of the law's own model."""
+        return True
+
     def check_pumps(self, actuator):  # noqa: B027
         """Raise InputError for pumps whose limits, or whose input before t = 0, the law cannot work with."""
 

@@ -64,6 +64,10 @@ class PID(Controller):
             return ()
         return tuple((rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model)))
 
+    @property
+    def reads_model(self):
+        return self.feed_forward
+
     def init(self, x0, u0):
         zero, loops = 0.0 * u0[0], range(len(u0))
         return Memory(

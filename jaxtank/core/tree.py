@@ -124,6 +124,10 @@ def with_values(tree, values):
         try:
             tree = _replace(tree, path, index, value, name)
         except LookupError:
+            if base in [other for other, _, _ in walk(tree, kind="static")]:
+                raise InputError(
+                    f"{base} is no number of the loop but a part of its structure: set it with rig.set_values"
+                ) from None
             raise unknown("parameter", name, _all_names(tree)) from None
     return tree
 

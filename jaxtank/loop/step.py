@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.kahan import added
 from jaxtank.core.records import Sample, Tick
+from jaxtank.core.tree import is_real
 from jaxtank.plants.runge_kutta import change, integrate
 from jaxtank.xla.barrier import materialised
 
@@ -88,7 +89,8 @@ def time_of(state, clock):
 def commanded(loop, state, tick, estimate):
     """Return the controller's ((m,) inputs before their limits, new state).
 
-    Raises InputError, while the loop is traced, for a number of inputs that is not that of the pumps.
+    Raises InputError, while the loop is traced, for a number of inputs that is not that of the pumps,
+    and for an input that is no single real number.
     """
     command, state = loop.controller.step(state, tick, estimate)
     pumps = loop.plant.pumps
@@ -99,6 +101,13 @@ def commanded(loop, state, tick, estimate):
         raise InputError(
             f"controller {law}: its step returns {found} for {pumps} pump{'' if pumps == 1 else 's'}: "
             "must return (inputs, state), a tuple with one input for each pump"
+        )
+    parts = [(np.shape(v), v) for v in command] if isinstance(command, tuple | list) else [(np.shape(command)[1:], command)]
+    switch = np.dtype(bool)  # on or off: 1 or 0
+    if any(shape or not (is_real(v) or getattr(v, "dtype", None) == switch) for shape, v in parts):
+        raise InputError(
+            f"controller {type(loop.controller).__name__}: its step returns an input that is no single real number: "
+            "must return (inputs, state), a tuple with one number for each pump"
         )
     return command, state
 

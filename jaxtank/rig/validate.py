@@ -64,14 +64,16 @@ def model_doubts(case):
     the plant's by more than its uncertainty.
 
     The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
-    but rounding where neither has the parameter. Rims count only in a model in which they are physics.
+    but rounding where neither has the parameter. Rims count only in a model in which they are physics,
+    and no model that its law does not read (PID without feed-forward).
     """
     found, plant = [], case.loop.plant
     for holder in ("controller", "observer"):
         part = getattr(case.loop, holder)
         inner = f"{holder}.law." if is_component(getattr(part, "law", None)) else f"{holder}."
-        model = getattr(getattr(part, "law", part), "model", None)
-        if model is None:
+        law = getattr(part, "law", part)
+        model = getattr(law, "model", None)
+        if model is None or not getattr(law, "reads_model", True):
             continue
         # no level depends on rims that are no physics
         vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
@@ -88,7 +90,7 @@ def model_doubts(case):
                 found.append(
                     f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the "
                     f"model of the {holder} differs from the plant{words}; unless that is meant, set "
-                    f"{here} = {_listed(own)}, or leave it out of the rig file: it follows the plant"
+                    f"{here} = {_listed(own)} too (in a rig file a model that is left out follows the plant)"
                 )
     return found
 

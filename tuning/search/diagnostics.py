@@ -71,7 +71,8 @@ def felt(problem, z):
             moved = b.to_unit(value * (1 + factor)) if b.scale == "log" else z[i] + factor
             trials.append(np.where(np.arange(len(z)) == i, np.clip(moved, 0.0, 1.0), z))
     costs, _ = problem.screen(np.array(trials))
-    change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a cost of 0 has no percent
+        change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
     return [float(c) if np.isfinite(c) else None for c in change]
 
 
