@@ -45,7 +45,7 @@ class PID(Controller):
 
     with u what the limits leave of v (back-calculation, tracking time Tt), and the derivative of the measurement behind a lag of Td/8. Without
     Td there is no derivative; without `order` the integral is an ordinary one, with it s^-order = (1/s) s^(1-order), where the second factor is
-    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the voltage that the model needs on the reference,
+    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the input that the model needs on the reference,
     (r' - f(r))/c2.
     """
 
@@ -55,8 +55,8 @@ class PID(Controller):
     Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc")
     order: np.ndarray | None = leaf("-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc")
     Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
-    bias: np.ndarray = leaf("V", "(m,) voltage added where there is no feed-forward")
-    feed_forward: bool = static("-", "add the model's voltage on the reference", choices=(False, True), default=False)
+    bias: np.ndarray = leaf("V", "(m,) input added where there is no feed-forward")
+    feed_forward: bool = static("-", "add the model's input on the reference", choices=(False, True), default=False)
 
     @pointwise
     def prepare(self, r, dr, ddr):

@@ -68,7 +68,7 @@ class LQI(Controller):
     Q: np.ndarray = leaf(
         "-", "(tanks + outputs,) weight of each level, over its unit squared, then of each integral, over that times s^2", low=0.0
     )
-    R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each voltage", low=0.0, strict=True)
+    R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each input", low=0.0, strict=True)
     operating_point: np.ndarray = leaf("cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True)
 
     @pointwise

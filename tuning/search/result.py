@@ -264,12 +264,12 @@ def _agreement(result):
         return words
     best = min(o["cost"] for o in held)
     alike = [i for i, o in enumerate(outcomes) if o["violation"] == 0.0 and o["cost"] <= best * 1.001]
-    words.append(f"{len(alike)} of {len(outcomes)} starts ended within 0.1 % of the best")
+    words.append(f"{len(alike)} of {len(outcomes)} searches ended within 0.1 % of the best")
     image = result.mirrored
     if image and image["objective"] is not None:
         at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
         above = 100 * (image["objective"] / result.objective["after"] - 1)
         same = "the same objective" if abs(above) < 1e-3 else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
-        ended = f"; {len(image['starts'])} of the starts ended there, and count as this answer" if image["starts"] else ""
+        ended = f"; {len(image['starts'])} of the searches ended there and count as this answer" if image["starts"] else ""
         words.append(f"mirror image: {image['words']}: {at} gives {same}{ended.replace('; ', ', ')}")
     return words
