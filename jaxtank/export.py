@@ -79,11 +79,12 @@ def export(case, language="c", precision="double", name=None):
         raise InputError(f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to export")
     if case.loop.controller.inputs(case.clock) != ():
         raise InputError(f"{case.name}: its law plays a signal of its own back, which code without a run cannot have")
-    name = name or function_name(case)
+    given, name = name, name or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
-        raise InputError(
-            f"--name {name!r}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51"
-        )
+        whose = f"--name {given!r}" if given else f"{case.name!r} gives no name for the function; --name NAME"
+        raise InputError(f"{whose}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51")
+    if language == "m" and name in TAKEN_M.split():
+        raise InputError(f"--name {name!r}: MATLAB, or the file itself, has this name already; give another")
     law = Code(case)
     return (_c if language == "c" else _matlab)(law, case, name, precision)
 
@@ -454,6 +455,13 @@ function out = backward_(n, k, a, b)
     out = c(:).';
 end""",
 }
+TAKEN_M = """
+break case catch classdef continue else elseif end for function global if otherwise parfor persistent return spmd switch try while
+isempty zeros reshape chol double true false pi NaN Inf nthroot isfinite fix rem round
+sqrt abs exp log tanh sin cos floor max min sign erf erfc log1p expm1 tan asin acos atan atan2 sinh cosh asinh acosh atanh ceil
+s t y r dr ddr u pick
+"""
+"""What a function of MATLAB may not be called: keywords, what such a file calls, and its own variables."""
 PICK_M = """
 function out = pick(condition, yes, no)
     if condition
