@@ -266,6 +266,42 @@ def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
     assert len(list(tmp_path.glob("part-*.npz"))) == len(paths)
 
 
+FORGED = {
+    "texts": lambda a: np.full(a.shape, "<b>"),
+    "complex": lambda a: a + 1j,
+    "fewer": lambda a: a[:1],
+    "a number": lambda a: a.ravel()[0],
+    "another shape": lambda a: np.zeros((len(a), 7)),
+    "records": lambda a: np.zeros(a.shape, dtype=[("a", float)]),
+    "times": lambda a: np.zeros(a.shape, dtype="M8[s]"),
+}
+
+
+@pytest.mark.parametrize("name", ["failed", "max_level", "rms_error_total"])
+@pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
+def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
+    """Whoever has the program can seal a batch: what it holds is looked at, too."""
+    options = {"samples": 8, "lanes": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
+    for i in (1, 2):
+        tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
+    store = parts.Store.__new__(parts.Store)
+    store.folder, store.manifest = tmp_path, parts.read_manifest(tmp_path)
+    with np.load(store.path(1)) as table:
+        arrays = {n: table[n] for n in table.files if n != "seal"}
+    store.put(1, arrays | {name: forged(arrays[name])})
+    with pytest.raises(InputError, match=r"part-000001.*is not what was written as batch"):
+        tuning.ensemble(case, folder=tmp_path, resume=True, merge=True, **options)
+
+
+@pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
+def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
+    tuning.ensemble(case, folder=tmp_path, shard=(1, 2), samples=8, lanes=4, measures=("max_level",), fan=False)
+    manifest = parts.read_manifest(tmp_path) | {"measures": measures}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match="the manifest is not one of this program"):
+        shards.restore(tmp_path)
+
+
 def test_every_value_of_a_discrete_distribution_is_looked_at(case):
     with pytest.raises(InputError, match="must be above 0"):
         Draws(case.loop, {"plant.pump_gain": tuning.Discrete(values=(7.0, -5.0, 8.0))})

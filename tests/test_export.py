@@ -423,6 +423,23 @@ def test_units_of_rigs_are_taken():
         network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("cm*/", "V"))
 
 
+@pytest.mark.parametrize("name", ["end", "max", "pick", "s"])
+def test_a_matlab_function_is_not_called_what_matlab_or_the_file_has(name):
+    """Its file would not be read, or would call itself."""
+    case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
+    with pytest.raises(InputError, match=f"--name '{name}'"):
+        export(case, "m")
+    assert f"void {name}_step(" in export(case, "c")
+
+
+@pytest.mark.parametrize("name", ["2 tanks", "日本"])
+def test_a_case_whose_name_is_none_of_the_language_asks_for_one(name):
+    case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
+    with pytest.raises(InputError, match=f"'{name}' gives no name for the function; --name NAME"):
+        export(case)
+    assert "void law_step(" in export(case, name="law")
+
+
 @pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])
 def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
     assert main.main(["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]) == (2 if name else 0)

@@ -379,6 +379,18 @@ def test_ctrl_c_in_an_import_ends_the_program_at_once(module):
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "jaxtank: interrupted\n")
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
+    """As a shell has it for Ctrl-C when a script runs a command in the background."""
+    code = (
+        f"import os, signal, time; signal.signal({int(number)}, signal.SIG_IGN)\n"
+        "from tuning import interrupts; interrupts.listen()\n"
+        f"os.kill(os.getpid(), {int(number)}); time.sleep(0.5); print('went on')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
+
+
 def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     """The first is answered while an evaluation is compiled that takes for ever."""
     code = (

@@ -157,6 +157,8 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"law": {"kind": "pid", "Kc": 1.0}}, "needs Ti \\[s\\]"),
         ({"law": {"kind": "pid", "Kc": 1.0, "Ti": 1.0, "K": 2.0}}, "unknown key of \\[law\\] 'K'"),
         ({"law": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "law.Kc = 'much'"),
+        ({"law": {"kind": "pid", "Kc": True, "Ti": 1.0}}, "law.Kc = True: must be a number"),
+        ({"law": {"kind": "pid", "Kc": "3", "Ti": 1.0}}, "law.Kc = '3': must be a number"),
         (
             {"law": {**GPC, "r_w": [0.1, 0.2]}},
             r"controller.r_w = \[0.1, 0.2\]: must be one number, the weight of the increments of all inputs",

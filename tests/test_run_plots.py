@@ -9,6 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
 
 from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
 from jaxtank.core.records import Trajectory
 from jaxtank.plots import diagnostics, responses
 
@@ -206,3 +207,20 @@ def test_the_rim_is_in_every_panel_of_a_fan():
         else:
             assert line.get_label() == f"rim {rims[i]:g} cm, above the picture" and ax.get_ylim()[1] < rims[i]
     plt.close(figure)
+
+
+def test_no_responses_of_no_run(gouta):
+    with pytest.raises(InputError, match="no run to draw"):
+        responses.responses(gouta("ngpc").loop, {})
+
+
+def test_units_of_parameters_are_never_set_as_mathematics(ax):
+    """Those of a controller of one's own may be any text."""
+    odd = r"$\x{$"
+    x = np.linspace(1.0, 2.0, 5)
+    responses.curve(ax, x, x, 0 * x, "K", odd, "cm", (1.0, 1.0), (2.0, 2.0), False)
+    ax.figure.canvas.draw()
+    ax.clear()
+    a, b = np.meshgrid(x, x)
+    responses.contours(ax, a, b, a + b, a - 3, ("K", "L"), (odd, odd), "cm", (1.0, 1.0), (2.0, 2.0), (False, False))
+    ax.figure.canvas.draw()

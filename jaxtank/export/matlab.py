@@ -104,6 +104,15 @@ function out = pick(condition, yes, no)
 end"""
 
 
+TAKEN_M = """
+break case catch classdef continue else elseif end for function global if otherwise parfor persistent return spmd switch try while
+isempty zeros reshape chol double true false pi NaN Inf nthroot isfinite fix rem round
+sqrt abs exp log tanh sin cos floor max min sign erf erfc log1p expm1 tan asin acos atan atan2 sinh cosh asinh acosh atanh ceil
+s t y r dr ddr u pick
+"""
+"""What a function of MATLAB may not be called: keywords, what such a file calls, and its own variables."""
+
+
 def print_matlab(law, case, name, precision):
     ends = np.cumsum([law.state, 1, law.tanks, law.outputs, law.outputs, law.outputs])
 

@@ -5,7 +5,7 @@ import re
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import C_CALLS, print_c
-from jaxtank.export.matlab import print_matlab
+from jaxtank.export.matlab import TAKEN_M, print_matlab
 from jaxtank.export.printer import SAME_NAME, Code, function_name
 
 LANGUAGES = ("c", "m")
@@ -28,11 +28,12 @@ def export(case, language="c", precision="double", name=None):
         raise InputError(f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to export")
     if case.loop.controller.inputs(case.clock) != ():
         raise InputError(f"{case.name}: its law plays a signal of its own back, which code without a run cannot have")
-    name = name or function_name(case)
+    given, name = name, name or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
-        raise InputError(
-            f"--name {name!r}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51"
-        )
+        whose = f"--name {given!r}" if given else f"{case.name!r} gives no name for the function; --name NAME"
+        raise InputError(f"{whose}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51")
+    if language == "m" and name in TAKEN_M.split():
+        raise InputError(f"--name {name!r}: MATLAB, or the file itself, has this name already; give another")
     law = Code(case)
     return (print_c if language == "c" else print_matlab)(law, case, name, precision)
 

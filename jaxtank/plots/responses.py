@@ -9,6 +9,8 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from jaxtank.errors import InputError
+
 BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
     "#D55E00",
     "#0072B2",
@@ -112,6 +114,8 @@ def responses(loop, trajectories, title="", limits=None):
 
     trajectories: {name: Trajectory}, the first drawn dashed where there are several; limits: (tanks,) level limits [cm] or None.
     """
+    if not trajectories:
+        raise InputError("trajectories = {}: there is no run to draw")
     count = len(RUNS)
     again = [(colour, RUNS[(i + i // count) % count][1]) for i, (colour, _) in zip(range(len(trajectories)), itertools.cycle(RUNS))]
     styles = [(AFTER, "-")] if len(trajectories) == 1 else again
@@ -208,7 +212,10 @@ def curve(ax, values, cost, violation, name, unit, cost_unit, before, after, log
     ax.plot(*before, "s", color=BEFORE, label="before")
     ax.plot(*after, "o", color=AFTER, label="after")
     ax.set(
-        xlabel=f"{name} [{unit}]", ylabel=f"objective [{cost_unit}]", title="landscape", xscale="log" if logarithmic else "linear"
+        xlabel=plain(f"{name} [{unit}]"),
+        ylabel=f"objective [{cost_unit}]",
+        title="landscape",
+        xscale="log" if logarithmic else "linear",
     )
     ax.legend()
     return ax
@@ -230,7 +237,7 @@ def contours(ax, x, y, cost, violation, names, units, cost_unit, before, after, 
         ax.plot([], [], color=FORBIDDEN, linewidth=2.0, label="a limit is reached; broken where hatched")
     ax.plot(*before, "s", color=BEFORE, markeredgecolor="white", markersize=8, label="before", clip_on=False, zorder=5)
     ax.plot(*after, "o", color=AFTER, markeredgecolor="white", markersize=9, label="after", clip_on=False, zorder=5)
-    ax.set(xlabel=f"{names[0]} [{units[0]}]", ylabel=f"{names[1]} [{units[1]}]", title="landscape")
+    ax.set(xlabel=plain(f"{names[0]} [{units[0]}]"), ylabel=plain(f"{names[1]} [{units[1]}]"), title="landscape")
     ax.set_xscale("log" if logarithmic[0] else "linear")
     ax.set_yscale("log" if logarithmic[1] else "linear")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)

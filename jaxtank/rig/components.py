@@ -11,7 +11,7 @@ from jaxtank.core.tree import number, shortened
 from jaxtank.core.units import local
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.schema import static_value
+from jaxtank.rig.schema import is_numeric, static_value
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
@@ -101,10 +101,9 @@ def _value(name, value, field, plant):
 
 def _shaped(name, value, meta, plant):
     """A leaf's value as an array; one number for an array of one entry per pump, tank or output fills it."""
-    try:
-        array = number(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers") from None
+    if not is_numeric(value):
+        raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers")
+    array = number(value)
     size = size_of(meta, plant)
     return np.full(size, array) if size is not None and array.ndim == 0 else array
 

@@ -37,14 +37,16 @@ def listen():
         except RuntimeError:  # no more threads for this user: the main thread answers when it can
             _signal.set_wakeup_fd(-1)
     for number in SIGNALS:
-        _signal.signal(number, _handler)
+        if _signal.getsignal(number) != _signal.SIG_IGN:  # a script that ran this with & keeps its Ctrl-C
+            _signal.signal(number, _handler)
     atexit.register(_end)  # the first to be registered is the last to be called
 
 
 def _end():
     """Give the signals back to the system: the interpreter ends, and its threads with it."""
     for number in SIGNALS:
-        _signal.signal(number, _signal.SIG_DFL)
+        if _signal.getsignal(number) is _handler:
+            _signal.signal(number, _signal.SIG_DFL)
 
 
 def _watch(pipe):

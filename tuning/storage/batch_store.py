@@ -70,13 +70,14 @@ class Store:
         except OSError as error:
             raise InputError(f"{str(path)!r} cannot be written ({error.strerror}): make room, then --resume") from None
 
-    def get(self, k):
-        """Batch k as {name: array}. Raises InputError for a file that is not one of ours, or not what was written as batch k of this
-        ensemble: its seal says so."""
+    def get(self, k, shapes):
+        """Batch k as {name: array} of these {name: shape}. Raises InputError for a file that is not one of ours, or not what was written as
+        batch k of this ensemble: its seal says so, which whoever has this program can make, or what it holds does."""
         path = self.path(k)
         found = read_part(path, set(self.manifest["measures"]) | {"failed", "seal"})
         seal = found.pop("seal")
-        if seal.dtype.kind != "S" or seal.shape != () or bytes(seal).decode("ascii", "replace") != self._seal(k, found):
+        odd = [n for n, a in found.items() if a.dtype not in (np.float64, np.float32) or a.shape != shapes[n]]
+        if odd or seal.dtype.kind != "S" or seal.shape != () or bytes(seal).decode("ascii", "replace") != self._seal(k, found):
             raise InputError(
                 f"{path.name}: is not what was written as batch {k} of this ensemble: remove it and run its share again"
             )

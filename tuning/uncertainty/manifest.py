@@ -66,7 +66,8 @@ def restore(folder):
         raise InputError(f"{str(folder)!r}: no rig file describes the case of these shards; merge them from Python")
     case = rig.loads(asked["rig"], f"manifest of {str(folder)!r}")
     options = {n: manifest[n] for n in ("samples", "key", "lanes", "draws")}
-    if options["lanes"] < 1 or options["samples"] > 10**8:
+    named = all(isinstance(m, str) for m in manifest["measures"])
+    if options["lanes"] < 1 or options["samples"] > 10**8 or not named:
         raise InputError(f"{str(folder)!r}: the manifest is not one of this program")
     return case, {
         **options,

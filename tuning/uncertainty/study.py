@@ -230,9 +230,10 @@ def ensemble(
             progress(min(samples, lanes * (len(mine) - len(todo) + len(batches))))
     if shard is not None:
         return None
+    shapes = {m: (lanes,) if ms.MEASURES[m].per == "run" else (lanes, ms.entries(m, case.loop.plant)) for m in wanted}
     for k in mine:
         if k not in batches:
-            batches[k] = store.get(k)
+            batches[k] = store.get(k, {**shapes, "failed": (lanes,)})
     if jax.process_count() > 1:
         batches = _gather(batches, count)
     whole = {name: np.concatenate([batches[k][name] for k in range(count)])[:samples] for name in batches[0]}
