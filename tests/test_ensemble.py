@@ -284,8 +284,8 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
     options = {"samples": 8, "lanes": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
-    store = parts.Store.__new__(parts.Store)
-    store.folder, store.manifest = tmp_path, parts.read_manifest(tmp_path)
+    store = batch_store.Store.__new__(batch_store.Store)
+    store.folder, store.manifest = tmp_path, batch_store.read_manifest(tmp_path)
     with np.load(store.path(1)) as table:
         arrays = {n: table[n] for n in table.files if n != "seal"}
     store.put(1, arrays | {name: forged(arrays[name])})
@@ -296,10 +296,10 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
 @pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
 def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
     tuning.ensemble(case, folder=tmp_path, shard=(1, 2), samples=8, lanes=4, measures=("max_level",), fan=False)
-    manifest = parts.read_manifest(tmp_path) | {"measures": measures}
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    altered = batch_store.read_manifest(tmp_path) | {"measures": measures}
+    (tmp_path / "manifest.json").write_text(json.dumps(altered))
     with pytest.raises(InputError, match="the manifest is not one of this program"):
-        shards.restore(tmp_path)
+        manifest.restore(tmp_path)
 
 
 def test_every_value_of_a_discrete_distribution_is_looked_at(case):

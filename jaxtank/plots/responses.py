@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxtank.errors import InputError
+from jaxtank.core.errors import InputError
 
 BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = (
     "#D55E00",

@@ -33,8 +33,8 @@ def _tune(args):
         objective = check_objective(objective)
     limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
     if sweep:  # before the search, which would be lost
-        from tuning.objective import resolve_in
-        from tuning.scenarios import check_scenarios, lanes_of
+        from tuning.problem.limits import resolve_in
+        from tuning.problem.scenarios import check_scenarios, lanes_of
 
         runs = check_scenarios(case, case.scenarios if scenarios is None else scenarios)
         resolve_in(lanes_of(case, runs, seed), {sweep[0]: sweep[1][0]})
