@@ -19,7 +19,7 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from jaxtank.plots import responses
-from tuning.cli.main import main
+from tuning.cli import main
 from tuning.report import figures
 from tuning.storage import batch_store, evaluation_log, folder_lock
 
@@ -384,7 +384,7 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
     """As a shell has it for Ctrl-C when a script runs a command in the background."""
     code = (
         f"import os, signal, time; signal.signal({int(number)}, signal.SIG_IGN)\n"
-        "from tuning import interrupts; interrupts.listen()\n"
+        "from tuning.cli import interrupts; interrupts.listen()\n"
         f"os.kill(os.getpid(), {int(number)}); time.sleep(0.5); print('went on')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
