@@ -51,10 +51,10 @@ class Proportional(Controller):
 def case():
     loop = jaxtank.ClosedLoop(
         plant=Cone(pump_gain=number(30.0), drain=number(1.2), slope=number(0.5), rim=number([30.0])),
-        sensor=jaxtank.instruments.sensors.LevelSensor(gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)),
+        sensor=jaxtank.instruments.LevelSensor(gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)),
         observer=jaxtank.observers.Direct(),
         controller=Proportional(Kc=number(1.0), bias=number(5.0)),
-        actuator=jaxtank.instruments.actuators.PumpBank(
+        actuator=jaxtank.instruments.PumpBank(
             low=number([0.0]), high=number([12.0]), stop=number([0.0]), pulse=number([12.0]), initial=number([0.0])
         ),
         reference=jaxtank.signals.ramps([5.0], [(5.0, 0, 12.0)], ramp=0.0),

@@ -8,6 +8,18 @@ from jaxtank.analysis.steady_state import (
     steady_flows,
     steady_gain,
     steady_levels,
+    transmission_zeros,
+    zero_direction,
 )
 
-__all__ = ["equilibrium", "linearise", "relative_gain_array", "steady_along", "steady_flows", "steady_gain", "steady_levels"]
+__all__ = [
+    "equilibrium",
+    "linearise",
+    "relative_gain_array",
+    "steady_along",
+    "steady_flows",
+    "steady_gain",
+    "steady_levels",
+    "transmission_zeros",
+    "zero_direction",
+]
