@@ -6,9 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.kahan import added
 from jaxtank.core.records import Sample, Tick
-from jaxtank.plants.runge_kutta import change, integrate
+from jaxtank.plants.runge_kutta import advance
 from jaxtank.xla.barrier import materialised
 
 
@@ -76,8 +75,10 @@ def move(loop, clock, state, applied, now):
     t = time_of(state, clock)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
-    return state._replace(k=state.k + 1, x=x, actuator=actuator, excess=excess), u, spilled, shortfall
+    driving = materialised(loop.actuator.driving(u))
+    found = advance(plant, clock.integrator, t, state.x, driving, now.d, clock.dt, clock.substeps, excess=state.excess)
+    moved = state._replace(k=state.k + 1, x=found.x, actuator=actuator, excess=found.excess)
+    return moved, u, found.spilled, found.shortfall
 
 
 def time_of(state, clock):
@@ -101,20 +102,3 @@ def commanded(loop, state, tick, estimate):
             "must return (inputs, state), a tuple with one input for each pump"
         )
     return command, state
-
-
-def _advance(plant, clock, t, x, excess, u, d):
-    """Levels after dt with u and d held, what rounding has added to them too much, the volume lost over each rim on the way [cm^3], and
-    the volume that a negative inflow could not take from each empty tank [cm^3]."""
-    h = clock.dt / clock.substeps
-    spilled = shortfall = (0.0,) * plant.tanks
-    for j in range(clock.substeps):
-        if excess:
-            changes = change(plant, clock.integrator, t + j * h, x, u, d, h)
-            x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
-        else:
-            x = integrate(plant, clock.integrator, t + j * h, x, u, d, h)
-        shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
-        x, lost = plant.spill(x)
-        spilled = tuple(a + b for a, b in zip(spilled, lost))
-    return x, excess, spilled, shortfall
