@@ -20,6 +20,8 @@ ONLY = {  # function or method: the one file that calls it
     "change": "jaxtank/plants/runge_kutta.py",
     "spill": "jaxtank/plants/runge_kutta.py",
     "shortfall": "jaxtank/plants/runge_kutta.py",
+    "predict": "jaxtank/loop/step.py",
+    "commanded": "jaxtank/loop/step.py",
 }
 
 

@@ -22,6 +22,16 @@ class State(NamedTuple):
     excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
 
 
+class Decision(NamedTuple):
+    """What observer and controller make of one sample."""
+
+    estimate: Any  # Estimate of the levels [cm] and inflows [cm^3/s]
+    command: tuple  # (m) inputs before their limits [V]
+    applied: tuple  # (m) inputs within them [V]
+    observer: Any  # its state after the sample
+    controller: Any  # its state after the sample
+
+
 class Inputs(NamedTuple):
     """What is known of every sample before the loop starts: arrays (samples,)."""
 
@@ -43,12 +53,8 @@ def step(loop, clock, state, now):
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y = loop.sensor.read(state.x, now.xi)
-    estimate, observer = loop.observer.step(state.observer, tick, y)
-    command, controller = commanded(loop, state.controller, tick, estimate)
-    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
-    applied = loop.actuator.limit(command, metric)
-    observer = loop.observer.predict(observer, tick, command, applied)
-    controller = loop.controller.track(controller, tick, command, applied)
+    made = decide(loop, state.observer, state.controller, tick, y)
+    estimate, command, applied = made.estimate, made.command, made.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
@@ -65,7 +71,33 @@ def step(loop, clock, state, now):
         spilled=spilled,
         shortfall=shortfall,
     )
-    return moved._replace(observer=observer, controller=controller), sample
+    return moved._replace(observer=made.observer, controller=made.controller), sample
+
+
+def decide(loop, observer, controller, tick, y):
+    """Return what observer and controller make of one sample: the order of a sample, written once.
+
+    The observer corrects its estimate by the readings, the controller commands, the actuator limits
+    the command, and both are given what was applied. Simulation and export call it.
+
+    Parameters
+    ----------
+    loop : Loop
+    observer, controller : states before the sample
+    tick : Tick, what is known at its time
+    y : (n) readings [cm]
+
+    Returns
+    -------
+    Decision
+    """
+    estimate, observer = loop.observer.step(observer, tick, y)
+    command, controller = commanded(loop, controller, tick, estimate)
+    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    applied = loop.actuator.limit(command, metric)
+    observer = loop.observer.predict(observer, tick, command, applied)
+    controller = loop.controller.track(controller, tick, command, applied)
+    return Decision(estimate, command, applied, observer, controller)
 
 
 def move(loop, clock, state, applied, now):
