@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.export import lowering as cg
 from jaxtank.loop.closed_loop import initial
-from jaxtank.loop.step import commanded
+from jaxtank.loop.step import decide
 
 
 def law_of(case):
@@ -18,7 +18,7 @@ def law_of(case):
 
     step(state, t, y, r, dr, ddr) -> (u, state): t [s]; y: (tanks,) readings; r, dr, ddr: (outputs,) setpoints with their first and second
     derivatives by time; u: (pumps,) inputs within the pumps' limits. begin(y, u) -> state, for readings and inputs before the first sample. The
-    order is that of `stepping.step`: observer, law, limits, and both are told what was applied.
+    order is that of `jaxtank.loop.step.decide`, which is called.
     """
     loop, dt = case.loop, case.clock.dt
 
@@ -34,13 +34,8 @@ def law_of(case):
         samples = [tuple(v[None] for v in signal) for signal in (r, dr, ddr)]
         plan = jax.tree.map(lambda a: a[0], loop.controller.prepare(*samples))
         tick = Tick(t=t, r=r, dr=dr, ddr=ddr, dt=dt, plan=plan, own=())
-        estimate, observer = loop.observer.step(observer, tick, one(y))
-        command, controller = commanded(loop, controller, tick, estimate)
-        metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
-        applied = loop.actuator.limit(command, metric)
-        observer = loop.observer.predict(observer, tick, command, applied)
-        controller = loop.controller.track(controller, tick, command, applied)
-        return jax.numpy.stack(list(applied)), (observer, controller)
+        made = decide(loop, observer, controller, tick, one(y))
+        return jax.numpy.stack(list(made.applied)), (made.observer, made.controller)
 
     return step, begin
 

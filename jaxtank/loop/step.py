@@ -6,10 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.kahan import added
 from jaxtank.core.records import Sample, Tick
 from jaxtank.core.tree import is_real
-from jaxtank.plants.runge_kutta import change, integrate
+from jaxtank.plants.runge_kutta import advance
 from jaxtank.xla.barrier import materialised
 
 
@@ -22,6 +21,16 @@ class State(NamedTuple):
     controller: Any
     actuator: Any
     excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
+
+
+class Decision(NamedTuple):
+    """What observer and controller make of one sample."""
+
+    estimate: Any  # Estimate of the levels [cm] and inflows [cm^3/s]
+    command: tuple  # (m) inputs before their limits [V]
+    applied: tuple  # (m) inputs within them [V]
+    observer: Any  # its state after the sample
+    controller: Any  # its state after the sample
 
 
 class Inputs(NamedTuple):
@@ -45,12 +54,8 @@ def step(loop, clock, state, now):
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y = loop.sensor.read(state.x, now.xi)
-    estimate, observer = loop.observer.step(state.observer, tick, y)
-    command, controller = commanded(loop, state.controller, tick, estimate)
-    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
-    applied = loop.actuator.limit(command, metric)
-    observer = loop.observer.predict(observer, tick, command, applied)
-    controller = loop.controller.track(controller, tick, command, applied)
+    made = decide(loop, state.observer, state.controller, tick, y)
+    estimate, command, applied = made.estimate, made.command, made.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
     sample = Sample(
@@ -67,7 +72,33 @@ def step(loop, clock, state, now):
         spilled=spilled,
         shortfall=shortfall,
     )
-    return moved._replace(observer=observer, controller=controller), sample
+    return moved._replace(observer=made.observer, controller=made.controller), sample
+
+
+def decide(loop, observer, controller, tick, y):
+    """Return what observer and controller make of one sample: the order of a sample, written once.
+
+    The observer corrects its estimate by the readings, the controller commands, the actuator limits
+    the command, and both are given what was applied. Simulation and export call it.
+
+    Parameters
+    ----------
+    loop : Loop
+    observer, controller : states before the sample
+    tick : Tick, what is known at its time
+    y : (n) readings [cm]
+
+    Returns
+    -------
+    Decision
+    """
+    estimate, observer = loop.observer.step(observer, tick, y)
+    command, controller = commanded(loop, controller, tick, estimate)
+    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    applied = loop.actuator.limit(command, metric)
+    observer = loop.observer.predict(observer, tick, command, applied)
+    controller = loop.controller.track(controller, tick, command, applied)
+    return Decision(estimate, command, applied, observer, controller)
 
 
 def move(loop, clock, state, applied, now):
@@ -77,8 +108,10 @@ def move(loop, clock, state, applied, now):
     t = time_of(state, clock)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
-    x, excess, spilled, shortfall = _advance(plant, clock, t, state.x, state.excess, materialised(loop.actuator.driving(u)), now.d)
-    return state._replace(k=state.k + 1, x=x, actuator=actuator, excess=excess), u, spilled, shortfall
+    driving = materialised(loop.actuator.driving(u))
+    found = advance(plant, clock.integrator, t, state.x, driving, now.d, clock.dt, clock.substeps, excess=state.excess)
+    moved = state._replace(k=state.k + 1, x=found.x, actuator=actuator, excess=found.excess)
+    return moved, u, found.spilled, found.shortfall
 
 
 def time_of(state, clock):
@@ -110,20 +143,3 @@ def commanded(loop, state, tick, estimate):
             "must return (inputs, state), a tuple with one number for each pump"
         )
     return command, state
-
-
-def _advance(plant, clock, t, x, excess, u, d):
-    """Levels after dt with u and d held, what rounding has added to them too much, the volume lost over each rim on the way [cm^3], and
-    the volume that a negative inflow could not take from each empty tank [cm^3]."""
-    h = clock.dt / clock.substeps
-    spilled = shortfall = (0.0,) * plant.tanks
-    for j in range(clock.substeps):
-        if excess:
-            changes = change(plant, clock.integrator, t + j * h, x, u, d, h)
-            x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
-        else:
-            x = integrate(plant, clock.integrator, t + j * h, x, u, d, h)
-        shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
-        x, lost = plant.spill(x)
-        spilled = tuple(a + b for a, b in zip(spilled, lost))
-    return x, excess, spilled, shortfall

@@ -13,7 +13,7 @@ from jaxtank.core.records import Estimate
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
-from jaxtank.plants.runge_kutta import integrate
+from jaxtank.plants.runge_kutta import advance
 
 
 class Belief(NamedTuple):
@@ -60,12 +60,10 @@ class ExtendedKalman(Observer):
         return Estimate(x=x), Belief(x, P)
 
     def predict(self, state, tick, command, applied):
-        n, h = range(len(state.x)), tick.dt / self.substeps
+        n = range(len(state.x))
 
         def onward(x):
-            for j in range(self.substeps):
-                x, _ = self.model.spill(integrate(self.model, self.integrator, tick.t + j * h, x, applied, None, h))
-            return x
+            return advance(self.model, self.integrator, tick.t, x, applied, None, tick.dt, self.substeps).x
 
         one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
         columns = [jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in n),))[1] for j in n]  # columns[j][i] = F_ij

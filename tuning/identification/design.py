@@ -69,14 +69,14 @@ def settled(plant, voltage):
     u = tuple(jnp.asarray(v) for v in voltage)
     import jax
 
-    from jaxtank.plants.runge_kutta import integrate
+    from jaxtank.plants.runge_kutta import advance
 
     size = float(np.max(np.asarray(plant.rim)))
     rate = max(abs(float(v)) for v in plant.derivative(0.0, tuple(jnp.asarray(0.5 * size) for _ in range(plant.tanks)), u, d))
     h = 0.02 * size / max(rate, 1e-12)
 
     def body(x, _):
-        return plant.spill(integrate(plant, "rk4", 0.0, x, u, d, h))[0], None
+        return advance(plant, "rk4", 0.0, x, u, d, h, 1).x, None
 
     x, _ = jax.lax.scan(body, x, None, length=20_000)
     return np.array([max(float(v), 0.0) for v in x])

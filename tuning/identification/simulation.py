@@ -14,7 +14,7 @@ from jaxtank.core.tree import component, leaf, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
-from jaxtank.plants.runge_kutta import integrate
+from jaxtank.plants.runge_kutta import advance
 from jaxtank.signals.base import Constant
 from jaxtank.xla.hoist import scan
 
@@ -94,17 +94,9 @@ def readings(rig, dt, u, channels, substeps):
         inputs = tuple(clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs))
         held = jnp.where(step > 0, step, 1.0)  # the padding at the end must not divide by nothing
         driven, state = rig.actuator.deliver(state, inputs, held)
-        driven, h = rig.actuator.driving(driven), step / substeps
-
-        def advance(x, _):
-            return rig.plant.spill(integrate(rig.plant, "rk4", 0.0, x, driven, d, h))[0], None
-
-        # a loop of its own, for a program of many unrolled steps takes minutes to compile with its derivatives
-        if isinstance(substeps, int):
-            x = advance(x, None)[0] if substeps == 1 else jax.lax.scan(advance, x, None, length=substeps)[0]
-        else:
-            x = jax.lax.fori_loop(0, substeps, lambda _, x: advance(x, None)[0], x)
-        return (x, state), out
+        driven = rig.actuator.driving(driven)
+        found = advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True)
+        return (found.x, state), out
 
     xs = (dt, tuple(u[:, j] for j in range(rig.plant.pumps)))
     return jnp.stack(scan(body, (x, state), xs, length=dt.shape[0])[1], axis=-1)
