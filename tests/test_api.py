@@ -1,8 +1,10 @@
 """What a user writes in Python: names for components, solver options, results that are read."""
 
 import abc
+import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -11,6 +13,9 @@ import tuning
 from jaxtank import rig
 from jaxtank.controllers import Controller
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.rig import components
@@ -163,3 +168,49 @@ def test_a_taken_name_and_a_class_that_is_no_component_are_refused(own):
         assert "\n" not in str(refused.value)
     assert rig.register("proportional", Proportional) is Proportional  # a cell that is run again
     assert sorted(components.REGISTERED) == ["offset", "proportional"]
+
+
+def test_a_constructor_converts_lists_and_numbers():
+    short = PumpBank(low=[0.0, 1], high=(12.0, 10.0))
+    full = PumpBank(
+        low=number([0.0, 1.0]),
+        high=number([12.0, 10.0]),
+        stop=number([0.0, 0.0]),
+        pulse=number([12.0, 10.0]),
+        initial=number([0.0, 0.0]),
+    )
+    sensors = (LevelSensor(noise=[0.1]), LevelSensor(gain=[1], noise=(0.1,), full_scale=5))
+    for one, other in ((short, full), sensors):
+        assert jax.tree.structure(one) == jax.tree.structure(other)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other)):
+            assert type(a) is np.ndarray and a.dtype == np.float64
+            np.testing.assert_array_equal(a, b)
+    assert dataclasses.replace(short, low=[2, 3]).low.tolist() == [2.0, 3.0]
+    assert PumpBank(low=[0.0], high=[np.inf]).pulse == 1.0
+
+
+def test_a_constructor_refuses_what_it_cannot_fill():
+    with pytest.raises(TypeError, match="low"):
+        PumpBank(high=[12.0])
+    with pytest.raises(InputError, match="bits = 10: an ADC needs"):
+        LevelSensor(noise=[0.1], bits=10)
+
+
+def test_what_is_no_number_passes_a_constructor_and_a_transformation_untouched():
+    bank = PumpBank(low=[0.0], high=[12.0])
+    marks = [object(), jax.ShapeDtypeStruct((1,), np.float64), None, "x", np.float32(1.0), [[1.0], 2.0]]
+    for mark in marks:
+        assert PumpBank(low=mark, high=[12.0], stop=0.0, initial=0.0).low is mark
+    for mark in (*marks, 0, 1.0, (1, 2)):
+        assert jax.tree.map(lambda _, m=mark: m, bank).high is mark
+    assert jax.eval_shape(lambda b: b, bank).high == jax.ShapeDtypeStruct((1,), np.float64)
+    axes = jax.tree.map(lambda _: 0, bank)  # a constructor would make arrays of them
+    many = jax.tree.map(lambda v: jnp.stack([v, v + 1.0]), bank)
+    sums = jax.jit(jax.vmap(lambda b: b.low + b.high, in_axes=(axes,)))(many)
+    np.testing.assert_array_equal(sums, [[12.0], [14.0]])
+    made = jax.jit(lambda v: PumpBank(low=[0.0], high=v))(jnp.array([3.0]))
+    assert made.pulse == 3.0
+    slopes = jax.grad(lambda b: (b.low * b.high).sum())(bank)
+    assert isinstance(slopes, PumpBank) and slopes.low == 12.0
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(bank)]
+    assert paths == [".low", ".high", ".stop", ".pulse", ".initial"]
