@@ -10,7 +10,7 @@ import pytest
 
 import jaxtank
 import tuning
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.controllers import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
@@ -214,3 +214,12 @@ def test_what_is_no_number_passes_a_constructor_and_a_transformation_untouched()
     assert isinstance(slopes, PumpBank) and slopes.low == 12.0
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(bank)]
     assert paths == [".low", ".high", ".stop", ".pulse", ".initial"]
+
+
+def test_load_answers_with_a_case_where_one_is_named():
+    assert presets.load("cascaded/pi") is presets.find("cascaded/pi")
+    for name, words in (("cascaded/pj", "unknown case"), ("cascade/pi", "unknown case")):
+        with pytest.raises(InputError, match=words):
+            presets.load(name)
+    with pytest.raises(InputError, match="unknown paper"):
+        presets.load("cascade")
