@@ -223,3 +223,64 @@ def test_load_answers_with_a_case_where_one_is_named():
             presets.load(name)
     with pytest.raises(InputError, match="unknown paper"):
         presets.load("cascade")
+
+
+def told(result):
+    """What a search came to: its method, gains and every evaluation."""
+    return result.method, result.parameters, result.history, result.message
+
+
+def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
+    few = dict(starts=1, screening=2, iterations=3)
+    assert told(tuning.tune(own, tuning.TRF(**few), validation=0)) == told(tuned)
+    problem = tuning.Problem(own, free=own.free, limits={})
+    assert told(tuning.tune(problem, tuning.TRF(**few), validation=0)) == told(tuned)
+    by_name = tuning.tune(own, method="slsqp", **QUICK)
+    assert told(tuning.tune(own, tuning.SQP(**few), validation=0)) == told(by_name)
+    assert by_name.method == "slsqp" and told(by_name) != told(tuned)
+
+
+def test_solver_options_name_a_method_and_keep_its_numbers():
+    for options, method, more in (
+        (tuning.SQP(tolerance=1e-3), "slsqp", {"tolerance": 1e-3}),
+        (tuning.TRF(), "trf", {}),
+        (tuning.TRF(coarse=True), "coarse-trf", {}),
+        (tuning.LBFGS(starts=2), "lbfgs", {"starts": 2}),
+        (tuning.Adam(batch=4), "adam", {"batch": 4}),
+    ):
+        assert options.name == method
+        assert (
+            options.options()
+            == {"starts": 8, "screening": 64, "iterations": 60}
+            | ({"tolerance": None} if method == "slsqp" else {"batch": None} if method == "adam" else {})
+            | more
+        )
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            options.starts = 3
+
+
+def test_solver_options_are_checked_when_they_are_made_and_against_keywords(own):
+    for make, words in (
+        (lambda: tuning.SQP(starts=0), "starts = 0: must be a whole number from 1"),
+        (lambda: tuning.SQP(tolerance=2.0), "tolerance = 2.0: must be"),
+        (lambda: tuning.Adam(batch=True), "batch = True: must be"),
+        (lambda: tuning.TRF(coarse=1), "coarse = 1: must be True or False"),
+        (lambda: tuning.tune(own, tuning.SQP(starts=4), starts=2), "starts = 2: SQP has starts = 4"),
+        (lambda: tuning.tune(tuning.Problem(own), limits={}), "limits: the Problem has it already"),
+        (lambda: tuning.tune(tuning.Problem(own), risk="worst"), "risk: the Problem has it"),
+    ):
+        with pytest.raises(InputError, match=words):
+            make()
+    with pytest.raises(TypeError, match="tolerance"):
+        tuning.TRF(tolerance=1e-3)
+
+
+def test_a_problem_keeps_its_seed_and_its_limits(own):
+    from tuning.search.options import spelled_out
+
+    plain = dict(free=None, objective=None, limits=None, scenarios=None, risk="mean", seed=0)
+    problem = tuning.Problem(own, limits={"max_level": 9.0}, seed=3)
+    case, method, options = spelled_out(problem, "auto", plain)
+    assert case is own and method == "auto"
+    assert options == plain | {"limits": {"max_level": 9.0}, "seed": 3}
+    assert spelled_out(problem, "auto", plain | {"seed": 5})[2]["seed"] == 5
