@@ -11,7 +11,11 @@ result.save("tuned")
 import importlib
 
 _NAMES = {
+    "Adam": "tuning.search.options",
     "Bound": "tuning.problem.bounds",
+    "LBFGS": "tuning.search.options",
+    "SQP": "tuning.search.options",
+    "TRF": "tuning.search.options",
     "Problem": "tuning.problem.problem",
     "TuningResult": "tuning.search.result",
     "Certificate": "tuning.search.robust",

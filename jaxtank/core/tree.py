@@ -4,11 +4,12 @@ A component is a frozen keyword-only dataclass that JAX sees as a pytree. Each f
 differentiated, with a unit and an allowed range), a static value (hashable: sizes, switching times, topologies), or another
 component. Dotted names reach every leaf: "controller.k1", "plant.drain[0]".
 
-JAX rebuilds components through `__init__` with whatever it carries (tracers, batches, placeholders), so there is no
-`__post_init__`: conversion belongs in a constructor function, checks in `check_leaves`.
+A constructor converts leaves given as lists and numbers. JAX rebuilds components without it, with
+whatever a transformation carries (tracers, batches, axes, placeholders). Checks: `check_leaves`.
 """
 
 import dataclasses
+import functools
 import numbers
 import re
 
@@ -22,14 +23,18 @@ from jaxtank.core.units import DEFAULT, local
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 
 
-def leaf(unit="-", doc="", *, low=None, high=None, strict=False, like=None):
+def leaf(unit="-", doc="", *, low=None, high=None, strict=False, like=None, default=None):
     """A differentiable field: its unit, what it is, and the range in which it means something.
 
     low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a sibling field: such a leaf may be
-    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set.
+    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set. default: function of
+    {field: value} of the fields given, whose result a leaf has that is left out.
     """
     meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "like": like}
-    return dataclasses.field(metadata=meta, default=dataclasses.MISSING if like is None else None)
+    if default is not None:
+        meta["default"] = default
+    needed = like is None and default is None
+    return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
 
 
 def static(unit="-", doc="", *, low=None, high=None, strict=False, choices=None, default=dataclasses.MISSING):
@@ -39,11 +44,69 @@ def static(unit="-", doc="", *, low=None, high=None, strict=False, choices=None,
 
 
 def component(cls):
-    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data."""
+    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data.
+
+    The constructor converts leaves given as numbers or lists and tuples of numbers to arrays (`number`), and gives those that are left out
+    their default.
+
+    >>> from jaxtank.instruments.actuators import PumpBank
+    >>> PumpBank(low=[0.0], high=[12.0]).pulse
+    array([12.])
+    """
     cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    data = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") != "static"]
-    meta = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") == "static"]
-    return jax.tree_util.register_dataclass(cls, data, meta)
+    fields = dataclasses.fields(cls)
+    leaves = {f.name: f.metadata.get("default") for f in fields if f.metadata.get("kind") == "leaf"}
+    needed = {f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING}
+    construct = cls.__init__
+
+    @functools.wraps(construct)
+    def __init__(self, *args, **values):
+        for name in leaves.keys() & values.keys():
+            values[name] = _converted(values[name])
+        if needed <= values.keys():  # else dataclasses name what is missing
+            for name, default in leaves.items():
+                if default is not None and name not in values:
+                    values[name] = _converted(default(values))
+        construct(self, *args, **values)
+
+    cls.__init__ = __init__
+    _register(
+        cls,
+        tuple(f.name for f in fields if f.metadata.get("kind") != "static"),
+        tuple(f.name for f in fields if f.metadata.get("kind") == "static"),
+    )
+    return cls
+
+
+def _register(cls, data, meta):
+    """`jax.tree_util.register_dataclass`, which calls the constructor: its conversion must not see
+    what a transformation carries, such as the axes 0 and 1 of a vmap."""
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
+
+    def flatten(tree):
+        values = vars(tree)
+        return tuple(values[name] for name in data), tuple(values[name] for name in meta)
+
+    def flatten_with_keys(tree):
+        children, static = flatten(tree)
+        return tuple(zip(keys, children)), static
+
+    def unflatten(static, children):
+        tree = object.__new__(cls)
+        vars(tree).update(zip(data, children), **dict(zip(meta, static)))
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+
+
+def _converted(value):
+    """`number(value)` of a Python number and of a list or tuple of numbers; any other as it is."""
+    if type(value) in (int, float, list, tuple) and is_real(value):
+        try:
+            return number(value)
+        except (TypeError, ValueError, OverflowError):  # traced entries, rows of several lengths
+            return value
+    return value
 
 
 def is_component(value):

@@ -23,9 +23,15 @@ class ActuatorState(NamedTuple):
     head: Any  # where the ring buffers are read and written
 
 
+def _largest(high):
+    """(m,) pulses [V] as high as the pumps' upper limits [V], 1 V where those are no pulse."""
+    xp = jnp if isinstance(high, jax.Array) else np
+    return xp.where((high > 0.0) & xp.isfinite(high), high, 1.0)
+
+
 @component
 class PumpBank:
-    """m pumps: what reaches the plant for a command u.
+    """m pumps: what reaches the plant for a command u. `PumpBank(low=[0.0], high=[12.0])` suffices.
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
        best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
@@ -44,10 +50,25 @@ class PumpBank:
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
     dead_zone: np.ndarray | None = leaf("V", "(m,) input at or below which a pump stands still", low=0.0, like="low")
-    stop: np.ndarray = leaf("V", "(m,) input below which a turning pump stops (hysteresis)", low=0.0)
-    pulse: np.ndarray = leaf("V", "(m,) input of the pulses that replace a dead zone (pulse)", low=0.0, strict=True)
+    stop: np.ndarray = leaf(
+        "V",
+        "(m,) input below which a turning pump stops (hysteresis)",
+        low=0.0,
+        default=lambda own: np.zeros(np.shape(own["low"])),
+    )
+    pulse: np.ndarray = leaf(
+        "V",
+        "(m,) input of the pulses that replace a dead zone (pulse)",
+        low=0.0,
+        strict=True,
+        default=lambda own: _largest(own["high"]),
+    )
     lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low")
-    initial: np.ndarray = leaf("V", "(m,) input at which the pumps ran before t = 0")
+    initial: np.ndarray = leaf(
+        "V",
+        "(m,) input at which the pumps ran before t = 0",
+        default=lambda own: np.zeros(np.shape(own["low"])),
+    )
     delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
     saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")
     dead_zone_kind: str = static("-", "what the dead zone does", choices=DEAD_ZONES, default="plain")

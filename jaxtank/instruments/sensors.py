@@ -5,23 +5,44 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import PIECE
+from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, quantise
 from jaxtank.core.tree import component, leaf, static
 
 
+def _without_adc(own, value):
+    """`value` for a leaf of an ADC that is left out. Raises InputError where there is an ADC."""
+    if own.get("bits", 0):
+        raise InputError(f"sensor.bits = {own['bits']}: an ADC needs its gain and its full_scale")
+    return value
+
+
 @component
 class LevelSensor:
-    """One level sensor per tank: noise, then an ADC where `bits` is not 0.
+    """One level sensor per tank: noise, then an ADC where `bits` is not 0. `LevelSensor(noise=[0.1])`
+    suffices where there is no ADC.
 
         y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale], rounded to full_scale / 2^bits
 
     The ADC's slope is that of the line through its staircase (numerics.quantise).
     """
 
-    gain: np.ndarray = leaf("cm/volt", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
+    gain: np.ndarray = leaf(
+        "cm/volt",
+        "(n,) level per volt of each sensor (a)",
+        low=0.0,
+        strict=True,
+        default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
+    )
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
     offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain")
-    full_scale: np.ndarray = leaf("volt", "range of the ADC", low=0.0, strict=True)
+    full_scale: np.ndarray = leaf(
+        "volt",
+        "range of the ADC",
+        low=0.0,
+        strict=True,
+        default=lambda own: _without_adc(own, 5.0),
+    )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
     def draw(self, key, samples, piece=None):

@@ -19,7 +19,13 @@ PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name !
 
 
 def load(paper):
-    """The Preset of `paper`, one of PAPERS. Raises InputError for another name."""
+    """The Preset of `paper`, one of PAPERS; the Case of "paper/case", as `find`. Raises InputError for another name.
+
+    >>> load("gouta2015/ngpc") is find("gouta2015/ngpc")
+    True
+    """
+    if isinstance(paper, str) and "/" in paper:
+        return find(paper)
     if paper not in PAPERS:
         raise unknown("paper", str(paper), PAPERS)
     return _load(paper)

@@ -70,6 +70,7 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 """
 
 from jaxtank.case import Case
+from jaxtank.rig.components import register
 from jaxtank.rig.read import from_table, load, loads, open_case
 from jaxtank.rig.schema import toml
 from jaxtank.rig.validate import (
@@ -107,6 +108,7 @@ __all__ = [
     "open_case",
     "overlap",
     "overridden",
+    "register",
     "save",
     "set_and_schedule",
     "set_scenario",

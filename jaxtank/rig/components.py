@@ -1,6 +1,8 @@
 """[law] and [observer] of a rig file: a component by its kind, and its fields by their names."""
 
 import dataclasses
+import inspect
+import re
 
 import numpy as np
 
@@ -9,7 +11,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import number, shortened
 from jaxtank.core.units import local
-from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman
+from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.schema import is_numeric, static_value
 from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
@@ -30,6 +32,106 @@ LAWS = {
     "open-loop": controllers.OpenLoop,
 }
 OBSERVERS = {"direct": Direct, "disturbance": DisturbanceObserver, "kalman": Kalman, "extended-kalman": ExtendedKalman}
+REGISTERED = set()
+"""Kinds that were added by `register`."""
+
+_KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
+
+
+def register(kind, cls):
+    """Give a controller or an observer of one's own a name in rig files.
+
+    `kind = "..."` of [law] (a controller) or [observer] (an observer) then makes a component of
+    the class. Its leaves and static fields are keys of the table; a field `model` is the plant of
+    the rig. A static field of type tuple holds tanks, which a file counts from 1. `rig.dump`,
+    `rig.complete` and `result.save` write such a case.
+
+    Parameters
+    ----------
+    kind : text of letters, digits, "-", "_" and "."; a name that no other class has
+    cls : class made by `jaxtank.component`, of Controller or Observer
+
+    Returns
+    -------
+    The class.
+
+    Raises
+    ------
+    InputError for a name that is taken, and for a class that a rig file cannot describe.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import rig
+    >>> @jaxtank.component
+    ... class Proportional(jaxtank.controllers.Controller):
+    ...     Kc: float = jaxtank.leaf("V/cm", "gain", low=0.0)
+    ...
+    ...     def step(self, state, tick, estimate):
+    ...         return tuple(self.Kc * (r - h) for r, h in zip(tick.r, estimate.x)), state
+    >>> cls = rig.register("proportional", Proportional)
+    >>> own = rig.loads('''
+    ... case = "cascaded/pi"
+    ... [law]
+    ... kind = "proportional"
+    ... Kc = 2.0
+    ... [free]
+    ... "controller.Kc" = [0.1, 10.0]
+    ... ''')
+    >>> float(own.loop.controller.Kc)
+    2.0
+    """
+    if not (isinstance(kind, str) and _KIND.fullmatch(kind)):
+        allowed = 'a text of letters, digits, "-", "_" and "."'
+        raise InputError(f"kind = {shortened(kind)}: must be {allowed}")
+    name = getattr(cls, "__name__", shortened(cls))
+    known = _table_of(cls)
+    if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
+        wanted = "a class of Controller or Observer with its own step, made by jaxtank.component"
+        raise InputError(f"{name} is no component: it must be {wanted}")
+    for field in dataclasses.fields(cls):
+        why = _unwritable(field)
+        if why:
+            raise InputError(f"{name}.{field.name}: {why}")
+    taken = LAWS.get(kind) or OBSERVERS.get(kind)
+    if taken not in (None, cls):
+        raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
+    other = next((k for k, c in known.items() if c is cls and k != kind), None)
+    if other is not None:
+        raise InputError(f"{name} has a name in rig files already: {other!r}")
+    if taken is None:
+        known[kind] = cls
+        REGISTERED.add(kind)
+    return cls
+
+
+def _table_of(cls):
+    """LAWS or OBSERVERS, where `cls` belongs; None of what belongs to neither."""
+    if not isinstance(cls, type):
+        return None
+    if issubclass(cls, controllers.Controller):
+        return LAWS
+    return OBSERVERS if issubclass(cls, Observer) else None
+
+
+def _unwritable(field):
+    """Why a rig file cannot set the field of a component; "" where it can."""
+    kind = field.metadata.get("kind")
+    if field.name == "kind":
+        return "a rig file has this key for the name of the class: give the field another name"
+    if kind == "static" and _type_of(field) not in _TYPES.values():
+        return f"a static field must be one of {', '.join(_TYPES)} to be set by a rig file"
+    if kind is None and field.name != "model":
+        return "a rig file sets fields made by leaf(...) and static(...), and `model`"
+    return ""
+
+
+def _type_of(field):
+    """The type of a field, also where `from __future__ import annotations` makes it a text."""
+    return _TYPES.get(field.type, field.type)
+
+
 # what a law or an observer needs and a file may leave out: by field
 USUAL = {"Tt": 30.0, "spread": 0.0}
 FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}  # [cm]
@@ -57,7 +159,7 @@ def component(kind, table, known, plant, offered):
         raise InputError(f"[{kind}] needs kind = one of {', '.join(known)}")
     if not isinstance(table["kind"], str) or table["kind"] not in known:
         raise unknown(f"{kind} kind", str(table["kind"]), known)
-    cls, values = known[table["kind"]], {}
+    cls, values, own = known[table["kind"]], {}, table["kind"] in REGISTERED
     fields = {f.name: f for f in dataclasses.fields(cls)}
     settable = {n: f for n, f in fields.items() if n != "model"}
     for key in table:
@@ -69,11 +171,11 @@ def component(kind, table, known, plant, offered):
         meta = field.metadata
         if name in table:
             value = table[name]
-        elif name in offered:
+        elif name in offered and not own:
             value = offered[name]
-        elif name in USUAL:
+        elif name in USUAL and not own:
             value = USUAL[name]
-        elif name in FLOORS:
+        elif name in FLOORS and not own:
             value = in_unit(FLOORS[name], plant.units[0])
         elif field.default is not dataclasses.MISSING:
             continue
@@ -87,16 +189,16 @@ def component(kind, table, known, plant, offered):
 def _value(name, value, field, plant):
     if field.metadata.get("kind") == "leaf":
         array = _shaped(name, value, field.metadata, plant)
-        if field.type is float and array.ndim:
+        if _type_of(field) is float and array.ndim:
             raise InputError(f"{name} = {shortened(value)}: must be one number")
         return array
-    if field.type is tuple:  # tanks, counted from 1 in a file
+    if _type_of(field) is tuple:  # tanks, counted from 1 in a file
         if not (isinstance(value, list) and all(isinstance(i, int) and not isinstance(i, bool) for i in value)):
             raise InputError(f"{name} = {shortened(value)}: must be a list of tanks, counted from 1")
         if not all(1 <= i <= plant.tanks for i in value):
             raise InputError(f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}")
         return tuple(i - 1 for i in value)
-    return static_value(name, value, field.metadata, field.type)
+    return static_value(name, value, field.metadata, _type_of(field))
 
 
 def _shaped(name, value, meta, plant):
@@ -156,6 +258,9 @@ def keys_of(part, known):
         if meta.get("kind") == "leaf":
             found.append((field.name, meta, None if value is None else np.asarray(value).tolist()))
         elif meta.get("kind") == "static":
+            if isinstance(value, tuple) and not all(type(i) is int for i in value):
+                named = f"its {type(part).__name__}.{field.name}"
+                raise InputError(f"{named} = {shortened(value)} is no list of tanks")
             found.append((field.name, meta, [i + 1 for i in value] if isinstance(value, tuple) else value))
     return found
 

@@ -66,11 +66,12 @@ class Problem:
     free: {name: Free}; objective: {measure: weight} (a list measure counts with the sum of its entries; scenarios count with their
     weighted mean); limits as in resolve_limits, held in every scenario; scenarios: tuple of Scenario, () for the case's own run, None
     for those of the case; seed: of the sensor noise, which is the same for every evaluation (common random numbers); memo: a Memo of
-    what was evaluated before; risk: what the costs of the scenarios come to, one of RISKS.
+    what was evaluated before; risk: what the costs of the scenarios come to, one of RISKS. `tune` takes a Problem in the place of a Case.
     """
 
     def __init__(self, case, free=None, objective=None, limits=None, scenarios=None, seed=0, memo=None, risk="mean"):
         self.case, self.loop, self.clock, self.seed = case, case.loop, case.clock, seed
+        self.given = dict(free=free, objective=objective, scenarios=scenarios, risk=risk)
         if risk not in RISKS:
             raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
         self.risk = risk
@@ -87,6 +88,7 @@ class Problem:
         """Replace the limits by `limits`, as in `resolve_limits`.
 
         The evaluation cache holds margins of the former limits, and is emptied."""
+        self.given["limits"] = limits
         self.limits = resolve_in(self.lanes, limits)
         self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
         self.needed = tuple(dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)]))

@@ -18,6 +18,7 @@ from tuning.search.driver import SETTLED, Search
 from tuning.search.first_order import minibatches
 from tuning.search.kkt import UNSTABLE, downhill, optimality
 from tuning.search.methods import METHODS, approach, restore, slsqp
+from tuning.search.options import Solver, check_options, spelled_out
 from tuning.search.provenance import fingerprint, noisy, provenance
 from tuning.search.result import STATUSES, TuningResult, constraint_rows, message
 from tuning.search.screening import best_screened, distinct_starts, screen
@@ -59,7 +60,9 @@ def tune(
 ):
     """Better values for the free parameters of a case, under its limits.
 
-    case: presets Case; method: "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "coarse-trf"
+    case: presets Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its own (and its seed, unless another
+    is given); method: solver options (SQP, TRF, LBFGS, Adam), or
+    "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "coarse-trf"
     (trf at a tenth of the samples, then at all), "lbfgs" or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight};
     limits: {measure: value}, {} for none, held in every
     scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
@@ -90,12 +93,21 @@ def tune(
         tolerance=tolerance,
         progress=progress,
     )
+    if isinstance(case, Problem) or isinstance(method, Solver):
+        case, method, options = spelled_out(case, method, options)
+        return tune(case, method, choices=choices, log=log, resume=resume, **options)
     if choices:
         return tune_choices(tune, case, method, choices, log=log, resume=resume, **options)
     began = time.perf_counter()
-    _check_options(starts=starts, screening=screening, iterations=iterations, batch=batch, validation=validation)
-    if tolerance is not None and not (isinstance(tolerance, float) and 0.0 < tolerance < 1.0):
-        raise InputError(f"tolerance = {tolerance!r}: must be a number between 0 and 1")
+    _check_precision()
+    check_options(
+        starts=starts,
+        screening=screening,
+        iterations=iterations,
+        batch=batch,
+        validation=validation,
+        tolerance=tolerance,
+    )
     problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed, risk=risk)
     key = jax.random.key(seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
@@ -243,17 +255,11 @@ def _find_feasible(search, zs, margins, iterations):
     return any(ended)
 
 
-def _check_options(**counts):
+def _check_precision():
     if jax.numpy.result_type(float) != np.float64:
         raise InputError(
             "tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)"
         )
-    for name, value in counts.items():
-        low = 0 if name == "validation" else 1
-        if name == "batch" and value is None:
-            continue
-        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
 
 
 def _check_objective(problem, before):

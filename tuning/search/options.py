@@ -1,0 +1,124 @@
+"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam; `tuner` imports it."""
+
+import dataclasses
+from typing import ClassVar
+
+from jaxtank.core.errors import InputError
+from tuning.problem.problem import Problem
+
+PROBLEM = ("free", "objective", "limits", "scenarios", "risk")
+"""Keywords of `tune` that a Problem has of its own."""
+
+USUAL = {"starts": 8, "screening": 64, "iterations": 60, "batch": None, "tolerance": None}
+"""Defaults of the keywords of `tune` that solver options have too."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Solver:
+    """What every method has: local searches, Sobol points they begin at, iterations of each.
+
+    Raises InputError, when it is made, for a number that is out of range.
+    """
+
+    method: ClassVar[str]
+    starts: int = USUAL["starts"]
+    screening: int = USUAL["screening"]
+    iterations: int = USUAL["iterations"]
+
+    def __post_init__(self):
+        check_options(**self.options())
+
+    def options(self):
+        """{keyword of `tune`: value}."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return {name: value for name, value in fields.items() if name in USUAL}
+
+    @property
+    def name(self):
+        """The method, as `tune(case, method=...)` and `--method` have it."""
+        return self.method
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SQP(Solver):
+    """Sequential quadratic programming, which holds limits ("slsqp").
+
+    tolerance: change of the objective, as a share of its first value, below which a search has
+    arrived; None for 1e-8 and a polish of the best point to 1e-12.
+
+    >>> SQP(starts=4).options()["starts"]
+    4
+    """
+
+    method: ClassVar[str] = "slsqp"
+    tolerance: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TRF(Solver):
+    """Bounded Gauss-Newton trust region on squares, without limits ("trf").
+
+    coarse: first with a tenth of the samples ("coarse-trf").
+    """
+
+    method: ClassVar[str] = "trf"
+    coarse: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not isinstance(self.coarse, bool):
+            raise InputError(f"coarse = {self.coarse!r}: must be True or False")
+
+    @property
+    def name(self):
+        return "coarse-trf" if self.coarse else "trf"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LBFGS(Solver):
+    """Limited-memory BFGS on an augmented Lagrangian ("lbfgs")."""
+
+    method: ClassVar[str] = "lbfgs"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Adam(Solver):
+    """Adam on an augmented Lagrangian ("adam"). batch: scenarios drawn for each step, None for all."""
+
+    method: ClassVar[str] = "adam"
+    batch: int | None = None
+
+
+def check_options(*, tolerance=None, **counts):
+    """Raise InputError for a number of searches, points, iterations or runs that is out of range."""
+    for name, value in counts.items():
+        low = 0 if name == "validation" else 1
+        if name == "batch" and value is None:
+            continue
+        if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= 100_000:
+            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
+    if tolerance is not None and not (isinstance(tolerance, float) and 0.0 < tolerance < 1.0):
+        raise InputError(f"tolerance = {tolerance!r}: must be a number between 0 and 1")
+
+
+def spelled_out(case, method, options):
+    """(Case, name of the method, keywords of `tune`) of a Case or Problem and a name or Solver.
+
+    Raises InputError for a keyword that contradicts what the Problem or the Solver has.
+    """
+    options = dict(options)
+    if isinstance(case, Problem):
+        own = case.given
+        for name in PROBLEM:
+            if options[name] != ("mean" if name == "risk" else None):
+                raise InputError(f"{name}: the Problem has it already, leave it out of tune")
+        options |= own | {"seed": options["seed"] or case.seed}
+        case = case.case
+    if isinstance(method, Solver):
+        for name, value in method.options().items():
+            kind = type(method).__name__
+            if value is not None and options[name] not in (USUAL[name], value):
+                raise InputError(f"{name} = {options[name]!r}: {kind} has {name} = {value!r}")
+            options[name] = options[name] if value is None else value
+        method = method.name
+    return case, method, options
