@@ -134,7 +134,9 @@ def lanes(rounds):
     told = subprocess.run(program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.split()
     a, b, between = map(float, told)
     rival = f"vectorised C loop, float32 not compensated, {b:.1f} ns"
-    rows.append(["batch of 256, RK4, float32 with compensated sums", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "2.0"])
+    rows.append(
+        ["batch of 256, RK4, float32 with compensated sums", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "2.0"]
+    )
     return rows
 
 
