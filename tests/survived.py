@@ -1,7 +1,7 @@
-"""What was tried on this program and what came of it: the table in the README, from what the drills themselves recorded.
+"""What was tried on this program and what came of it: the table in benchmarks/README.md, from what the drills recorded.
 
     python tests/survived.py                 the table of what is recorded
-    python tests/survived.py --markdown      the same into the README, between its marks
+    python tests/survived.py --markdown      the same into benchmarks/README.md, between its marks
     python tests/survived.py fuzz kills ...  runs these drills first (all: hours), and records what they find
 
 A drill that fails is recorded as what it is. survived.json holds {drill: {"count", "outcome"}}.
@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 from jaxtank.core.files import write_atomic
 
 HERE = Path(__file__).parent
-README, KEPT = HERE.parent / "README.md", HERE / "survived.json"
+README, KEPT = HERE / "benchmarks" / "README.md", HERE / "survived.json"
 BEGIN, END = "<!-- tests/survived.py -->", "<!-- end of survived -->"
 
 SLOW = ["-p", "no:cacheprovider", "-n", "0", "-m", "slow or not slow"]

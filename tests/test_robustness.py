@@ -81,7 +81,7 @@ def test_runs_of_the_table_are_those_of_the_library(everything):
 
 
 def test_claims_of_the_paper(everything):
-    """What is borne out, and what is not; the README says the same."""
+    """What is borne out, and what is not; benchmarks/README.md says the same."""
     table = robustness_table.rows(*everything)
     held = {row.claim: row.holds for row in table}
     assert {c for c, h in held.items() if h != "yes"} == {

@@ -251,7 +251,8 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         for path in root.rglob("*")
         if path.is_file() and "__pycache__" not in path.parts
     }
-    assert packed == there and {"tuning/bench/floor.c", "tuning/cli/names.txt"} <= packed
+    assert packed == there
+    assert {"tuning/bench/floor.c", "tuning/cli/names.txt", "jaxtank/README.md", "tuning/README.md"} <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
@@ -271,6 +272,7 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
         "tests/conftest.py",
     } <= names
     assert {"tests/rigs/watertank.toml", "tests/slow.txt", "tests/versions.sh", "notebooks/run.py"} <= names
+    assert {"tests/benchmarks/README.md", "notebooks/README.md", "notebooks/images/tuned.gif"} <= names
     assert not any("__pycache__" in n or n.endswith((".pyc", ".so", ".log")) for n in names)
 
 

@@ -1,4 +1,4 @@
-"""The README's table of gains: every row is tuned anew, and held to the number that our re-derivation of its paper reached."""
+"""The table of tuned gains in benchmarks/README.md: every row is tuned anew, and compared with the number of our re-derivation."""
 
 import dataclasses
 import functools
@@ -159,7 +159,7 @@ def test_gains_of_the_predictive_laws(name, least):
 
 
 def test_the_table_is_that_of_the_store():
-    """Every row that is stored is one of ours, its limits hold, and the README shows it."""
+    """Every row that is stored is one of ours, its limits hold, and benchmarks/README.md shows it."""
     stored = json.loads(tuning_table.STORE.read_text())
     assert set(stored["rows"]) <= set(ROWS) and set(stored["bounds"]) <= set(BOUNDS)
     limits = [row["limits"]["after"] for row in stored["rows"].values()]

@@ -29,7 +29,7 @@ from jaxtank.core.files import write_atomic
 from tuning.bench import bench
 from tuning.report import tables
 
-README = Path(__file__).parents[2] / "README.md"
+README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
 FEW = 6000  # samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
 
@@ -267,7 +267,7 @@ RIVALS = {
     "diffrax, Tsit5 in a scan": diffrax_steps,
     "plain Python": plain_python,
     "scipy, LSODA between samples": scipy_lsoda,
-    "python-control (law continuous)": python_control,
+    "python-control (continuous controller)": python_control,
 }
 WHOLE = (numba_loop, casadi_accumulated, plain_scan, jax_as_it_comes)
 ABSENT = ("jaxonomy", "fugacio")

@@ -1,7 +1,7 @@
 """gouta2015 sec. 5.3, claim by claim: what its two laws make of plants whose coefficients are off, with 95 % intervals.
 
     python tests/benchmarks/robustness_table.py               # the table
-    python tests/benchmarks/robustness_table.py --markdown    # the same, into the README
+    python tests/benchmarks/robustness_table.py --markdown    # the same, into README.md here
 
 200 plants with c1, c2, c3, c7, c8 (and their twins) off by up to 5 and 10 %; the paper gives no ranges, nor numbers. Ramps of 30 s, steps of
 0.02 s (gouta2015 notes S11). Intervals of means and medians by resampling plants in pairs, of shares by Clopper and Pearson.
@@ -28,7 +28,7 @@ SHORT = {"ngpc": "NGPC", "backstepping": "BS"}
 CHANGES = (20.0, 270.0, 470.0, 760.0, 900.0, 1200.0)  # ends of the plateaus of the benchmark [s]
 EVERY = 0.5  # of the errors that are kept [s]
 MEASURES = ("rms_error_total", "max_level", "rms_input", "input_travel", "saturated_fraction", "overshoot_percent")
-README = Path(__file__).parents[2] / "README.md"
+README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/robustness_table.py -->", "<!-- end of robustness table -->"
 
 
@@ -169,7 +169,7 @@ def rows(found, nominal):
         ),
         row("overshoot, especially", "NGPC", differences("overshoot_percent"), "%", "NGPC less BS: "),
         row("more control effort: voltage", "NGPC", differences("rms_input"), "V rms", "NGPC less BS: "),
-        row("more control effort: travel of the pumps", "NGPC", differences("input_travel"), "V", "NGPC less BS: "),
+        row("more control effort: total variation of the voltage", "NGPC", differences("input_travel"), "V", "NGPC less BS: "),
         row("more often at the pumps' limits", "NGPC", differences("saturated_fraction"), "of the time", "NGPC less BS: "),
         row("larger error of h1 when r2 goes to 14 cm", "NGPC", first, "cm", "NGPC less BS: "),
         Row(
@@ -193,7 +193,7 @@ def _share(count, total):
 
 
 def markdown(table):
-    """The table as it stands in the README."""
+    """The table as it stands in README.md."""
     heads = ("claim of sec. 5.3", "of", *(f"+-{100 * s:g} %" for s in SPREADS), "holds")
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     return "\n".join([*lines, *(f"| {' | '.join([r.claim, r.paper, *r.measured, r.holds])} |" for r in table)])

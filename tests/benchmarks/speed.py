@@ -31,7 +31,7 @@ from tuning.bench import bench
 from tuning.report import tables
 from tuning.report.case import noisy
 
-README = Path(__file__).parents[2] / "README.md"
+README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"
 HEADS = ["what", "measured", "ratio (range)", "to", "at most"]
 NAMES = bench.MEASURES
@@ -128,13 +128,15 @@ def lanes(rounds):
             few = which.replace(clock=dataclasses.replace(which.clock, duration=200.0)) if plants > 256 else which
             a, b, between, apart = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
             assert apart < 1e-10, f"{words}: jaxtank and the C loop are {apart:.1e} cm apart"
-            rival = f"C loop in vector lanes, {b:.1f} ns"
-            rows.append([f"{plants:,} lanes, {words}", f"{a:.1f} ns per step and lane", f"{between:.2f}", rival, "1.5"])
+            rival = f"vectorised C loop, {b:.1f} ns"
+            rows.append([f"batch of {plants:,}, {words}", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "1.5"])
     program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(max(rounds // 4, 3))]
     told = subprocess.run(program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.split()
     a, b, between = map(float, told)
-    rival = f"C loop in vector lanes, float32 not compensated, {b:.1f} ns"
-    rows.append(["256 lanes, RK4, float32 with compensated sums", f"{a:.1f} ns per step and lane", f"{between:.2f}", rival, "2.0"])
+    rival = f"vectorised C loop, float32 not compensated, {b:.1f} ns"
+    rows.append(
+        ["batch of 256, RK4, float32 with compensated sums", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "2.0"]
+    )
     return rows
 
 
@@ -168,7 +170,7 @@ def gauss_newton(rounds):
     seconds = timed(calls, max(rounds // 3, 3))
     spent = f"{1e3 * statistics.median(seconds['pass']):.0f} ms"
     return [
-        ["Gauss-Newton pass, 8 parameters, 16 scenarios", spent, ratio(seconds, "pass", "run"), "the run of the same lanes", "8"]
+        ["Gauss-Newton pass, 8 parameters, 16 scenarios", spent, ratio(seconds, "pass", "run"), "the run of the same batch", "8"]
     ]
 
 

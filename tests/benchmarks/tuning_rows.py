@@ -1,4 +1,4 @@
-"""Which tunings the README's table of gains is made of: the case, what is free, what is made small, what it is judged on besides.
+"""The rows of the table of tuned gains in README.md here: case, free parameters, objective, other measures.
 
 A target is the number of our re-derivation of the paper (S10 of its
 notes), which the tuned objective must reach to 1 % or half a unit of its last digit; tests/test_tuning_rows.py asks for it.

@@ -1,9 +1,9 @@
-"""What tuning gains: published gains beside tuned, on plants and noise unseen, with the bound that no law could beat.
+"""Published gains beside tuned ones, on validation plants and noise, with the perfect-information optimum.
 
     python tests/benchmarks/tuning_table.py               # every row; an hour or two on two cores
     python tests/benchmarks/tuning_table.py 'khalid*'     # some, by name
     python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone; --rows for rows alone
-    python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into the README
+    python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into README.md here
 
 Rows and bounds are those of tuning_rows.py. Each is stored in tuning_table.json as soon as it is done, with the versions it was made with.
 """
@@ -25,7 +25,7 @@ from tuning.search import provenance
 from tuning.search.result import constraint_rows
 
 HERE = Path(__file__).parent
-STORE, README = HERE / "tuning_table.json", HERE.parents[1] / "README.md"
+STORE, README = HERE / "tuning_table.json", HERE / "README.md"
 BEGIN, END = "<!-- tests/benchmarks/tuning_table.py -->", "<!-- end of tuning table -->"
 SIDES = ("before", "after")
 VERSIONS = ("jaxtank", "python", "jax", "jaxlib", "numpy", "scipy", "optax", "dtype", "xla_option")
@@ -196,7 +196,7 @@ def _bound(row, bounds):
 
 def markdown(stored):
     """The table that belongs between the marks."""
-    heads = ("row", "published → tuned", "objective", "limits at the true step", "unseen plants and noise", "bound", "s")
+    heads = ("row", "published → tuned", "objective", "limits at the true step", "validation plants and noise", "bound", "s")
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in stored["rows"].items():
         cells = [

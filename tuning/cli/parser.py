@@ -221,7 +221,7 @@ def parser():
     )
     compare.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
     compare.add_argument("--out", metavar="DIR", help="folder for report.html, result.json and the rigs as pictures")
-    compare.add_argument("--markdown", action="store_true", help="as the table of the README")
+    compare.add_argument("--markdown", action="store_true", help="as a Markdown table")
     completed = commands.add_parser(
         "completion", help="a script that completes commands, options, cases and parameters: bash, zsh or fish"
     )

@@ -190,7 +190,7 @@ def _in_full(found):
 
 
 def markdown(pages):
-    """The README's table: every measured quantity of {paper: page}; parameters that are only quoted are left out."""
+    """The table of tests/benchmarks/README.md: every measured quantity of {paper: page}; parameters that are only quoted are left out."""
     lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, page in pages.items():
         for r in page["rows"]:

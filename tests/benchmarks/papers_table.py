@@ -1,11 +1,11 @@
-"""Writes the README's table of papers: python tests/benchmarks/readme_table.py (about half a minute)."""
+"""Write the table of papers in README.md here: python tests/benchmarks/papers_table.py (about half a minute)."""
 
 import re
 from pathlib import Path
 
 import jaxtank  # noqa: F401  (before jax starts)
 
-README = Path(__file__).parents[2] / "README.md"
+README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- jaxtank compare all --markdown -->", "<!-- end -->"
 
 
