@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -284,3 +285,38 @@ def test_a_problem_keeps_its_seed_and_its_limits(own):
     assert case is own and method == "auto"
     assert options == plain | {"limits": {"max_level": 9.0}, "seed": 3}
     assert spelled_out(problem, "auto", plain | {"seed": 5})[2]["seed"] == 5
+
+
+def test_a_parameter_of_a_result_is_read_by_name(tuned):
+    change = tuned["controller.Kc"]
+    assert dataclasses.asdict(change) == tuned.parameters["controller.Kc"]
+    assert (change.before, change.lower, change.upper, change.unit) == (2.0, 0.1, 10.0, "V/V")
+    assert change.after == float(tuned.tuned.loop.controller.Kc)
+    assert change.at_bound == "upper"
+    assert "controller.Kc" in tuned and "controller.Kd" not in tuned
+    assert list(tuned) == ["controller.Kc"]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        change.after = 1.0
+    with pytest.raises(InputError, match=r"'controller.Kd'; nearest: controller.Kc"):
+        tuned["controller.Kd"]
+
+
+def test_a_status_is_typed_and_is_its_text(tuned):
+    assert type(tuned.status) is tuning.Status and tuned.success
+    assert tuned.status is tuning.Status.CONVERGED and tuned.status == "converged"
+    assert {"converged": 0}[tuned.status] == 0 and f"{tuned.status}" == "converged"
+    assert json.dumps(tuned.status) == '"converged"'
+    with pytest.raises(ValueError, match="done"):
+        tuning.Status("done")
+
+
+def test_every_result_has_the_same_ways_out(tuned):
+    from tuning.uncertainty.sensitivity_study import SensitivityResult
+
+    for kind in (tuning.TuningResult, tuning.Ensemble, SensitivityResult, tuning.Identification):
+        assert all(callable(getattr(kind, name)) for name in ("to_json", "plot", "save"))
+    found = tuned.to_json()
+    assert type(found["status"]) is str and found["case"] == "own"
+    assert found["parameters"]["controller.Kc"]["after"] == tuned["controller.Kc"].after
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert str(tuned).startswith("own: converged (trf") and "controller.Kc" in str(tuned)

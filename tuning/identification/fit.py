@@ -18,6 +18,7 @@ from tuning.identification.confidence import stopped
 from tuning.identification.identified_case import bare, proposed
 from tuning.identification.problem import Estimation, Fit, check_length
 from tuning.identification.proposal import check_law
+from tuning.problem.status import Status
 from tuning.storage.batch_store import digest
 from tuning.storage.evaluation_log import Log, Memo
 
@@ -33,7 +34,7 @@ class Identification:
     case: Any  # the case that was given
     estimation: Estimation
     fit: Fit
-    status: str  # converged, not_converged, not_identifiable, interrupted
+    status: Status  # CONVERGED, NOT_CONVERGED, NOT_IDENTIFIABLE or INTERRUPTED
     parameters: dict  # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}
     levels: list  # of each log, of each tank: {"value", "interval95"}
     covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
@@ -203,7 +204,7 @@ def identify(
         case=case,
         estimation=estimation,
         fit=best,
-        status=status,
+        status=Status(status),
         parameters=parameters,
         levels=levels,
         covariance=spread.covariance_of_values(),

@@ -10,6 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.problem.problem import Problem
+from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.baseline import own_values, run_measures
 from tuning.search.diagnostics import of_answer
@@ -20,7 +21,7 @@ from tuning.search.kkt import UNSTABLE, downhill, optimality
 from tuning.search.methods import METHODS, approach, restore, slsqp
 from tuning.search.options import Solver, check_options, spelled_out
 from tuning.search.provenance import fingerprint, noisy, provenance
-from tuning.search.result import STATUSES, TuningResult, constraint_rows, message
+from tuning.search.result import TuningResult, constraint_rows, message
 from tuning.search.screening import best_screened, distinct_starts, screen
 from tuning.storage.evaluation_log import Log
 
@@ -174,7 +175,6 @@ def tune(
     checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
     status = "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
-    assert status in STATUSES
     mirrored = None if interrupted or best is None else diagnostics.mirror_of(problem, outcomes, values)
     validated, cloud = None, None
     if (
@@ -187,7 +187,7 @@ def tune(
         case=case,
         tuned=tuned,
         method=method,
-        status=status,
+        status=Status(status),
         message="",
         parameters={
             b.name: {

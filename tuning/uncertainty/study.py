@@ -137,6 +137,12 @@ class Ensemble:
 
         return json_of(self)
 
+    def plot(self):
+        """Matplotlib figures {name: figure}: fan of the levels, violations, rig."""
+        from tuning.report.uncertainty import figures
+
+        return figures(self)
+
     def save(self, folder, command=None):
         """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report.uncertainty import save
