@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -68,7 +69,8 @@ offset = [0.01, 0.02]
 """
 
 
-QUICK = dict(starts=1, screening=2, iterations=3, validation=0)
+FEW = dict(starts=1, screening=2, iterations=3)
+QUICK = FEW | dict(validation=0)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -231,12 +233,11 @@ def told(result):
 
 
 def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
-    few = dict(starts=1, screening=2, iterations=3)
-    assert told(tuning.tune(own, tuning.TRF(**few), validation=0)) == told(tuned)
+    assert told(tuning.tune(own, tuning.TRF(**FEW), validation=0)) == told(tuned)
     problem = tuning.Problem(own, free=own.free, limits={})
-    assert told(tuning.tune(problem, tuning.TRF(**few), validation=0)) == told(tuned)
+    assert told(tuning.tune(problem, tuning.TRF(**FEW), validation=0)) == told(tuned)
     by_name = tuning.tune(own, method="slsqp", **QUICK)
-    assert told(tuning.tune(own, tuning.SQP(**few), validation=0)) == told(by_name)
+    assert told(tuning.tune(own, tuning.SQP(**FEW), validation=0)) == told(by_name)
     assert by_name.method == "slsqp" and told(by_name) != told(tuned)
 
 
@@ -284,3 +285,62 @@ def test_a_problem_keeps_its_seed_and_its_limits(own):
     assert case is own and method == "auto"
     assert options == plain | {"limits": {"max_level": 9.0}, "seed": 3}
     assert spelled_out(problem, "auto", plain | {"seed": 5})[2]["seed"] == 5
+
+
+def test_a_parameter_of_a_result_is_read_by_name(tuned):
+    change = tuned["controller.Kc"]
+    assert dataclasses.asdict(change) == tuned.parameters["controller.Kc"]
+    assert (change.before, change.lower, change.upper, change.unit) == (2.0, 0.1, 10.0, "V/V")
+    assert change.after == float(tuned.tuned.loop.controller.Kc)
+    assert change.at_bound == "upper"
+    assert "controller.Kc" in tuned and "controller.Kd" not in tuned
+    assert list(tuned) == ["controller.Kc"]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        change.after = 1.0
+    with pytest.raises(InputError, match=r"'controller.Kd'; nearest: controller.Kc"):
+        tuned["controller.Kd"]
+
+
+def test_a_status_is_typed_and_is_its_text(tuned):
+    assert type(tuned.status) is tuning.Status and tuned.success
+    assert tuned.status is tuning.Status.CONVERGED and tuned.status == "converged"
+    assert {"converged": 0}[tuned.status] == 0 and f"{tuned.status}" == "converged"
+    assert json.dumps(tuned.status) == '"converged"'
+    with pytest.raises(ValueError, match="done"):
+        tuning.Status("done")
+
+
+def test_every_result_has_the_same_ways_out(tuned):
+    from tuning.uncertainty.sensitivity_study import SensitivityResult
+
+    for kind in (tuning.TuningResult, tuning.Ensemble, SensitivityResult, tuning.Identification):
+        assert all(callable(getattr(kind, name)) for name in ("to_json", "plot", "save"))
+    found = tuned.to_json()
+    assert type(found["status"]) is str and found["case"] == "own"
+    assert found["parameters"]["controller.Kc"]["after"] == tuned["controller.Kc"].after
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert str(tuned).startswith("own: converged (trf") and "controller.Kc" in str(tuned)
+
+
+def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tmp_path):
+    assert told(tuning.tune(own, "trf", **QUICK, checkpoint=tmp_path)) == told(tuned)
+    lines = (tmp_path / "evaluations.jsonl").read_text().splitlines()
+    (tmp_path / "evaluations.jsonl").write_text("\n".join(lines[:4]) + "\n")
+    again = tuning.tune(own, tuning.TRF(**FEW), validation=0, checkpoint=tmp_path, resume=True)
+    assert told(again) == told(tuned)
+    assert (tmp_path / "evaluations.jsonl").read_text().splitlines() == lines
+
+
+@pytest.mark.parametrize("run", [tuning.tune, tuning.ensemble, lambda case, **more: tuning.identify(case, [], **more)])
+def test_a_checkpoint_and_its_former_name_are_one_folder(own, run):
+    name = "log" if run is tuning.tune else "folder"
+    with pytest.raises(InputError, match=f"checkpoint and {name} are two names"):
+        run(own, checkpoint="one", **{name: "two"})
+
+
+def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
+    options = {"measures": ("max_level",), "limits": {}, "fan": False, "lanes": 2}
+    spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
+    tuning.ensemble(own, spread, 4, checkpoint=tmp_path, shard=(1, 2), **options)
+    with pytest.raises(InputError, match="1 of 2 batches are missing"):
+        tuning.ensemble(own, spread, 4, checkpoint=tmp_path, resume=True, merge=True, **options)

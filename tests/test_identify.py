@@ -315,7 +315,7 @@ def test_a_level_that_no_reading_tells_costs_only_its_own_interval(case):
         t=T[::10], u=np.tile(VOLTAGE, (31, 1)), y=y[:, :1] + 0.01 * np.random.default_rng(0).standard_normal((31, 1)), tanks=(0,)
     )
     found = tuning.identify(case, log, free, starts=1, hold_back=0, noise=0.01)
-    assert found.status == "converged" and found.parameters["plant.pump_gain[0]"]["identifiable"]
+    assert found.status is tuning.Status.CONVERGED and found.parameters["plant.pump_gain[0]"]["identifiable"]
     low, high = found.parameters["plant.pump_gain[0]"]["interval95"]
     assert low < 27.43 < high
     assert found.levels[0][0]["interval95"] is not None and found.levels[0][1]["interval95"] is None

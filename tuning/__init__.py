@@ -17,6 +17,8 @@ _NAMES = {
     "SQP": "tuning.search.options",
     "TRF": "tuning.search.options",
     "Problem": "tuning.problem.problem",
+    "ParameterChange": "tuning.search.result",
+    "Status": "tuning.problem.status",
     "TuningResult": "tuning.search.result",
     "Certificate": "tuning.search.robust",
     "Correlated": "tuning.uncertainty.distributions",

@@ -18,8 +18,9 @@ from tuning.identification.confidence import stopped
 from tuning.identification.identified_case import bare, proposed
 from tuning.identification.problem import Estimation, Fit, check_length
 from tuning.identification.proposal import check_law
+from tuning.problem.status import Status
 from tuning.storage.batch_store import digest
-from tuning.storage.evaluation_log import Log, Memo
+from tuning.storage.evaluation_log import Log, Memo, folder_of
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001
@@ -33,7 +34,7 @@ class Identification:
     case: Any  # the case that was given
     estimation: Estimation
     fit: Fit
-    status: str  # converged, not_converged, not_identifiable, interrupted
+    status: Status  # CONVERGED, NOT_CONVERGED, NOT_IDENTIFIABLE or INTERRUPTED
     parameters: dict  # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}
     levels: list  # of each log, of each tank: {"value", "interval95"}
     covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
@@ -107,6 +108,7 @@ def identify(
     iterations=100,
     gap=1.5,
     folder=None,
+    checkpoint=None,
     resume=False,
     progress=None,
     ready=None,
@@ -123,14 +125,15 @@ def identify(
     each log (below 1), or number of samples, at its end on which a fit to the rest is judged before all is fitted; noise: standard
     deviation of each channel in its unit, from the record where None; loss: "linear", "soft_l1" or "huber" (beyond 3 standard deviations);
     substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
-    gap: longest step between samples, in median steps; folder: where a log of the searches is kept, with which resume=True goes on after a
+    gap: longest step between samples, in median steps; checkpoint (or folder): where a log
+    of the searches is kept, with which resume=True goes on after a
     kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
     KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search;
     law: "pi" for the identified rig under a PI controller with gains from its model (`proposal.py`), None for the case's own.
 
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
-    began = time.perf_counter()
+    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
     if not jax.config.jax_enable_x64:
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     case = bare(case) if isinstance(case, Plant) else case
@@ -203,7 +206,7 @@ def identify(
         case=case,
         estimation=estimation,
         fit=best,
-        status=status,
+        status=Status(status),
         parameters=parameters,
         levels=levels,
         covariance=spread.covariance_of_values(),

@@ -168,7 +168,7 @@ def json_of(found):
     quality, est = found.quality, found.estimation
     return {
         "case": found.case.name,
-        "status": found.status,
+        "status": str(found.status),
         "success": found.status == "converged",
         "message": message(found),
         "parameters": {n: tables.clean(p) for n, p in found.parameters.items()},

@@ -27,7 +27,7 @@ def json_of(result):
         "case": result.tuned.name,
         "method": result.method,
         "success": result.success,
-        "status": result.status,
+        "status": str(result.status),
         "message": result.message,
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",

@@ -51,7 +51,7 @@ def tune_choices(tune, case, method, choices, *, log=None, resume=False, **optio
     rows = [
         {
             "values": values,
-            "status": r.status,
+            "status": str(r.status),
             "objective": {k: r.objective[k] for k in ("before", "after")},
             "parameters": {n: p["after"] for n, p in r.parameters.items()},
         }

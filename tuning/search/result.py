@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.errors import unknown
 from tuning.problem.limits import ABSENT, REASONS
 from tuning.problem.problem import EXPLODED
+from tuning.problem.status import Status
 from tuning.search.diagnostics import flat_words
 from tuning.search.kkt import SLOPING, UNSTABLE
 
@@ -17,12 +19,25 @@ BARELY = 0.5
 CHATTER = 20.0
 """How many times the pumps' travel may grow before the answer says so."""
 
-STATUSES = ("converged", "not_converged", "infeasible", "interrupted")
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ParameterChange:
+    """A tuned parameter: values and range in `unit`; at_bound: "lower", "upper" or None; felt_percent,
+    exercised: as in `TuningResult.parameters`."""
+
+    before: float
+    after: float
+    unit: str
+    lower: float
+    upper: float
+    at_bound: str | None
+    felt_percent: float | None
+    exercised: bool
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TuningResult:
-    """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures.
+    """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for pictures, `result["controller.k"].after`.
 
     parameters: {name: {before, after, unit, lower, upper, at_bound, felt_percent, exercised}}: how much
     10 % of the value changes the objective [%], and whether any run depends on the value (if none does,
@@ -39,7 +54,7 @@ class TuningResult:
     case: Any
     tuned: Any
     method: str
-    status: str
+    status: Status
     message: str
     parameters: dict
     objective: dict
@@ -65,7 +80,25 @@ class TuningResult:
     @property
     def success(self):
         """True if a search converged and every limit holds at the case's own step, in every scenario."""
-        return self.status == "converged"
+        return self.status == Status.CONVERGED
+
+    def __getitem__(self, name):
+        """The ParameterChange of a free parameter. Raises InputError for another name."""
+        if name not in self.parameters:
+            raise unknown("tuned parameter", str(name), self.parameters)
+        return ParameterChange(**self.parameters[name])
+
+    def __contains__(self, name):
+        return name in self.parameters
+
+    def __iter__(self):
+        return iter(self.parameters)
+
+    def to_json(self):
+        """The JSON object of `jaxtank tune --json`."""
+        from tuning.report.tuning import json_of
+
+        return json_of(self)
 
     def replace(self, **changes):
         """A copy with the named fields changed."""

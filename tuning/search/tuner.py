@@ -10,6 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.problem.problem import Problem
+from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.baseline import own_values, run_measures
 from tuning.search.diagnostics import of_answer
@@ -20,9 +21,9 @@ from tuning.search.kkt import UNSTABLE, downhill, optimality
 from tuning.search.methods import METHODS, approach, restore, slsqp
 from tuning.search.options import Solver, check_options, spelled_out
 from tuning.search.provenance import fingerprint, noisy, provenance
-from tuning.search.result import STATUSES, TuningResult, constraint_rows, message
+from tuning.search.result import TuningResult, constraint_rows, message
 from tuning.search.screening import best_screened, distinct_starts, screen
-from tuning.storage.evaluation_log import Log
+from tuning.storage.evaluation_log import Log, folder_of
 
 OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
 """Methods that can be asked for by name."""
@@ -55,6 +56,7 @@ def tune(
     validation=64,
     tolerance=None,
     log=None,
+    checkpoint=None,
     resume=False,
     progress=None,
 ):
@@ -73,11 +75,12 @@ def tune(
     seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
     adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
     objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
-    log: folder for
+    checkpoint (or log): folder for
     the log of evaluations, with which a killed search is continued by resume=True, to the same bits; progress: called with a dict after
     every evaluation. Ctrl-C ends the search with the best point so far. Returns a TuningResult. Raises InputError for anything it
     cannot use, before anything is run.
     """
+    log = folder_of(checkpoint, log=log)
     options = dict(
         free=free,
         objective=objective,
@@ -174,7 +177,6 @@ def tune(
     checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
     status = "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
-    assert status in STATUSES
     mirrored = None if interrupted or best is None else diagnostics.mirror_of(problem, outcomes, values)
     validated, cloud = None, None
     if (
@@ -187,7 +189,7 @@ def tune(
         case=case,
         tuned=tuned,
         method=method,
-        status=status,
+        status=Status(status),
         message="",
         parameters={
             b.name: {

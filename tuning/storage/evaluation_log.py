@@ -22,6 +22,20 @@ BROKEN = (ValueError, KeyError, TypeError, RecursionError)
 """What reading a line of JSON raises that is not one of ours; the last where it is nested without end."""
 
 
+def folder_of(checkpoint, **former):
+    """The folder where a search or study keeps what is done, None for none.
+
+    former: {its former keyword: value}. Raises InputError where both are given, for two folders.
+
+    >>> folder_of("run1", log=None)
+    'run1'
+    """
+    ((name, folder),) = former.items()
+    if checkpoint is None or folder is None or Path(checkpoint) == Path(folder):
+        return folder if checkpoint is None else checkpoint
+    raise InputError(f"checkpoint and {name} are two names of one folder: give one of them")
+
+
 class Memo:
     """Results by what was asked. A search asks in an order that its results alone decide, so one that is started again and finds its
     earlier results here walks the same path, and goes on where the log ends."""

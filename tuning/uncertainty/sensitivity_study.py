@@ -81,6 +81,8 @@ class SensitivityResult:
 
         return figures(self)
 
+    plot = figures
+
     def save(self, folder, command=None):
         """Write result.json, sensitivity.csv, the picture and report.html, which says the line `command`, to a folder; returns their paths."""
         from tuning.report.sensitivity_tables import save

@@ -20,6 +20,7 @@ from jaxtank.xla.flags import WIDE
 from tuning.problem.limits import LOWER, resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage import batch_store
+from tuning.storage.evaluation_log import folder_of
 from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
@@ -137,6 +138,12 @@ class Ensemble:
 
         return json_of(self)
 
+    def plot(self):
+        """Matplotlib figures {name: figure}: fan of the levels, violations, rig."""
+        from tuning.report.uncertainty import figures
+
+        return figures(self)
+
     def save(self, folder, command=None):
         """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report.uncertainty import save
@@ -172,6 +179,7 @@ def ensemble(
     devices=1,
     shard=None,
     folder=None,
+    checkpoint=None,
     resume=False,
     merge=False,
     progress=None,
@@ -182,12 +190,12 @@ def ensemble(
     and sensor noise (draw i has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures:
     names, SUMMARISED where None; limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in a batch;
     devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them);
-    folder: where finished batches are kept, with which resume=True goes on; merge: run nothing, only join what lies there, and
+    checkpoint (or folder): where finished batches are kept, with which resume=True goes on; merge: run nothing, only join what lies there, and
     refuse an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its share
     of the batches and all get the whole. Numbers of a draw do not depend on any of it. Returns an Ensemble (None for a shard).
     Raises InputError before anything is run.
     """
-    began = time.perf_counter()
+    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
     if shard is not None and not (isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]):
         raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
     for name, value in (("samples", samples), ("key", key)):

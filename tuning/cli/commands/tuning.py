@@ -97,7 +97,7 @@ def _tune(args):
     try:
         written = result.save(folder, args.line) if folder else []
     finally:  # a disk that is full costs the files, not the answer; and the log is kept
-        print(tables.dumps(tuning.json_of(result)) if args.json else tuning.text(result))
+        print(tables.dumps(result.to_json()) if args.json else tuning.text(result))
     if folder and result.status != "interrupted":
         from tuning.storage.evaluation_log import discard
 
