@@ -33,6 +33,15 @@ class Measure(NamedTuple):
     scale: Callable | None = None  # run -> factor of that sum
     low: float | None = 0.0  # least and largest value that it can have, None where there is none
     high: float | None = None
+    sense: float = 1.0  # +1 where a larger value is worse (limits are upper ones), -1 a smaller
+    counts: bool = False  # counts whole samples: a step function of the parameters, no derivative
+    by_input: bool = False  # a sum over the run with a slope in every input: `bound` minimises it
+    shown: int = 0  # its place in the table of a tuning result; 0: not in it
+    summary: int = 0  # its place in an ensemble's summary unless others are named; 0: not in it
+    reached: str = ""  # the measure that holds the time at which this one was reached
+    undefined: str = "the value is not a finite number"  # why a run has no value of it
+    unserved: str = ""  # why a case has none, reported where it is not computed
+    nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
 
 
 """{accumulator: (run, its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
@@ -61,13 +70,25 @@ def _overshoot_percent(run, acc):
 
 
 MEASURES = {
-    "rms_error": Measure("cm", "output", ("e2",), root_mean("e2"), "root mean square tracking error"),
+    "rms_error": Measure(
+        "cm",
+        "output",
+        ("e2",),
+        root_mean("e2"),
+        "root mean square tracking error",
+        by_input=True,
+        shown=10,
+        summary=10,
+    ),
     "rms_error_total": Measure(
         "cm",
         "run",
         ("e2",),
         lambda run, acc: root_of_mean(sum(mean(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
+        by_input=True,
+        shown=20,
+        summary=20,
     ),
     "mean_square_error": Measure(
         "cm^2",
@@ -77,6 +98,7 @@ MEASURES = {
         "mean square tracking error",
         residual="e2",
         scale=lambda run: 1.0 / run.samples,
+        by_input=True,
     ),
     "ise": Measure(
         "cm^2 s",
@@ -86,9 +108,25 @@ MEASURES = {
         "integral of the squared error",
         residual="e2",
         scale=lambda run: run.dt,
+        by_input=True,
     ),
-    "iae": Measure("cm s", "output", ("abs_e",), _per_run("abs_e", lambda run: run.dt), "integral of the absolute error"),
-    "max_error": Measure("cm", "output", ("max_error",), _extremes("max_error"), "largest absolute tracking error"),
+    "iae": Measure(
+        "cm s",
+        "output",
+        ("abs_e",),
+        _per_run("abs_e", lambda run: run.dt),
+        "integral of the absolute error",
+        by_input=True,
+    ),
+    "max_error": Measure(
+        "cm",
+        "output",
+        ("max_error",),
+        _extremes("max_error"),
+        "largest absolute tracking error",
+        shown=30,
+        summary=30,
+    ),
     "mean_square_overshoot": Measure(
         "cm^2",
         "output",
@@ -98,14 +136,27 @@ MEASURES = {
         windows=True,
         residual="past2",
         scale=lambda run: 1.0 / run.samples,
+        by_input=True,
     ),
-    "rms_input": Measure("V", "pump", ("u2",), root_mean("u2"), "root mean square input"),
+    "rms_input": Measure(
+        "V",
+        "pump",
+        ("u2",),
+        root_mean("u2"),
+        "root mean square input",
+        by_input=True,
+        shown=80,
+        summary=90,
+    ),
     "input_travel": Measure(
         "V",
         "pump",
         ("travel",),
         lambda run, acc: as_list(acc["travel"][1]),
         "sum of the absolute changes of the input",
+        by_input=True,
+        shown=90,
+        summary=100,
     ),
     "mean_square_travel": Measure(
         "V^2",
@@ -115,6 +166,7 @@ MEASURES = {
         "mean of the squared changes of the input from sample to sample",
         residual="changes2",
         scale=lambda run: 1.0 / run.samples,
+        by_input=True,
     ),
     "input_deviation": Measure(
         "V^2 s",
@@ -125,6 +177,7 @@ MEASURES = {
         rests=True,
         residual="deviation2",
         scale=lambda run: run.dt,
+        by_input=True,
     ),
     "saturated_fraction": Measure(
         "-",
@@ -133,6 +186,9 @@ MEASURES = {
         _per_run("outside", lambda run: 1.0 / run.samples),
         "share of samples commanded outside the limits",
         high=1.0,
+        counts=True,
+        shown=100,
+        summary=110,
     ),
     "saturation_excess": Measure(
         "-",
@@ -141,15 +197,36 @@ MEASURES = {
         lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
         "mean of x/(1+x), x = input commanded outside the limits over their span",
         high=1.0,
+        by_input=True,
     ),
-    "max_level": Measure("cm", "tank", ("max_level",), _extremes("max_level"), "highest level"),
-    "min_level": Measure("cm", "tank", ("min_level",), _extremes("min_level"), "lowest level"),
+    "max_level": Measure(
+        "cm",
+        "tank",
+        ("max_level",),
+        _extremes("max_level"),
+        "highest level",
+        shown=40,
+        summary=60,
+        reached="time_of_max_level",
+    ),
+    "min_level": Measure(
+        "cm",
+        "tank",
+        ("min_level",),
+        _extremes("min_level"),
+        "lowest level",
+        sense=-1.0,
+        shown=50,
+        summary=70,
+        reached="time_of_min_level",
+    ),
     "rms_over_rim": Measure(
         "cm",
         "run",
         ("over_rim2",),
         lambda run, acc: root_of_mean(sum(mean(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
+        by_input=True,
     ),
     "mean_square_over_rim": Measure(
         "cm^2",
@@ -159,20 +236,47 @@ MEASURES = {
         "mean square of the rise past the rim",
         residual="over_rim2",
         scale=lambda run: 1.0 / run.samples,
+        by_input=True,
     ),
-    "overflow_volume": Measure("cm^3", "tank", ("spilled",), lambda run, acc: as_list(acc["spilled"]), "volume lost over the rim"),
+    "overflow_volume": Measure(
+        "cm^3",
+        "tank",
+        ("spilled",),
+        lambda run, acc: as_list(acc["spilled"]),
+        "volume lost over the rim",
+        by_input=True,
+        summary=80,
+    ),
     "inflow_shortfall": Measure(
         "cm^3",
         "tank",
         ("shortfall",),
         lambda run, acc: as_list(acc["shortfall"]),
         "volume that a negative inflow could not take from an empty tank",
+        by_input=True,
     ),
     "overshoot_percent": Measure(
-        "%", "output", ("overshoot",), _overshoot_percent, "worst overshoot of a change, in percent of it", windows=True
+        "%",
+        "output",
+        ("overshoot",),
+        _overshoot_percent,
+        "worst overshoot of a change, in percent of it",
+        windows=True,
+        shown=60,
+        summary=40,
+        undefined="the reference does not change",
+        unserved="the reference has no changes that end",
     ),
     "rise_time": Measure(
-        "s", "output", ("rise",), _rise, "longest time from 10 % to 90 % of a change, of those followed so far", windows=True
+        "s",
+        "output",
+        ("rise",),
+        _rise,
+        "longest time from 10 % to 90 % of a change, of those followed so far",
+        windows=True,
+        counts=True,
+        undefined="no change of the setpoint was followed to 90 % of its height",
+        unserved="the reference has no changes that end",
     ),
     "settling_time": Measure(
         "s",
@@ -183,6 +287,12 @@ MEASURES = {
         "negative: inside before the change ended; none: never settled",
         windows=True,
         low=None,
+        counts=True,
+        shown=70,
+        summary=50,
+        undefined="an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
+        unserved="the reference has no changes that end",
+        nan_holds="the output never left its band",
     ),
     "recovery_time": Measure(
         "s",
@@ -191,13 +301,30 @@ MEASURES = {
         recovery,
         "longest time from the start of a pour to the last sample outside +-5 % of the setpoint; none: never recovered",
         pours=True,
+        counts=True,
+        undefined="an output was still outside the band when it was watched no longer",
+        unserved="this case has no disturbance to recover from",
     ),
     "estimation_rms": Measure("cm", "tank", ("estimate2",), root_mean("estimate2"), "root mean square error of the level estimate"),
-    "time_of_max_level": Measure("s", "tank", ("max_level",), _extremes("max_level", 1), "when the highest level was reached"),
-    "time_of_min_level": Measure("s", "tank", ("min_level",), _extremes("min_level", 1), "when the lowest level was reached"),
+    "time_of_max_level": Measure(
+        "s",
+        "tank",
+        ("max_level",),
+        _extremes("max_level", 1),
+        "when the highest level was reached",
+        counts=True,
+    ),
+    "time_of_min_level": Measure(
+        "s",
+        "tank",
+        ("min_level",),
+        _extremes("min_level", 1),
+        "when the lowest level was reached",
+        counts=True,
+    ),
 }
 
-TIMES = {"max_level": "time_of_max_level", "min_level": "time_of_min_level"}
+TIMES = {m: spec.reached for m, spec in MEASURES.items() if spec.reached}
 """Measures that say when another one was reached: not reported by themselves."""
 
 SQUARES = tuple(m for m, spec in MEASURES.items() if spec.residual)
@@ -209,6 +336,12 @@ def check_names(names):
     for name in names:
         if name not in MEASURES:
             raise unknown("measure", name, MEASURES)
+
+
+def placed(field):
+    """Return the names of the measures with a place in `field`, "shown" or "summary", in order."""
+    found = {m: getattr(spec, field) for m, spec in MEASURES.items()}
+    return tuple(sorted((m for m in found if found[m]), key=found.get))
 
 
 def unit(name, units=DEFAULT):

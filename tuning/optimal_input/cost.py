@@ -18,7 +18,7 @@ from jaxtank.loop.step import step
 from jaxtank.observers import Direct
 from jaxtank.signals.base import Table
 
-RUNNING = {"max_level": 1.0, "min_level": -1.0, "max_error": 1.0}
+RUNNING = {m: ms.MEASURES[m].sense for m in ("max_level", "min_level", "max_error")}
 """Measures whose limit is held sample by sample: +1 for an upper limit, -1 for a lower one."""
 
 

@@ -15,9 +15,6 @@ from tuning.optimal_input.cost import RUNNING, Held, Terms, look, open_loop, val
 from tuning.optimal_input.lbfgsb import minimise
 from tuning.problem.limits import resolve_limits
 
-SUMS = {"e2", "abs_e", "u2", "over_rim2", "spilled", "shortfall", "travel", "saturation_excess", "deviation2", "changes2", "past2"}
-"""Accumulators that are sums over the run with a slope in every input: measures of these alone can be made small, or be limited."""
-
 TOLERANCE = 3e-5
 """Share of a limit by which it may be passed and still counts as held [-]: 1e-3 cm of 30 cm."""
 
@@ -321,7 +318,7 @@ def _better(a, b):
 
 
 def _check_served(objective, limits):
-    good = [m for m, spec in ms.MEASURES.items() if set(spec.needs) <= SUMS]
+    good = [m for m, spec in ms.MEASURES.items() if spec.by_input]
     for m in objective:
         if m not in good:
             raise InputError(f"bound of {m}: has no slope in every input; can be made small: {', '.join(good)}")

@@ -9,8 +9,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.rig import check_limits
 from tuning.problem import scenarios as sc
 
-LOWER = {"min_level"}
-
 NOT_A_NUMBER = 1e6
 
 NOTHING = 1e-3
@@ -30,7 +28,7 @@ class Limit(NamedTuple):
     @property
     def sign(self):
         """+1 for an upper limit, -1 for a lower one."""
-        return -1.0 if self.measure in LOWER else 1.0
+        return ms.MEASURES[self.measure].sense
 
     @property
     def label(self):
@@ -49,7 +47,7 @@ class Limit(NamedTuple):
         An infinite value (never settled) breaks the limit by NOT_A_NUMBER, as does an undefined one (a
         rise that never reached 90 %). An undefined settling time holds: the output never left its band.
         """
-        undefined = NOT_A_NUMBER if self.measure == "settling_time" else -NOT_A_NUMBER
+        undefined = NOT_A_NUMBER if ms.MEASURES[self.measure].nan_holds else -NOT_A_NUMBER
         found = np.clip(self.sign * (self.value - np.asarray(values)), -NOT_A_NUMBER, NOT_A_NUMBER)
         return np.where(np.isnan(values), undefined, found)
 
@@ -121,13 +119,3 @@ def undefined(measure, case):
         why = f"no setpoint is stepped within its {clock.duration:g} s; add a step (reference.changes)"
         return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
     return "", [False] * ms.entries(measure, loop.plant)
-
-
-REASONS = {
-    "overshoot_percent": "the reference does not change",
-    "rise_time": "no change of the setpoint was followed to 90 % of its height",
-    "settling_time": "an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
-    "recovery_time": "an output was still outside the band when it was watched no longer",
-}
-
-ABSENT = "the value is not a finite number"

@@ -16,7 +16,6 @@ from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import Pours
 from jaxtank.signals.setpoints import Ramps, Sine
-from tuning.problem.limits import LOWER
 from tuning.report import tables
 
 
@@ -198,7 +197,7 @@ def text(case):
     parts += _chapter(f"The observer: {page['observer']}") + _docstring(loop.observer)
     parts += _chapter("What is tuned")
     parts += [grid(_tuned(case, preset), ["parameter", "value", "published", "unit", "range", "what it is"], (26, 18, 12, 8, 14))]
-    limited = (f"{m} at {'least' if m in LOWER else 'most'} {v}" for m, v in page["limits"].items())
+    limited = (f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}" for m, v in page["limits"].items())
     parts += ["", *textwrap.wrap("limits of tune: " + (", ".join(limited) or "none"), WIDTH)]
     parts += textwrap.wrap("objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()), WIDTH)
     if case.scenarios:

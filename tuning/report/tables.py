@@ -7,14 +7,6 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.units import DEFAULT
-from tuning.problem.limits import ABSENT, REASONS
-
-UNSERVED = {
-    "overshoot_percent": "the reference has no changes that end",
-    "rise_time": "the reference has no changes that end",
-    "settling_time": "the reference has no changes that end",
-    "recovery_time": "this case has no disturbance to recover from",
-}
 
 
 def number(value, digits=5):
@@ -48,13 +40,19 @@ def clean(value):
 
 def reasons(measures):
     """{measure: why} for every measure that is absent or has an entry that is not a number."""
-    found = {m: REASONS.get(m, ABSENT) for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float)))}
-    return {**found, **{m: why for m, why in UNSERVED.items() if m not in measures}}
+    absent = (m for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float))))
+    found = {m: ms.MEASURES[m].undefined for m in absent}
+    return {**found, **{m: why for m, why in _unserved().items() if m not in measures}}
+
+
+def _unserved():
+    """{measure: why a case has none} of those that are reported where they are not computed."""
+    return {m: spec.unserved for m, spec in ms.MEASURES.items() if spec.unserved}
 
 
 def measures_json(measures):
     """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
-    return {**dict.fromkeys(UNSERVED), **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()})}
+    return {**dict.fromkeys(_unserved()), **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()})}
 
 
 def dumps(table):

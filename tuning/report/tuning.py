@@ -3,22 +3,8 @@
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.problem.limits import LOWER
 from tuning.problem.problem import TAIL
 from tuning.report.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
-
-SHOWN = (
-    "rms_error",
-    "rms_error_total",
-    "max_error",
-    "max_level",
-    "min_level",
-    "overshoot_percent",
-    "settling_time",
-    "rms_input",
-    "input_travel",
-    "saturated_fraction",
-)
 
 
 def json_of(result):
@@ -79,7 +65,7 @@ def parts_of(result):
     ]
     parts = [table(rows, ["parameter", "unit", "before", "after", "range", "10 % of it moves the objective by", ""]), ""]
     rows = [["objective", unit, number(result.objective["before"]), number(result.objective["after"])]]
-    for m in SHOWN:
+    for m in ms.placed("shown"):
         if m in result.measures["after"] and not (m == "rms_error_total" and set(result.objective["terms"]) == {m}):
             rows.append(
                 [
@@ -96,7 +82,7 @@ def parts_of(result):
             [
                 c["name"],
                 c["unit"],
-                (">= " if c["measure"] in LOWER else "<= ") + number(c["limit"], 7),
+                (">= " if ms.MEASURES[c["measure"]].sense < 0 else "<= ") + number(c["limit"], 7),
                 number(c["value"], 7),
                 number(c["margin"], 3) if c["reason"] is None else "undefined",
                 f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",

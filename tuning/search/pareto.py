@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
-from jaxtank.measures.catalogue import check_names
-from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
 from tuning.search.methods import approach, restore, slsqp
@@ -46,12 +45,12 @@ def tradeoff(
     ("converged", "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises
     InputError for an unknown measure and for values that are not finite.
     """
-    check_names([measure])
+    ms.check_names([measure])
     values = [float(v) for v in values]
     if not 1 <= len(values) <= MANY or not all(math.isfinite(v) for v in values):
         raise InputError(f"tradeoff of {measure}: must have 1 to {MANY} finite values of its limit")
     others = {m: v for m, v in (case.limits if limits is None else limits).items() if m != measure}
-    values = sorted(values, reverse=measure not in LOWER)
+    values = sorted(values, reverse=ms.MEASURES[measure].sense > 0)
     problem = Problem(case, free=free, objective=objective, limits={**others, measure: values[0]}, scenarios=scenarios, seed=seed)
     z = problem.start()
     if start is not None:

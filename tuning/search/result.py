@@ -7,7 +7,6 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import unknown
-from tuning.problem.limits import ABSENT, REASONS
 from tuning.problem.problem import EXPLODED
 from tuning.problem.status import Status
 from tuning.search.diagnostics import flat_words
@@ -131,6 +130,7 @@ def constraint_rows(problem, table):
         per = ms.MEASURES[limit.measure].per
         tank = limit.index if per == "tank" else plant.outputs[limit.index] if per == "output" else None
         value = float(measures[limit.measure].ravel()[limit.index])
+        reached = ms.MEASURES[limit.measure].reached
         rows.append(
             {
                 "name": limit.label,
@@ -140,7 +140,7 @@ def constraint_rows(problem, table):
                 "value": value,
                 "margin": limit.margin(measures),
                 "tank": None if tank is None else tank + 1,
-                "time_s": float(measures[ms.TIMES[limit.measure]][limit.index]) if limit.measure in ms.TIMES else None,
+                "time_s": float(measures[reached][limit.index]) if reached else None,
                 "scenario": limit.scenario or None,
                 "reason": _reason(limit, value),
             }
@@ -152,9 +152,8 @@ def _reason(limit, value):
     """Why the value of a limited measure is not a finite number; None where it is."""
     if np.isfinite(value):
         return None
-    if np.isnan(value) and limit.measure == "settling_time":
-        return "the output never left its band"
-    return REASONS.get(limit.measure, ABSENT)
+    spec = ms.MEASURES[limit.measure]
+    return spec.nan_holds if np.isnan(value) and spec.nan_holds else spec.undefined
 
 
 def _amount(row):

@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.case import Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
-from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
 from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
@@ -148,7 +148,7 @@ def _kept_off(case, limits, share):
         return limits
     rim = np.asarray(case.loop.plant.rim).tolist()
     values = {m: np.asarray(rim if isinstance(v, str) else v, dtype=float) for m, v in limits.items()}
-    return {m: (v + (share if m in LOWER else -share) * np.abs(v)).tolist() for m, v in values.items()}
+    return {m: (v - share * ms.MEASURES[m].sense * np.abs(v)).tolist() for m, v in values.items()}
 
 
 def _run(case, distributions, limits, names, fresh, seed):

@@ -30,9 +30,6 @@ LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
 LANES, NUMBERS = 64, 1 << 22
 """Runs in a batch, and the samples that all of them may have together: what is prepared before the loop is held for each."""
 
-COUNTED = ("settling_time", "rise_time", "recovery_time", "saturated_fraction", *ms.TIMES.values())
-"""Measures that count whole samples: a step function of the parameters, whose derivative says nothing."""
-
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
 
@@ -185,7 +182,7 @@ def check_measures(case, measures, method):
     """The names of the measures of a study, if the case has them all and the method can say something of each."""
     if measures is None:
         names = [m for m in (*case.objective, "rms_error_total", "max_level") if ms.serves(m, case.loop)]
-        names = [m for m in names if method != "local" or m not in COUNTED]
+        names = [m for m in names if method != "local" or not ms.MEASURES[m].counts]
     else:
         names = [measures] if isinstance(measures, str) else list(measures)
         if not names:
@@ -194,7 +191,7 @@ def check_measures(case, measures, method):
         for m in names:
             if not ms.serves(m, case.loop):
                 raise InputError(f"measure {m} means nothing for {case.name}: it has no changes of setpoint, or nothing is poured")
-            if method == "local" and m in COUNTED:
+            if method == "local" and ms.MEASURES[m].counts:
                 raise InputError(f"measure {m} counts whole samples and has no derivative: take the method morris or sobol")
     return tuple(dict.fromkeys(names))
 

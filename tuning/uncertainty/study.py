@@ -17,7 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
-from tuning.problem.limits import LOWER, resolve_limits
+from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage import batch_store
 from tuning.storage.evaluation_log import folder_of
@@ -39,21 +39,6 @@ RESTS = 1 << 14
 
 FAN_DRAWS, FAN_ROWS = 512, 240
 """Draws and time stamps of a fan chart."""
-
-SUMMARISED = (
-    "rms_error",
-    "rms_error_total",
-    "max_error",
-    "overshoot_percent",
-    "settling_time",
-    "max_level",
-    "min_level",
-    "overflow_volume",
-    "rms_input",
-    "input_travel",
-    "saturated_fraction",
-)
-"""Measures of an ensemble unless others are named."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -90,7 +75,7 @@ class Ensemble:
         found = {}
         for name, values in self.measures.items():
             kept = values[~self.failed]
-            sign = -1.0 if name in LOWER else 1.0
+            sign = ms.MEASURES[name].sense
             if not len(kept):
                 found[name] = {k: None for k in ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")}
                 continue
@@ -188,7 +173,8 @@ def ensemble(
 
     distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's own where None; key: seed of draws
     and sensor noise (draw i has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures:
-    names, SUMMARISED where None; limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in a batch;
+    names, those of a summary where None; limits as in `tune`; fan: keep quantiles of the first
+    draws' levels; lanes: draws in a batch;
     devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them);
     checkpoint (or folder): where finished batches are kept, with which resume=True goes on; merge: run nothing, only join what lies there, and
     refuse an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its share
@@ -204,7 +190,7 @@ def ensemble(
     distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
     held = resolve_limits(case, limits)
-    wanted = tuple(m for m in SUMMARISED if ms.serves(m, case.loop)) if measures is None else tuple(measures)
+    wanted = tuple(m for m in ms.placed("summary") if ms.serves(m, case.loop)) if measures is None else tuple(measures)
     ms.check_names(wanted)
     wanted = tuple(dict.fromkeys([*wanted, *(limit.measure for limit in held)]))
     random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
