@@ -52,8 +52,8 @@ class PID(Controller):
     model: Plant
     Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc", low=0.0, strict=True)
     Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
-    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc")
-    order: np.ndarray | None = leaf("-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc")
+    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None)
+    order: np.ndarray | None = leaf("-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc", default=None)
     Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
     bias: np.ndarray = leaf("V", "(m,) voltage added where there is no feed-forward")
     feed_forward: bool = static("-", "add the model's voltage on the reference", choices=(False, True), default=False)

@@ -43,10 +43,10 @@ class PumpBank:
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    dead_zone: np.ndarray | None = leaf("V", "(m,) voltage at or below which a pump stands still", low=0.0, like="low")
+    dead_zone: np.ndarray | None = leaf("V", "(m,) voltage at or below which a pump stands still", low=0.0, like="low", default=None)
     stop: np.ndarray = leaf("V", "(m,) voltage below which a turning pump stops (hysteresis)", low=0.0)
     pulse: np.ndarray = leaf("V", "(m,) voltage of the pulses that replace a dead zone (pulse)", low=0.0, strict=True)
-    lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low")
+    lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low", default=None)
     initial: np.ndarray = leaf("V", "(m,) voltage at which the pumps ran before t = 0")
     delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
     saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")

@@ -20,7 +20,7 @@ class LevelSensor:
 
     gain: np.ndarray = leaf("cm/volt", "(n,) level per volt of each sensor (a)", low=0.0, strict=True)
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
-    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain")
+    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain", default=None)
     full_scale: np.ndarray = leaf("volt", "range of the ADC", low=0.0, strict=True)
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 

@@ -40,7 +40,7 @@ class ExtendedKalman(Observer):
         "cm^2", "(n,) variance of each sensor's noise (r); of unmeasured tanks not used", low=0.0, strict=True
     )
     spread: np.ndarray = leaf("cm^2", "(n,) variance of the levels believed at t = 0", low=0.0)
-    start: np.ndarray | None = leaf("cm", "(n,) levels believed at t = 0; absent: the true ones", low=0.0, like="spread")
+    start: np.ndarray | None = leaf("cm", "(n,) levels believed at t = 0; absent: the true ones", low=0.0, like="spread", default=None)
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
     integrator: str = static(doc="how the model is carried on", choices=("rk4", "midpoint"), default="rk4")
