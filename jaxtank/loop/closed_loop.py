@@ -38,7 +38,7 @@ class ClosedLoop:
     x0: np.ndarray = leaf("cm", "(n,) levels at t = 0", low=0.0)
 
     @property
-    def units(self):
+    def units(self) -> tuple[str, str]:
         """(length, pump input) of the rig."""
         return self.plant.units
 

@@ -7,10 +7,12 @@ derivatives of the measures along with the run. All are pure: jit, vmap, grad an
 
 import functools
 import math
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
 from jaxtank.core.clock import PIECE, Clock, is_pointwise
@@ -24,7 +26,12 @@ from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
 
 
-def simulate(loop, clock, key=None, save_every=1):
+def simulate(
+    loop: ClosedLoop,
+    clock: Clock,
+    key: jax.Array | None = None,
+    save_every: int = 1,
+) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
 
     loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a Trajectory.
@@ -38,7 +45,12 @@ def simulate(loop, clock, key=None, save_every=1):
     return trajectory
 
 
-def evaluate(loop, clock, measures, key=None):
+def evaluate(
+    loop: ClosedLoop,
+    clock: Clock,
+    measures: Sequence[str],
+    key: jax.Array | None = None,
+) -> dict[str, jax.Array]:
     """Run the loop and keep only running measures.
 
     measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or None; returns {name: scalar, or array with one
@@ -68,7 +80,14 @@ def evaluate_for_reverse(loop, clock, measures, key=None):
     return evaluate_compiled(loop, clock, names, key, True)[0]
 
 
-def sensitivities(loop, clock, measures, values, key=None, squares=None):
+def sensitivities(
+    loop: ClosedLoop,
+    clock: Clock,
+    measures: Sequence[str],
+    values: Mapping[str, ArrayLike],
+    key: jax.Array | None = None,
+    squares: Mapping[str, float] | None = None,
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
     """Measures, their exact derivatives, and a Gauss-Newton matrix, in one run.
 
     values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth

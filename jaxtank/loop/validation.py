@@ -6,10 +6,11 @@ import re
 import jax
 import numpy as np
 
-from jaxtank.core.clock import check_clock
+from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
 from jaxtank.core.tree import check_leaves, is_component
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
@@ -55,7 +56,7 @@ def _shape(said, sizes):
     return tuple(found)
 
 
-def check(loop, clock, key=None):
+def check(loop: ClosedLoop, clock: Clock, key: jax.Array | None = None) -> None:
     """Raise InputError for a loop or clock that cannot be run: values out of range, wrong shapes, a reference the law cannot serve.
 
     Only concrete leaves are looked at, so that it costs nothing inside a trace.

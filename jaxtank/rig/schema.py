@@ -48,7 +48,7 @@ def keys_of(found, units, on=True):
 SMALL_INT = (int, np.integer)
 
 
-def toml(value):
+def toml(value: Any) -> str:
     """`value` as TOML: numbers to their last digit, texts escaped, lists and tuples as arrays."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()

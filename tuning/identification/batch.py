@@ -3,17 +3,22 @@
 import dataclasses
 import functools
 import time
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from scipy.stats import t as student
 
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import experiment as lg
 from tuning.identification import simulation as pb
 from tuning.identification.confidence import ROUND_OFF, VAGUE
+from tuning.identification.experiment import Log
 from tuning.identification.problem import Estimation, check_length
 
 ROOM = 256 * 2**20
@@ -50,7 +55,17 @@ class Identifications:
         return len(self.values)
 
 
-def identify_many(case, logs, free=None, *, start="free", noise=None, substeps=None, iterations=50, gap=1.5):
+def identify_many(
+    case: Case,
+    logs: Sequence[Log],
+    free: Mapping[str, Any] | None = None,
+    *,
+    start: str = "free",
+    noise: ArrayLike | None = None,
+    substeps: int | None = None,
+    iterations: int = 50,
+    gap: float = 1.5,
+) -> Identifications:
     """Estimate the same parameters from each of many logs by itself, in one compiled program: Monte Carlo, a log a day, a rig of each kind.
 
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2      for each log

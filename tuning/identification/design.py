@@ -1,8 +1,13 @@
 """Which experiment tells most: candidate inputs compared by the standard deviations they would leave."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError
 from tuning.identification import simulation as pb
 from tuning.identification.parametrisation import coordinates, nominal, usual
@@ -103,8 +108,19 @@ def _operating(loop):
 
 
 def compare_experiments(
-    case, free=None, *, noise, duration, dt, levels=None, start="known", voltage=None, size=None, bit=None, inputs=None
-):
+    case: Case,
+    free: Mapping[str, Any] | None = None,
+    *,
+    noise: ArrayLike,
+    duration: float,
+    dt: float,
+    levels: ArrayLike | None = None,
+    start: str = "known",
+    voltage: ArrayLike | None = None,
+    size: ArrayLike | None = None,
+    bit: float | None = None,
+    inputs: Mapping[str, Any] | None = None,
+) -> list[dict[str, Any]]:
     """Predicted standard deviations of the free parameters for each candidate experiment (of `candidates`, or `inputs`: {words: (t (samples,)
     [s], u (samples, pumps), x0 (tanks,))}).
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank.case import Scenario
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
@@ -14,6 +14,7 @@ from tuning.problem.limits import LOWER
 from tuning.problem.problem import Problem
 from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
+from tuning.search.result import TuningResult
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
@@ -78,17 +79,17 @@ def scenario_bound(scenarios, support, beta=CONFIDENCE):
 
 
 def tune_robust(
-    case,
+    case: Case,
     distributions: Mapping[str, Any] | None = None,
-    risk="mean",
-    samples=64,
-    fresh=1024,
-    seed=0,
-    back_off=0.0,
-    tolerance=TOLERANCE,
-    validation=64,
-    **options,
-):
+    risk: str = "mean",
+    samples: int = 64,
+    fresh: int = 1024,
+    seed: int = 0,
+    back_off: float = 0.0,
+    tolerance: float = TOLERANCE,
+    validation: int = 64,
+    **options: Any,
+) -> TuningResult:
     """`tune` on `samples` plants drawn from `distributions` (the case's own spread where None), every limit held on every plant.
 
     risk: "mean", "cvar" or "worst" of their costs; fresh: plants drawn afterwards, with seeds of their own, on which the values before and

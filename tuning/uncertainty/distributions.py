@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
+from jax.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import check_value, describe, get_value, is_real, shortened, split_index
@@ -21,13 +22,13 @@ class Uniform:
     relative: float | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
         return self.low + (self.high - self.low) * p
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the range is one."""
         _one_kind(self, name, ("low", "high"), "relative")
         if self.relative is not None and not self.relative > 0:
@@ -45,13 +46,13 @@ class LogUniform:
     factor: float | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
         return self.low * (self.high / self.low) ** p
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the range is one, above 0."""
         _one_kind(self, name, ("low", "high"), "factor")
         if self.factor is not None and not self.factor > 1:
@@ -73,14 +74,14 @@ class Normal:
     cut: float = 3.0
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
         return centre + spread * scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * p)
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the width is one."""
         _one_kind(self, name, ("sd",), "relative")
         width = self.sd if self.relative is None else self.relative
@@ -96,13 +97,13 @@ class Discrete:
     weights: tuple | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...)."""
         weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=float)
         edges = np.cumsum(weights / weights.sum())[:-1]
         return np.asarray(self.values, dtype=float)[np.searchsorted(edges, p, side="right")]
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless there are values, and a weight of at least 0 for each."""
         good = len(self.values) > 0 and all(math.isfinite(v) for v in self.values)
         weights = self.weights or (1.0,) * len(self.values)
@@ -123,11 +124,11 @@ class Correlated:
     mean: tuple | None = None
     cut: float = 3.0
 
-    def factor(self):
+    def factor(self) -> np.ndarray:
         """(n, n) lower Cholesky factor."""
         return np.linalg.cholesky(np.asarray(self.covariance, dtype=float))
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the covariance is symmetric and positive definite, one row for each name."""
         try:
             matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)

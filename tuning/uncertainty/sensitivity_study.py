@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
@@ -92,18 +94,18 @@ class SensitivityResult:
 
 
 def sensitivity(
-    case,
-    distributions=None,
+    case: Case,
+    distributions: Mapping[str, Any] | None = None,
     *,
-    method="local",
-    measures=None,
-    samples=None,
-    spread=None,
-    seed=0,
-    batch=None,
-    devices=1,
-    progress=None,
-):
+    method: str = "local",
+    measures: Sequence[str] | None = None,
+    samples: int | None = None,
+    spread: float | None = None,
+    seed: int = 0,
+    batch: int | None = None,
+    devices: int = 1,
+    progress: Callable | None = None,
+) -> SensitivityResult:
     """Which uncertain parameter moves which measure of a case.
 
     distributions: {dotted name: distribution}; what the case calls uncertain, uniform within its own share, where None; spread: one share

@@ -4,7 +4,9 @@ import dataclasses
 import functools
 import math
 import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +15,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_flows
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
@@ -78,11 +81,11 @@ class Ensemble:
     method: str
 
     @property
-    def samples(self):
+    def samples(self) -> int:
         """Number of draws N."""
         return len(self.failed)
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
         or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's
         interval, which is cut at what the measure cannot pass, are None for a single draw."""
@@ -112,7 +115,7 @@ class Ensemble:
                     found[name] |= {"sd": None, "mean_interval95": None}
         return found
 
-    def violations(self):
+    def violations(self) -> list[dict[str, Any]]:
         """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run that failed counts as breaking it. The
         intervals are those of Clopper and Pearson."""
         rows = []
@@ -131,13 +134,13 @@ class Ensemble:
             )
         return rows
 
-    def to_json(self):
+    def to_json(self) -> dict[str, Any]:
         """The JSON object of `jaxtank uncertainty --json`."""
         from tuning.report.uncertainty import json_of
 
         return json_of(self)
 
-    def save(self, folder, command=None):
+    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report.uncertainty import save
 
@@ -159,23 +162,23 @@ def _within(name, values, end):
 
 
 def ensemble(
-    case,
-    distributions=None,
-    samples=1000,
-    key=0,
+    case: Case,
+    distributions: Mapping[str, Any] | None = None,
+    samples: int = 1000,
+    key: int = 0,
     *,
-    draws="random",
-    measures=None,
-    limits=None,
-    fan=True,
-    lanes=None,
-    devices=1,
-    shard=None,
-    folder=None,
-    resume=False,
-    merge=False,
-    progress=None,
-):
+    draws: str = "random",
+    measures: Sequence[str] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    fan: bool = True,
+    lanes: int | None = None,
+    devices: int = 1,
+    shard: tuple[int, int] | None = None,
+    folder: str | Path | None = None,
+    resume: bool = False,
+    merge: bool = False,
+    progress: Callable | None = None,
+) -> Ensemble | None:
     """Run a case on `samples` draws of what is uncertain.
 
     distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's own where None; key: seed of draws
