@@ -252,7 +252,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert packed == there and {"tuning/bench/floor.c", "tuning/cli/names.txt"} <= packed
-    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt"}
+    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt", "typed"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 

@@ -17,6 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.instruments.actuators import PumpBank
+from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
@@ -26,8 +27,8 @@ EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit
 class Memory(NamedTuple):
     """What the law keeps of the last sample: levels measured (n) [cm], inputs applied (m) [V]."""
 
-    x: tuple
-    u: tuple
+    x: Sequence
+    u: Sequence
 
 
 def incremental_model(model, operating_point, dt):
@@ -74,6 +75,15 @@ class LinearPredictive(Controller):
     the quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes S4.4). u(k-1) is what the
     pumps' limits let through, which is all the anti-windup there is.
     """
+
+    model: TankNetwork
+    operating_point: Any
+    r_w: Any
+    q: Any
+    du_limit: Any
+    u_low: Any
+    u_high: Any
+    mode: str
 
     @property
     @abc.abstractmethod

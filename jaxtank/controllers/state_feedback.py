@@ -15,6 +15,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
+from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 
@@ -69,7 +70,7 @@ class LQI(Controller):
     weights diag(Q) and diag(R). The gain follows its weights, its model and its operating point, derivatives included.
     """
 
-    model: Plant
+    model: TankNetwork
     # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig counts in
     Q: np.ndarray = leaf(
         "-", "(tanks + outputs,) weight of each level, over its unit squared, then of each integral, over that times s^2", low=0.0

@@ -12,7 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import floored_root
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
-from jaxtank.plants.base import Plant
+from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
 from jaxtank.signals.base import Signal
 
@@ -32,7 +32,7 @@ class TwoTankBackstepping(Controller):
     where levels count in other units. The output h1 follows h3; there is no integral action. Units in this class are the rig's (m, m^3/s).
     """
 
-    model: Plant
+    model: TankNetwork
     K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
     K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
     level_floor: float = leaf("cm", "level h3 below which the law takes the second tank to hold this much", low=0.0, strict=True)

@@ -12,11 +12,12 @@ import dataclasses
 import numbers
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, TypeVar, cast, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.units import DEFAULT, local
@@ -66,8 +67,9 @@ def static(
 def component(cls: type[T]) -> type[T]:
     """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data."""
     cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    data = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") != "static"]
-    meta = [f.name for f in dataclasses.fields(cls) if f.metadata.get("kind") == "static"]
+    fields = dataclasses.fields(cast(Any, cls))
+    data = [f.name for f in fields if f.metadata.get("kind") != "static"]
+    meta = [f.name for f in fields if f.metadata.get("kind") == "static"]
     return jax.tree_util.register_dataclass(cls, data, meta)
 
 
@@ -76,7 +78,7 @@ def is_component(value: Any) -> bool:
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def number(value: Any) -> np.ndarray:
+def number(value: Any) -> Any:
     """`value` as a host array of the default float: the form in which constructors store leaves."""
     return np.asarray(value, dtype=np.float64)
 
@@ -158,9 +160,10 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
 def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError for a malformed name."""
     parts = name.split(".")
-    if not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
+    last = _STEP.fullmatch(parts[-1])
+    if last is None or not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
         raise InputError(f"{name!r} is not a parameter name: write component.field or component.field[i]")
-    base, bracket = _STEP.fullmatch(parts[-1]).groups()
+    base, bracket = last.groups()
     index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()
     return ".".join([*parts[:-1], base]), index
 
@@ -171,7 +174,7 @@ def check_leaves(tree, names=None, vacant=()):
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
-        if isinstance(value, jax.core.Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
+        if isinstance(value, Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
             continue
         check_value(name, value, meta)
 

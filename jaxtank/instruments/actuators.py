@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import at_least, clip
@@ -46,12 +45,10 @@ class PumpBank:
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    dead_zone: np.ndarray | None = leaf(
-        "V", "(m,) voltage at or below which a pump stands still", low=0.0, like="low", default=None
-    )
+    dead_zone: Any = leaf("V", "(m,) voltage at or below which a pump stands still", low=0.0, like="low", default=None)
     stop: np.ndarray = leaf("V", "(m,) voltage below which a turning pump stops (hysteresis)", low=0.0)
     pulse: np.ndarray = leaf("V", "(m,) voltage of the pulses that replace a dead zone (pulse)", low=0.0, strict=True)
-    lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low", default=None)
+    lag: Any = leaf("s", "(m,) time constant of each pump", low=0.0, like="low", default=None)
     initial: np.ndarray = leaf("V", "(m,) voltage at which the pumps ran before t = 0")
     delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
     saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")
@@ -86,12 +83,12 @@ class PumpBank:
         state: ActuatorState,
         command: Sequence,
         metric: tuple | None,
-        dt: ArrayLike,
+        dt: Any,
     ) -> tuple[tuple, ActuatorState]:
         """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then `deliver`."""
         return self.deliver(state, self.limit(command, metric), dt)
 
-    def deliver(self, state: ActuatorState, u: tuple, dt: ArrayLike) -> tuple[tuple, ActuatorState]:
+    def deliver(self, state: ActuatorState, u: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
         """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead zone, lag, delay."""
         if self.dead_zone is not None and self.dead_zone_kind != "offset":
             u, state = self._dead_zone(state, u, dt)

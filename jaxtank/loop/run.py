@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
@@ -181,7 +182,7 @@ def simulate_compiled(loop, clock, key, save_every):
 
 def _report_broken(broken, loop, clock, key):
     """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
-    if isinstance(broken, jax.core.Tracer) or np.ndim(broken) or not broken:
+    if isinstance(broken, Tracer) or np.ndim(broken) or not broken:
         return
     loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same
     run = simulate_compiled(loop, clock, key, 1)[0]

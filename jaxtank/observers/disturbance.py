@@ -29,7 +29,7 @@ class DisturbanceObserver(Observer):
     """
 
     model: Plant
-    l: object = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
+    l: Any = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
     fed: str = static("-", "input that the observer is told", choices=FED, default="applied")
     before_compensation: bool = static("-", "as printed: told the input before eq. (28)", choices=(False, True), default=False)
 

@@ -20,7 +20,7 @@ from jaxtank.plants.runge_kutta import integrate
 class Belief(NamedTuple):
     """What the filter carries on."""
 
-    x: tuple  # (n) levels [cm]
+    x: Sequence  # (n) levels [cm]
     P: tuple  # (n) rows of n covariances [cm^2]
 
 

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +14,22 @@ from jaxtank.core.units import DEFAULT
 class Plant(abc.ABC):
     """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of scalars.
 
-    Beside what follows a plant has two fields: `outputs`, the tanks (counted from 0) whose levels are controlled, and `rim`, (n,) the height
-    of each tank [cm]. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
+    A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
     """
 
-    units = DEFAULT
+    outputs: tuple[int, ...]
+    """Tanks, counted from 0, whose levels are controlled."""
+
+    rim: Any
+    """(n,) height of each tank [cm]."""
+
+    units: tuple[str, str] = DEFAULT
     """(length, pump input): the units that this plant counts in."""
 
-    overflow = False
+    overflow: bool = False
     """True where a level stops at its rim and what would rise past it is lost."""
 
-    bottom = False
+    bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
 
     @property

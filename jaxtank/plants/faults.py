@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +39,7 @@ class Faults:
             field, (index,) = split_index(name)
             entries = changed.setdefault(field, [getattr(plant, field)[i] for i in range(np.shape(getattr(plant, field))[0])])
             entries[index] = entries[index] * (1.0 + (self.factor[k] - 1.0) * active[k]) + self.extra[k] * active[k]
-        return dataclasses.replace(plant, **{field: tuple(entries) for field, entries in changed.items()})
+        return dataclasses.replace(cast(Any, plant), **{field: tuple(entries) for field, entries in changed.items()})
 
 
 def faults(plant, entries):

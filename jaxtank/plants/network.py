@@ -3,11 +3,13 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.core import Tracer
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
@@ -117,7 +119,7 @@ class TankNetwork(Plant):
         rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
         for j, tank, gain in self._shares():
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
-        supply = None if step is None else self._supply(step)
+        supply = () if step is None else self._supply(step)
         q = [root(h, self.knee) if step is None else limited_root(h, self.knee, supply[i]) for i, h in enumerate(x)]
         held = x if step is None else [at_least(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
@@ -148,7 +150,7 @@ class TankNetwork(Plant):
         pump, tank, gain = (list(column) for column in zip(*self._shares()))
         return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(self.area)
 
-    def net_inflow(self, x: Sequence, u: Sequence, d: Sequence | None) -> jax.Array:
+    def net_inflow(self, x: Sequence, u: Sequence, d: Sequence | None) -> Any:
         """Pumped and disturbing inflow less what leaves for the basin [cm^3/s]: the rate of change of the stored volume."""
         inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
         return inflow - sum(self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks))
@@ -187,8 +189,8 @@ SURPLUS = 1e-6
 def check_caught(plant, name="plant"):
     """Raise InputError where the spills of one tank catch more than passes its rim: volume would come from nowhere. `plant` is called
     `name`; one whose shares are traced or of a batch, or that has none, is passed over."""
-    shares = getattr(plant, "caught", None)
-    if isinstance(shares, jax.core.Tracer) or np.ndim(shares) != 1:
+    shares: Any = getattr(plant, "caught", None)
+    if isinstance(shares, Tracer) or np.ndim(shares) != 1:
         return
     for tank in dict.fromkeys(source for source, _ in plant.spills):
         own = [float(share) for share, (source, _) in zip(shares, plant.spills) if source == tank]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.plants.hydraulics import disc
@@ -39,7 +39,7 @@ def state_coupled_four_tank(area: float) -> TankNetwork:
 def quadruple_tank(
     *,
     area: ArrayLike,
-    outlet: ArrayLike,
+    outlet: Sequence[float],
     pump_gain: ArrayLike,
     split: ArrayLike,
     rim: ArrayLike,

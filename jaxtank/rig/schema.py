@@ -1,5 +1,6 @@
 """How values are written in a rig file, and what may be said of them: numbers, ranges, units."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ class Key(NamedTuple):
 
     name: str
     value: Any
-    meta: dict = BARE
+    meta: Mapping[str, Any] = BARE
     on: bool = True
 
 

@@ -1,7 +1,7 @@
 """Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain, scenarios."""
 
 import math
-from collections.abc import Container, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -35,13 +35,13 @@ def doubts(case: Case) -> list[str]:
     _late(found, "changes of the reference", [t for t, _ in events], end)
     if isinstance(loop.disturbance, Pours):
         _late(found, "pours", [t for t, *_ in loop.disturbance.events], end)
-    over, early = {}, []
+    over, early, ramp = {}, [], 0.0 if reference is None else reference.ramp
     for t, i in events:
         early += [(i, t)] if t < over.get(i, 0.0) - 1e-7 * case.clock.dt else []
-        over[i] = t + reference.ramp
+        over[i] = t + ramp
     if early:
         found.append(
-            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {reference.ramp:g} s), the first "
+            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {ramp:g} s), the first "
             f"of output {early[0][0] + 1} at {early[0][1]:g} s: each starts from where that one has got to"
         )
     lost = "what is above it is lost at once" if loop.plant.overflow else "rims are limits here and not physics"
@@ -49,7 +49,9 @@ def doubts(case: Case) -> list[str]:
         if level > rim[i]:
             found.append(f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
     never = "a level cannot get there" if loop.plant.overflow else lost
-    for i, tank in enumerate(loop.plant.outputs if reference is not None else ()):
+    for i, tank in enumerate(loop.plant.outputs):
+        if reference is None:
+            break
         asked = [reference.initial[i], *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i)]
         if max(asked) > rim[tank]:
             found.append(
@@ -173,7 +175,7 @@ def uncovered(
     loop: ClosedLoop,
     name: str,
     share: float,
-    covered: Container[str],
+    covered: Iterable[str],
 ) -> dict[str, float]:
     """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry where that is part of an array; a
     share of nothing is left out."""

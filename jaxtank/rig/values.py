@@ -123,12 +123,12 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
             levels, inputs = equilibrium(case.loop.plant, setpoints)
         except EquilibriumError as error:
             raise EquilibriumError(f'{steady[0]} = "steady": {error}') from None
-        known = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
+        known: dict[str, Any] = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
         found |= {name: known[name] for name in steady}
     return set_values(case, found)
 
 
-def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, list]:
+def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
     """Let values that were set in a case take the place of those of its scenarios.
 
     Parameters
@@ -194,7 +194,7 @@ def _absolute(case, name, value):
 def _number_of(case, name):
     """The number or array that `name` is in a case, None where it is no number."""
     if name.startswith("clock."):
-        value = getattr(case.clock, name.removeprefix("clock."), None)
+        value: Any = getattr(case.clock, name.removeprefix("clock."), None)
     elif _meta(case, name)["kind"] == "leaf":
         return get_value(case.loop, name)
     else:

@@ -1,6 +1,7 @@
 """The interface of a signal, and signals that hold for any purpose: constant, table, sum."""
 
 import abc
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -84,15 +85,17 @@ class Sum(Signal):
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
-        return tuple(
+        value, rate, second = (
             tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
         )
+        return value, rate, second
 
     @pointwise
     def windows(self, clock: Clock) -> tuple:
         """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
         t = sample_times(clock)
-        found = list(self.first.windows(clock))
-        still = t < self.second.start - 1e-7 * clock.dt
-        found[self.second.channel] = tuple(jnp.where(still, a, 0.0) for a in found[self.second.channel])
+        steps, sine = cast(Any, self.first), cast(Any, self.second)  # a Ramps, with a Sine on it
+        found = list(steps.windows(clock))
+        still = t < sine.start - 1e-7 * clock.dt
+        found[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in found[sine.channel])
         return tuple(found)

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from jaxtank.core.clock import Clock, Piece, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
@@ -120,11 +119,12 @@ class Sine(Signal):
         sine, cosine = self.amplitude * jnp.sin(angle), self.amplitude * jnp.cos(angle)
         moving = [jnp.where(inside, v, 0.0) for v in (self.offset + sine, omega * cosine, -omega * omega * sine)]
         still = jnp.zeros_like(t)
-        return tuple(tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+        value, rate, second = (tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+        return value, rate, second
 
 
 def ramps(
-    initial: ArrayLike,
+    initial: Sequence[float],
     changes: Sequence[tuple[float, int, float]],
     ramp: float = 60.0,
     shape: str = "linear",

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from jaxtank.case import Case
@@ -76,7 +76,7 @@ def identify_many(
     Returns Identifications. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
     began, logs = time.perf_counter(), list(logs)
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     if not logs:
         raise InputError("no log is given")
@@ -239,12 +239,12 @@ def _spread(lanes, e, z, cost, matrix):
     scale = 2 * cost / max(lanes.readings[e] - moving.size, 1)
     full, hidden = np.zeros((size, size)), held.copy()
     if moving.size and np.all(np.isfinite(matrix)):
-        squares, axes = np.linalg.eigh(matrix[np.ix_(moving, moving)])
+        squares, axes = np.linalg.eigh(matrix[np.ix_(moving, moving)])  # pyright: ignore[reportCallIssue]  (stubs know lists only)
         singular = np.sqrt(np.maximum(squares, 0.0))
         sd = np.sqrt(scale) / np.maximum(singular, 1e-300)
         # squares know a singular value to half of the digits only
         open_ = (sd > VAGUE) | (singular < np.sqrt(ROUND_OFF) * 1e-3 * singular.max())
-        full[np.ix_(moving, moving)] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T
+        full[np.ix_(moving, moving)] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T  # pyright: ignore[reportCallIssue]  (stubs know lists only)
         own = np.sqrt(np.diag(full))[moving]
         for axis, reach in zip(axes[:, open_].T, np.minimum(sd[open_], 1.0)):
             hidden[moving[np.abs(axis) * reach > np.maximum(0.5 * own, 1e-6)]] = True

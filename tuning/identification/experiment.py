@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import DataError
 from jaxtank.core.units import DEFAULT
@@ -76,8 +76,8 @@ def log(
     in_volts: Sequence[bool] | None = None,
     name: str = "log",
     lines: ArrayLike | None = None,
-    headers: Sequence[str] | None = None,
-    units: Sequence[str] | None = None,
+    headers: tuple | None = None,
+    units: tuple | None = None,
 ) -> Log:
     """A Log from arrays. t: (samples,) [s]; u: (samples,) or (samples, pumps); y: (samples,) or (samples, channels), NaN where missing; tanks:
     the tank of each channel (0, 1, ... where None); in_volts: per channel, False where None; name, lines, headers, units: of a Log, for messages.

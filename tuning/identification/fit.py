@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 import jaxtank
@@ -97,7 +97,7 @@ class Identification:
 
 def identify(
     case: Case | Plant,
-    log: Log | Sequence[Log],
+    log: lg.Log | Sequence[lg.Log],
     free: Mapping[str, Any] | None = None,
     *,
     start: str = "free",
@@ -135,7 +135,7 @@ def identify(
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
     began = time.perf_counter()
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     case = bare(case) if isinstance(case, Plant) else case
     check_law(law, case)

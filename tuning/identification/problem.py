@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -234,8 +234,12 @@ class Estimation:
                 kept["v"], kept["at"] = v.copy(), self.pass_at(whole)
             return kept["at"]
 
+        def slope(v):
+            inner = both(v)[1][:, moving]
+            return inner if pull is None else np.concatenate([inner, np.diag(drawn)])
+
         low, high = self.box[0][moving], self.box[1][moving]
-        drawn = None if pull is None else pull[1] * np.where(moving < self.coordinates.size, 1.0, 10.0)
+        drawn: Any = None if pull is None else pull[1] * np.where(moving < self.coordinates.size, 1.0, 10.0)
         before = self.passes
         if not np.all(np.isfinite(both(np.clip(whole[moving], low, high))[0])):
             p, own = self.parts(whole)
@@ -247,7 +251,7 @@ class Estimation:
             found = least_squares(
                 lambda v: both(v)[0] if pull is None else np.concatenate([both(v)[0], drawn * (v - pull[0][moving])]),
                 np.clip(whole[moving], low, high),
-                lambda v: both(v)[1][:, moving] if pull is None else np.concatenate([both(v)[1][:, moving], np.diag(drawn)]),
+                cast(Any, slope),
                 bounds=(low - 1e-12, high + 1e-12),
                 x_scale=1.0,
                 loss=loss,
@@ -295,7 +299,7 @@ class Estimation:
 
 def _felt(loop, spec, found):
     """`found` Bounds less the splits of pumps that feed one tank, which nothing depends on: an array's are left out, one by name refused."""
-    feeds = getattr(loop.plant, "feeds", ())
+    feeds = cast(Any, getattr(loop.plant, "feeds", ()))
     idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
     for name in idle & set(spec):
         raise InputError(f"free {name}: this pump feeds one tank alone, its split changes nothing")

@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, split_index

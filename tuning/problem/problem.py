@@ -159,9 +159,12 @@ class Problem:
         self.simulations += len(zs) * len(self.lanes)
         return tuple(v.copy() for v in self.memo.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse)))
 
+    def _per_lane(self) -> list[Any]:
+        return [None] * len(self.lanes)
+
     def _screen(self, zs, coarse):
         points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
-        tables, broken = [[None] * len(self.lanes) for _ in zs], np.zeros(len(zs), dtype=bool)
+        tables, broken = [self._per_lane() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
             clock = sc.coarse_clock(group.clock) if coarse else group.clock
             measures, flags = sc.values_of(group, self.needed, points, clock)
@@ -204,7 +207,7 @@ class Problem:
         values = {name: np.float64(v) for name, v in self.values(z).items()}
         per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
         count, ruined = len(z), False
-        table, slopes, matrices = ([None] * len(self.lanes) for _ in range(3))
+        table, slopes, matrices = (self._per_lane() for _ in range(3))
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
             ruined = ruined or bool(np.any(broken))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tuning.search.result import TuningResult
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
-from tuning.uncertainty.study import ensemble
+from tuning.uncertainty.study import Ensemble, ensemble
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
@@ -154,7 +154,10 @@ def _kept_off(case, limits, share):
 
 def _run(case, distributions, limits, names, fresh, seed):
     """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit or leaves the numbers)."""
-    seen = ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False)
+    seen = cast(
+        Ensemble,
+        ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False),
+    )
     past = [limit.margins(seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0 for limit in seen.limits]
     return seen, seen.failed | np.any(past, axis=0) if past else seen.failed
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -217,7 +217,7 @@ def tune(
     )
     result = result.replace(message=message(result, z, felt, redone, of_answer(problem, tuned, values, key)))
     if log is not None:
-        problem.memo = problem.memo.memo()
+        problem.memo = cast(Log, problem.memo).memo()
     return result
 
 

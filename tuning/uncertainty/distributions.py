@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
-from jax.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import check_value, describe, get_value, is_real, shortened, split_index
@@ -22,10 +21,11 @@ class Uniform:
     relative: float | None = None
     tied: bool = False
 
-    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
+        assert self.low is not None and self.high is not None  # `check`
         return self.low + (self.high - self.low) * p
 
     def check(self, name: str) -> None:
@@ -33,7 +33,7 @@ class Uniform:
         _one_kind(self, name, ("low", "high"), "relative")
         if self.relative is not None and not self.relative > 0:
             raise InputError(f"{name}: uniform of relative width {self.relative:g} must be wider than 0")
-        if self.relative is None and not self.low < self.high:
+        if self.low is not None and self.high is not None and not self.low < self.high:
             raise InputError(f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below its high one")
 
 
@@ -46,10 +46,11 @@ class LogUniform:
     factor: float | None = None
     tied: bool = False
 
-    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
+        assert self.low is not None and self.high is not None  # `check`
         return self.low * (self.high / self.low) ** p
 
     def check(self, name: str) -> None:
@@ -57,7 +58,7 @@ class LogUniform:
         _one_kind(self, name, ("low", "high"), "factor")
         if self.factor is not None and not self.factor > 1:
             raise InputError(f"{name}: log-uniform factor = {self.factor:g} must be above 1")
-        if self.factor is None and not 0 < self.low < self.high:
+        if self.low is not None and self.high is not None and not 0 < self.low < self.high:
             raise InputError(
                 f"{name}: log-uniform from {self.low:g} to {self.high:g} must lie above 0, its low end below its high one"
             )
@@ -74,7 +75,7 @@ class Normal:
     cut: float = 3.0
     tied: bool = False
 
-    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
@@ -85,6 +86,7 @@ class Normal:
         """Raise InputError unless the width is one."""
         _one_kind(self, name, ("sd",), "relative")
         width = self.sd if self.relative is None else self.relative
+        assert width is not None  # `_one_kind`
         if not (width > 0 and self.cut > 0):
             raise InputError(f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both must be above 0")
 
@@ -97,7 +99,7 @@ class Discrete:
     weights: tuple | None = None
     tied: bool = False
 
-    def quantile(self, p: np.ndarray, nominal: ArrayLike) -> np.ndarray:
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...)."""
         weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=float)
         edges = np.cumsum(weights / weights.sum())[:-1]

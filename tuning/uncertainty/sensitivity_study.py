@@ -222,7 +222,8 @@ class Runs:
         self.own = {name: np.asarray(get_value(case.loop, name))[None] for name in draws.values(np.zeros((0, draws.dimensions)))}
         self.draws, self.names, self.progress = draws, names, progress
         self.batch = batch or max(8, min(LANES, 1 << (max(1, NUMBERS // case.clock.samples).bit_length() - 1)))
-        self.nominal, self.failed = None, 0
+        self.nominal: Any = None
+        self.failed = 0
         self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
 
     def _batch(self, device, values):

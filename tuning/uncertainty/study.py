@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -208,7 +208,7 @@ def ensemble(
     lanes = lanes or _lanes(case, random, samples)
     p = probabilities(draws, space.dimensions, samples, key)
     count = -(-samples // lanes)
-    store = None
+    store: Any = None
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
         manifest["told"] = shards.told(case, case.limits if limits is None else limits)
@@ -235,7 +235,7 @@ def ensemble(
         return None
     for k in mine:
         if k not in batches:
-            batches[k] = store.get(k)
+            batches[k] = cast(Any, store).get(k)
     if jax.process_count() > 1:
         batches = _gather(batches, count)
     whole = {name: np.concatenate([batches[k][name] for k in range(count)])[:samples] for name in batches[0]}
