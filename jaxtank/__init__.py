@@ -16,8 +16,45 @@ import to leave XLA as it is.
 """
 
 import importlib
+from typing import TYPE_CHECKING
 
 from jaxtank.xla import flags
+
+# A type checker reads these imports in place of `__getattr__`; at run time none is made here.
+if TYPE_CHECKING:
+    from jaxtank import analysis as analysis
+    from jaxtank import controllers as controllers
+    from jaxtank import core as core
+    from jaxtank import export as export
+    from jaxtank import instruments as instruments
+    from jaxtank import interop as interop
+    from jaxtank import loop as loop
+    from jaxtank import measures as measures
+    from jaxtank import observers as observers
+    from jaxtank import plants as plants
+    from jaxtank import plots as plots
+    from jaxtank import presets as presets
+    from jaxtank import rig as rig
+    from jaxtank import signals as signals
+    from jaxtank import xla as xla
+    from jaxtank.case import Case as Case
+    from jaxtank.core.clock import Clock as Clock
+    from jaxtank.core.errors import EquilibriumError as EquilibriumError
+    from jaxtank.core.errors import InputError as InputError
+    from jaxtank.core.errors import NonFiniteError as NonFiniteError
+    from jaxtank.core.records import Trajectory as Trajectory
+    from jaxtank.core.tree import component as component
+    from jaxtank.core.tree import leaf as leaf
+    from jaxtank.core.tree import parameters as parameters
+    from jaxtank.core.tree import static as static
+    from jaxtank.core.tree import with_values as with_values
+    from jaxtank.interop import gymnasium as environment  # noqa: F401
+    from jaxtank.interop import python_control as neighbours  # noqa: F401
+    from jaxtank.loop.closed_loop import ClosedLoop as ClosedLoop
+    from jaxtank.loop.run import evaluate as evaluate
+    from jaxtank.loop.run import sensitivities as sensitivities
+    from jaxtank.loop.run import simulate as simulate
+    from jaxtank.loop.validation import check as check
 
 __version__ = "0.1.0"
 
@@ -65,17 +102,19 @@ _OPTIONAL = {
     "environment": "jaxtank.interop.gymnasium",
 }
 
-__all__ = [*_NAMES, *_FOLDERS]
+__all__ = [*_NAMES, *_FOLDERS]  # pyright: ignore[reportUnsupportedDunderAll]  the names of the table
 
 
-def __getattr__(name):
-    if name in _NAMES:
-        return getattr(importlib.import_module(_NAMES[name]), name)
-    if name in _FOLDERS:
-        return importlib.import_module(f"jaxtank.{name}")
-    if name in _OPTIONAL:
-        return importlib.import_module(_OPTIONAL[name])
-    raise AttributeError(f"module 'jaxtank' has no attribute {name!r}")
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
+
+    def __getattr__(name):
+        if name in _NAMES:
+            return getattr(importlib.import_module(_NAMES[name]), name)
+        if name in _FOLDERS:
+            return importlib.import_module(f"jaxtank.{name}")
+        if name in _OPTIONAL:
+            return importlib.import_module(_OPTIONAL[name])
+        raise AttributeError(f"module 'jaxtank' has no attribute {name!r}")
 
 
 def __dir__():

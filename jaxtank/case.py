@@ -66,6 +66,6 @@ class Case:
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     names: Mapping[str, tuple] = dataclasses.field(default_factory=dict)
 
-    def replace(self, **changes):
+    def replace(self, **changes: Any) -> "Case":
         """A copy with the named fields changed."""
         return dataclasses.replace(self, **changes)

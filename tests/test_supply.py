@@ -253,7 +253,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
     }
     assert packed == there
     assert {"tuning/bench/floor.c", "tuning/cli/names.txt", "jaxtank/README.md", "tuning/README.md"} <= packed
-    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt"}
+    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt", "typed"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 

@@ -9,6 +9,35 @@ result.save("tuned")
 """
 
 import importlib
+from typing import TYPE_CHECKING
+
+# A type checker reads these imports in place of `__getattr__`; at run time none is made here.
+if TYPE_CHECKING:
+    from tuning.identification.batch import Identifications as Identifications
+    from tuning.identification.batch import identify_many as identify_many
+    from tuning.identification.csv_log import read_log as read_log
+    from tuning.identification.design import compare_experiments as compare_experiments
+    from tuning.identification.experiment import Log as Log
+    from tuning.identification.experiment import log as log
+    from tuning.identification.fit import Identification as Identification
+    from tuning.identification.fit import identify as identify
+    from tuning.identification.problem import Estimation as Estimation
+    from tuning.optimal_input.perfect_information import bound as bound
+    from tuning.problem.bounds import Bound as Bound
+    from tuning.problem.problem import Problem as Problem
+    from tuning.search.pareto import tradeoff as tradeoff
+    from tuning.search.result import TuningResult as TuningResult
+    from tuning.search.robust import Certificate as Certificate
+    from tuning.search.robust import tune_robust as tune_robust
+    from tuning.search.tuner import tune as tune
+    from tuning.uncertainty.distributions import Correlated as Correlated
+    from tuning.uncertainty.distributions import Discrete as Discrete
+    from tuning.uncertainty.distributions import LogUniform as LogUniform
+    from tuning.uncertainty.distributions import Normal as Normal
+    from tuning.uncertainty.distributions import Uniform as Uniform
+    from tuning.uncertainty.sensitivity_study import sensitivity as sensitivity
+    from tuning.uncertainty.study import Ensemble as Ensemble
+    from tuning.uncertainty.study import ensemble as ensemble
 
 _NAMES = {
     "Adam": "tuning.search.options",
@@ -44,13 +73,15 @@ _NAMES = {
     "tune": "tuning.search.tuner",
 }
 
-__all__ = list(_NAMES)
+__all__ = list(_NAMES)  # pyright: ignore[reportUnsupportedDunderAll]  the names of the table
 
 
-def __getattr__(name):
-    if name in _NAMES:
-        return getattr(importlib.import_module(_NAMES[name]), name)
-    raise AttributeError(f"module 'tuning' has no attribute {name!r}")
+if not TYPE_CHECKING:  # a checker would take any name for one that is here
+
+    def __getattr__(name):
+        if name in _NAMES:
+            return getattr(importlib.import_module(_NAMES[name]), name)
+        raise AttributeError(f"module 'tuning' has no attribute {name!r}")
 
 
 def __dir__():

@@ -75,7 +75,7 @@ def _scaled(H, f, G, l, u):
 @solve.defjvp
 def _slope(iterations, primals, tangents):
     (unit, data), (_, moved) = jax.jvp(_scaled, primals, tangents)
-    found = _held(interior_point(*jax.lax.stop_gradient(data), iterations), *data)
+    found = _held(interior_point(*jax.lax.stop_gradient(data), iterations=iterations), *data)
     return unit * found.x, unit * _implicit(found, data, moved)
 
 

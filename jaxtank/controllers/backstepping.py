@@ -1,11 +1,16 @@
 """Backstepping (gouta2015, sec. 4), as printed and with the reference's rates."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Signal
 
 
 @component
@@ -28,7 +33,7 @@ class Backstepping(Controller):
     level_floor: float = leaf("cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True)
     reference_rates: bool = static("-", "use r' and r'' (backstepping-ff)", choices=(False, True), default=False)
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)
         (h1, h2, _, _), (r1, r2) = estimate.x, tick.r
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
@@ -43,9 +48,9 @@ class Backstepping(Controller):
         v2 = tick.ddr[1] + 0.5 * c.c4 * tick.dr[1] / q2 - gain * (w2 - tick.dr[1])
         return decouple(c, s3, s4, v1, v2), state
 
-    def input_metric(self, estimate):
+    def input_metric(self, estimate: Estimate) -> tuple | None:
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
         return input_metric(coefficients(self.model), s3, s4)
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_state_coupled(self.model, reference)

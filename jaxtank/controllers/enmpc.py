@@ -1,9 +1,14 @@
 """Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance estimate (gouta2022, sec. 3 and 4)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Signal
 
 COMPENSATIONS = ("none", "single", "double")
 DRIFTS = ("derived", "printed")
@@ -25,7 +30,7 @@ class ENMPC(Controller):
     compensation: str = static("-", "how often the disturbance estimate is subtracted", choices=COMPENSATIONS, default="none")
     drift: str = static("-", "sign of f in the law: derived, or as printed", choices=DRIFTS, default="derived")
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c2, k = authority(self.model), 1.5 / self.Tp
         f = drift(self.model, estimate.x)
         sign, times = (1.0 if self.drift == "derived" else -1.0), COMPENSATIONS.index(self.compensation)
@@ -33,5 +38,5 @@ class ENMPC(Controller):
         e = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
         return tuple(-(k * e[i] + sign * f[i] - tick.dr[i] + times * d[i]) / c2[i] for i in range(len(f))), state
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_own_pumps(self.model)

@@ -1,5 +1,8 @@
 """Fuzzy blend of sliding mode and state feedback for the quadruple tank (mirakhorli sec. 4.3)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -10,8 +13,10 @@ from jaxtank.controllers.state_feedback import feedback
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, magnitude
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Signal
 
 PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 
@@ -51,13 +56,13 @@ class FuzzyBlend(Controller):
     form: str = static("-", "which sliding-mode law", choices=FORMS, default="corrected")
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return steady_along(self.model, r)
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         return u0 if self.form == "printed" else ()
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         h0, u0 = tick.plan
         law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
         far = [clip(u, self.low[i], self.high[i]) for i, u in enumerate(slide(*law, estimate.x, tick.r, u0, state))]
@@ -66,10 +71,10 @@ class FuzzyBlend(Controller):
         share = [membership(size[j], self.b[i], self.w[i]) for i, j in enumerate(PAIRINGS[self.pairing])]
         return tuple(n + m * (f - n) for m, f, n in zip(share, far, near)), state
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_quadruple(self.model)
         for name, shape in (("K", (2, 4)), ("b", (2,)), ("w", (2,)), ("low", (2,)), ("high", (2,))):
             if np.shape(getattr(self, name)) != shape:

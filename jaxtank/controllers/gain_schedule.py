@@ -2,6 +2,7 @@
 
 import functools
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.numerics import portion
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import check_value, component, describe, get_value, leaf, parameters, static, with_values
+from jaxtank.signals.base import Signal
 from jaxtank.xla.reachability import use_of
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")
@@ -174,35 +176,35 @@ class Scheduled(Controller):
         return self.variable.startswith("r")
 
     @property
-    def allocates(self):
+    def allocates(self) -> bool:
         return self.law.allocates
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return self._blind().prepare(r, dr, ddr)
 
     @pointwise
-    def inputs(self, clock):
+    def inputs(self, clock: Clock) -> Any:
         return self._blind().inputs(clock)
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         return Memory(law=self._blind().init(x0, u0), at=() if self._on_setpoint else x0[self._index])
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         at = tick.r[self._index] if self._on_setpoint else estimate.x[self._index]
         command, inner = self._law_at(at).step(state.law, tick, estimate)
         return command, Memory(law=inner, at=state.at if self._on_setpoint else at)
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         at = tick.r[self._index] if self._on_setpoint else state.at
         return state._replace(law=self._law_at(at).track(state.law, tick, command, applied))
 
-    def input_metric(self, estimate):
+    def input_metric(self, estimate: Estimate) -> tuple | None:
         # the setpoint is not told here: `check` refuses gains that would need it
         law = self._blind() if self._on_setpoint else self._law_at(estimate.x[self._index])
         return law.input_metric(estimate)
 
-    def metadata_of(self, field):
+    def metadata_of(self, field: str) -> dict[str, Any]:
         """What to change of a field's metadata: the values are in the units and ranges of their gains."""
         if field != "values":
             return {}
@@ -216,7 +218,7 @@ class Scheduled(Controller):
             every |= {"low": rows[0]["low"], "strict": rows[0]["strict"]}
         return every
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_gains(self.law, self.gains)
         tanks = getattr(getattr(self.law, "model", None), "tanks", None)
         check_variable(self.variable, reference.channels, tanks)

@@ -1,5 +1,6 @@
 """Generalized predictive control of a linear model (khalid, section III)."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,6 +8,7 @@ from jaxtank.controllers.incremental import MODES, LinearPredictive
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.network import TankNetwork
+from jaxtank.signals.base import Signal
 
 
 @component
@@ -30,14 +32,14 @@ class GPC(LinearPredictive):
     mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
 
     @property
-    def ahead(self):
+    def ahead(self) -> int:
         return self.Nc
 
-    def basis(self):
+    def basis(self) -> jax.Array:
         pumps = self.model.pumps
         return jnp.eye(self.Np * pumps)[:, : self.Nc * pumps].reshape(self.Np, pumps, self.Nc * pumps)
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         super().check(reference)
         if self.Nc > self.Np:
             raise InputError(f"controller.Nc = {self.Nc}: must be at most controller.Np = {self.Np}")

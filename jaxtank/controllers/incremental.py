@@ -2,7 +2,8 @@
 
 import abc
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,10 @@ from jaxtank.analysis.steady_state import linearise
 from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.plants.network import TankNetwork
+from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
 EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact
@@ -22,8 +27,8 @@ EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit
 class Memory(NamedTuple):
     """What the law keeps of the last sample: levels measured (n) [cm], inputs applied (m) [V]."""
 
-    x: tuple
-    u: tuple
+    x: Sequence
+    u: Sequence
 
 
 def incremental_model(model, operating_point, dt):
@@ -71,30 +76,39 @@ class LinearPredictive(Controller):
     pumps' limits let through, which is all the anti-windup there is.
     """
 
+    model: TankNetwork
+    operating_point: Any
+    r_w: Any
+    q: Any
+    du_limit: Any
+    u_low: Any
+    u_high: Any
+    mode: str
+
     @property
     @abc.abstractmethod
-    def ahead(self):
+    def ahead(self) -> int:
         """Number of samples ahead on which the constraints are imposed [-]."""
 
     @abc.abstractmethod
-    def basis(self):
+    def basis(self) -> jax.Array:
         """(Np, m, variables): increments of the m pumps over the horizon, one column per variable."""
 
-    def design(self, dt):
+    def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
         """(Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt` [s]; see `quadratic_cost`."""
         basis = self.basis()
         A, B, C = incremental_model(self.model, self.operating_point, dt)
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
-    def gain(self, dt):
+    def gain(self, dt: float) -> jax.Array:
         """K (m, n+q) of the linear law du = -K [dx_m; y - r] [V/cm], at sampling period `dt` [s]."""
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         return Memory(x=x0, u=u0)
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         x = estimate.x
         error = [a - b for a, b in zip(x, state.x)] + [x[i] - r for i, r in zip(self.model.outputs, tick.r)]
         pumps = range(self.model.pumps)
@@ -127,10 +141,10 @@ class LinearPredictive(Controller):
         most = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])
         return basis[0] @ qp.solve(2.0 * Omega, 2.0 * (Psi @ error), rows, least, most)
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
 
-    def check_pumps(self, actuator):
+    def check_pumps(self, actuator: PumpBank) -> None:
         """A quadratic programme that begins outside its range may have no answer."""
         if self.mode != "constrained":
             return
@@ -147,7 +161,7 @@ class LinearPredictive(Controller):
                     f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits of a constrained law, {own}"
                 )
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         point, n, m = np.asarray(self.operating_point), self.model.tanks, self.model.pumps
         length = self.model.units[0]
         if point.shape != (n,):

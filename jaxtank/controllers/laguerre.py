@@ -8,6 +8,7 @@ from jaxtank.controllers.incremental import MODES, LinearPredictive
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.network import TankNetwork
+from jaxtank.signals.base import Signal
 
 
 def laguerre_functions(a, N, samples):
@@ -52,10 +53,10 @@ class Laguerre(LinearPredictive):
     mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
 
     @property
-    def ahead(self):
+    def ahead(self) -> int:
         return self.rows
 
-    def basis(self):
+    def basis(self) -> jax.Array:
         pumps = self.model.pumps
         blocks = []
         for i in range(pumps):
@@ -63,7 +64,7 @@ class Laguerre(LinearPredictive):
             blocks.append(jnp.zeros((self.Np, pumps, self.N)).at[:, i].set(functions))
         return jnp.concatenate(blocks, axis=2)
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         super().check(reference)
         if np.shape(self.a) != (self.model.pumps,):
             raise InputError(f"controller.a has shape {np.shape(self.a)}: must be ({self.model.pumps},), one pole per pump")

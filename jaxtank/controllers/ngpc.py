@@ -1,9 +1,14 @@
 """Nonlinear generalised predictive control (gouta2015, sec. 3)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Signal
 
 
 @component
@@ -20,7 +25,7 @@ class NGPC(Controller):
     Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
     level_floor: float = leaf("cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True)
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)
         (h1, h2, _, _), (r1, r2) = estimate.x, tick.r
         s1, s2, s3, s4 = floored_roots(estimate.x, self.level_floor)
@@ -31,9 +36,9 @@ class NGPC(Controller):
         v2 = tick.ddr[1] - k1 * (h2 - r2) - k2 * (z2 - tick.dr[1]) + 0.5 * c.c4 * z2 / s2
         return decouple(c, s3, s4, v1, v2), state
 
-    def input_metric(self, estimate):
+    def input_metric(self, estimate: Estimate) -> tuple | None:
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)
         return input_metric(coefficients(self.model), s3, s4)
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_state_coupled(self.model, reference)

@@ -1,7 +1,11 @@
 """No feedback: inputs played back."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from jaxtank.controllers.base import Controller
-from jaxtank.core.clock import pointwise
+from jaxtank.core.clock import Clock, pointwise
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component
 from jaxtank.signals.base import Signal
 
@@ -16,8 +20,8 @@ class OpenLoop(Controller):
     signal: Signal
 
     @pointwise
-    def inputs(self, clock):
+    def inputs(self, clock: Clock) -> Any:
         return self.signal.sample(clock)[0]
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         return tick.own, state

@@ -1,6 +1,7 @@
 """PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4; gouta2022 notes S4.5)."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +10,10 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
+from jaxtank.signals.base import Signal
 
 FILTER = 8.0  # the derivative's filter has the time constant Td/8
 LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N + 1 sections
@@ -52,23 +55,25 @@ class PID(Controller):
     model: Plant
     Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc", low=0.0, strict=True)
     Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
-    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc")
-    order: np.ndarray | None = leaf("-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc")
+    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None)
+    order: np.ndarray | None = leaf(
+        "-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc", default=None
+    )
     Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
     bias: np.ndarray = leaf("V", "(m,) input added where there is no feed-forward")
     feed_forward: bool = static("-", "add the model's input on the reference", choices=(False, True), default=False)
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         if not self.feed_forward:
             return ()
         return tuple((rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model)))
 
     @property
-    def reads_model(self):
+    def reads_model(self) -> bool:
         return self.feed_forward
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         zero, loops = 0.0 * u0[0], range(len(u0))
         return Memory(
             integral=(zero,) * len(u0),
@@ -77,7 +82,7 @@ class PID(Controller):
             error=(zero,) * len(u0),
         )
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         base = tick.plan if self.feed_forward else tuple(self.bias[i] for i in range(len(tick.r)))
         y = tuple(estimate.x[i] for i in self.model.outputs)
         e = tuple(r - level for r, level in zip(tick.r, y))
@@ -89,7 +94,7 @@ class PID(Controller):
             slow = tuple(slow[i] + (1.0 - jnp.exp(-tick.dt * FILTER / self.Td[i])) * (y[i] - slow[i]) for i in range(len(v)))
         return v, state._replace(slow=slow, error=e)
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         loops, integral, sections = range(len(command)), [], []
         for i in loops:
             w = state.error[i] + (self.Ti[i] / (self.Tt[i] * self.Kc[i])) * (applied[i] - command[i])
@@ -104,7 +109,7 @@ class PID(Controller):
             sections.append(tuple(keep[j] * s + enter[j] * w for j, s in enumerate(state.sections[i])))
         return state._replace(integral=tuple(integral), sections=tuple(sections))
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         if len(self.model.outputs) != self.model.pumps:
             raise InputError(f"PID needs one pump per output: the model has {self.model.pumps} and {len(self.model.outputs)}")
         if self.feed_forward:

@@ -1,5 +1,6 @@
 """Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and in a form that can work."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -8,9 +9,11 @@ from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, signed_root, signed_root_slope
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.plants.rigs import QUADRUPLE_FEEDS, QUADRUPLE_LINKS, check_topology
+from jaxtank.signals.base import Signal
 
 SWITCHES = {"tanh": jnp.tanh, "clip": lambda x: clip(x, -1.0, 1.0), "sign": jnp.sign}
 FORMS = ("corrected", "printed")
@@ -120,18 +123,18 @@ class SlidingMode(Controller):
     form: str = static("-", "which law", choices=FORMS, default="corrected")
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return steady_along(self.model, r)[1]
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         return u0 if self.form == "printed" else ()
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
         return slide(*law, estimate.x, tick.r, tick.plan, state), state
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_quadruple(self.model)

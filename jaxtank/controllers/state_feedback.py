@@ -1,5 +1,9 @@
 """State feedback around the steady state of the setpoint (mirakhorli sec. 4.2), and the same with integral action."""
 
+from collections.abc import Sequence
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -8,8 +12,11 @@ from jaxtank.analysis.steady_state import linearise, steady_along, steady_flows
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
+from jaxtank.plants.network import TankNetwork
+from jaxtank.signals.base import Signal
 
 
 def feedback(K, x, h0, u0):
@@ -41,13 +48,13 @@ class StateFeedback(Controller):
     K: np.ndarray = leaf("V/cm", "(pumps, tanks) gain K")
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return steady_along(self.model, r)
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         return feedback(self.K, estimate.x, *tick.plan), state
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
         if np.shape(self.K)[-2:] != (self.model.pumps, self.model.tanks):
             raise InputError(f"controller.K has shape {np.shape(self.K)}: must be ({self.model.pumps}, {self.model.tanks})")
@@ -63,7 +70,7 @@ class LQI(Controller):
     weights diag(Q) and diag(R). The gain follows its weights, its model and its operating point, derivatives included.
     """
 
-    model: Plant
+    model: TankNetwork
     # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig counts in
     Q: np.ndarray = leaf(
         "-", "(tanks + outputs,) weight of each level, over its unit squared, then of each integral, over that times s^2", low=0.0
@@ -72,14 +79,14 @@ class LQI(Controller):
     operating_point: np.ndarray = leaf("cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True)
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return steady_along(self.model, r)
 
-    def init(self, x0, u0):
+    def init(self, x0: tuple, u0: tuple) -> Any:
         zero = (0.0,) * len(self.model.outputs)
         return zero, zero  # integrals z [cm s], errors of this sample [cm]
 
-    def gain(self):
+    def gain(self) -> jax.Array:
         """[K, Ki] (pumps, tanks + outputs) [V/cm], [V/(cm s)]."""
         speeds, voltages = steady_flows(self.model, self.operating_point)
         A, B, C = linearise(self.model, speeds * speeds / (2.0 * self.model.gravity), voltages)
@@ -88,18 +95,18 @@ class LQI(Controller):
         B = jnp.concatenate([B, jnp.zeros((p, B.shape[1]))])
         return lqr(A, B, jnp.diag(jnp.asarray(self.Q)), jnp.diag(jnp.asarray(self.R)))
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         z, _ = state
         h0, u0 = tick.plan
         error = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
         return feedback(self.gain(), (*estimate.x, *z), (*h0, *(0.0 for _ in z)), u0), (z, error)
 
-    def track(self, state, tick, command, applied):
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         z, error = state
         free = sum(jnp.where(c == a, 0.0, 1.0) for c, a in zip(command, applied)) == 0.0
         return tuple(jnp.where(free, i + tick.dt * e, i) for i, e in zip(z, error)), error
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
         states = self.model.tanks + len(self.model.outputs)
         for name, size in (("Q", states), ("R", self.model.pumps), ("operating_point", len(self.model.outputs))):

@@ -1,5 +1,8 @@
 """Backstepping of two coupled tanks (calofir), in physical units."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -7,9 +10,11 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import floored_root
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
-from jaxtank.plants.base import Plant
+from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import COUPLED_PIPES, check_topology
+from jaxtank.signals.base import Signal
 
 
 @component
@@ -27,26 +32,26 @@ class TwoTankBackstepping(Controller):
     where levels count in other units. The output h1 follows h3; there is no integral action. Units in this class are the rig's (m, m^3/s).
     """
 
-    model: Plant
+    model: TankNetwork
     K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
     K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
     level_floor: float = leaf("cm", "level h3 below which the law takes the second tank to hold this much", low=0.0, strict=True)
     difference_floor: float = leaf("cm", "least h1 - h3 that the law reckons with", low=0.0, strict=True)
 
-    def coefficients(self):
+    def coefficients(self) -> tuple:
         """(a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3 = a in the paper, whose tanks are equal."""
         w = jnp.sqrt(2.0 * self.model.gravity)
         A1, A3 = self.model.area[0], self.model.area[1]
         return self.model.pipe[0] * w / A1, self.model.pipe[0] * w / A3, self.model.drain[1] * w / A3
 
     @pointwise
-    def prepare(self, r, dr, ddr):
+    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (calofir notes S2.2) [cm, cm^3/s]."""
         c1, c2 = self.model.pipe[0], self.model.drain[1]
         h3r = c1**2 / (c1**2 + c2**2) * r[0]  # kappa h1r
         return h3r, c1 * jnp.sqrt(2.0 * self.model.gravity) * jnp.sqrt(r[0] - h3r)
 
-    def step(self, state, tick, estimate):
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         a1, a, b = self.coefficients()
         h1, h3 = estimate.x
         e = h3 - tick.plan[0]
@@ -56,7 +61,7 @@ class TwoTankBackstepping(Controller):
         flow = self.model.area[0] * (2.0 * Z * (0.5 * (a1 + a) + inner) - b * s)
         return (flow / self.model.pump_gain[0],), state
 
-    def check(self, reference):
+    def check(self, reference: Signal) -> None:
         check_topology(self.model, "two coupled tanks", pipes=COUPLED_PIPES, feeds=((0, None),), links=(), outputs=(0,))
         if float(self.model.drain[0]) != 0.0:
             raise InputError(

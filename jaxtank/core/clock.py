@@ -70,7 +70,7 @@ class Clock:
     first = 0  # index of the first sample
 
     @property
-    def samples(self):
+    def samples(self) -> int:
         """Number of samples of a run, both ends included [-]."""
         return round(self.duration / self.dt) + 1
 

@@ -1,8 +1,10 @@
 """The records that cross rooms, and the clock."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError
@@ -12,7 +14,7 @@ def check_key(key):
     """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the older one, a row of unsigned integers;
     traced ones and placeholders too."""
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
-    typed = kind is not None and jax.dtypes.issubdtype(kind, jax.dtypes.prng_key)
+    typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
     if (typed and ndim == 0) or (kind == np.uint32 and (ndim == 1 or isinstance(key, jax.ShapeDtypeStruct))):
         return
     if key is not None:
@@ -27,7 +29,7 @@ class Tick(NamedTuple):
     r: tuple  # setpoint r [cm]
     dr: tuple  # its rate r' [cm/s]
     ddr: tuple  # its second derivative r'' [cm/s^2]
-    dt: float = 0.0  # sampling period Ts [s]
+    dt: Any = 0.0  # sampling period Ts [s]
     plan: Any = ()  # what the law prepared for this sample before the loop started
     own: Any = ()  # this sample of the signals that are the law's own (`Controller.inputs`)
 
@@ -35,25 +37,25 @@ class Tick(NamedTuple):
 class Estimate(NamedTuple):
     """What an observer hands to a law: tuples of scalars."""
 
-    x: tuple  # level estimate, one per tank [cm]
-    d: tuple = ()  # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
+    x: Sequence  # level estimate, one per tank [cm]
+    d: Sequence = ()  # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
 
 
 class Sample(NamedTuple):
     """The world at t_k, before it moves: tuples of scalars."""
 
     t: Any  # time [s]
-    x: tuple  # levels, one per tank [cm]
-    y: tuple  # measured levels, one per tank [cm]
-    x_hat: tuple  # estimated levels, one per tank [cm]
-    d_hat: tuple  # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
+    x: Sequence  # levels, one per tank [cm]
+    y: Sequence  # measured levels, one per tank [cm]
+    x_hat: Sequence  # estimated levels, one per tank [cm]
+    d_hat: Sequence  # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
     r: tuple  # setpoint, one per output [cm]
     e: tuple  # tracking error of the true output, x - r, one per output [cm]
-    command: tuple  # what the law asked for, one per pump [V]
-    applied: tuple  # the command within the pumps' limits, one per pump [V]
-    u: tuple  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
-    spilled: tuple  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
-    shortfall: tuple = ()  # volume that a negative inflow could not take from each tank in that time [cm^3]
+    command: Sequence  # what the law asked for, one per pump [V]
+    applied: Sequence  # the command within the pumps' limits, one per pump [V]
+    u: Sequence  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
+    spilled: Sequence  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
+    shortfall: Sequence = ()  # volume that a negative inflow could not take from each tank in that time [cm^3]
 
 
 class Trajectory(NamedTuple):

@@ -12,10 +12,13 @@ import dataclasses
 import functools
 import numbers
 import re
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar, cast, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.units import DEFAULT, local
@@ -23,27 +26,50 @@ from jaxtank.core.units import DEFAULT, local
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 
 
-def leaf(unit="-", doc="", *, low=None, high=None, strict=False, like=None, default=None):
+T = TypeVar("T")
+
+
+def leaf(
+    unit: str = "-",
+    doc: str = "",
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    strict: bool = False,
+    like: str | None = None,
+    default: Any = dataclasses.MISSING,
+) -> Any:
     """A differentiable field: its unit, what it is, and the range in which it means something.
 
     low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a sibling field: such a leaf may be
-    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set. default: function of
-    {field: value} of the fields given, whose result a leaf has that is left out.
+    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set; type checkers see that it may be
+    left out where `default=None` is written beside it. default: function of {field: value} of the fields given, whose result a leaf
+    has that is left out.
     """
     meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "like": like}
-    if default is not None:
+    if callable(default):
         meta["default"] = default
-    needed = like is None and default is None
+    needed = like is None and default is dataclasses.MISSING
     return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
 
 
-def static(unit="-", doc="", *, low=None, high=None, strict=False, choices=None, default=dataclasses.MISSING):
+def static(
+    unit: str = "-",
+    doc: str = "",
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    strict: bool = False,
+    choices: tuple | None = None,
+    default: Any = dataclasses.MISSING,
+) -> Any:
     """A field that is part of the compiled program: hashable, never an array. Ranges and choices as in `leaf`."""
     meta = {"kind": "static", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "choices": choices}
     return dataclasses.field(metadata=meta, default=default)
 
 
-def component(cls):
+@dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(leaf, static))
+def component(cls: type[T]) -> type[T]:
     """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data.
 
     The constructor converts leaves given as numbers or lists and tuples of numbers to arrays (`number`), and gives those that are left out
@@ -54,10 +80,10 @@ def component(cls):
     array([12.])
     """
     cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    fields = dataclasses.fields(cls)
+    fields = dataclasses.fields(cast(Any, cls))
     leaves = {f.name: f.metadata.get("default") for f in fields if f.metadata.get("kind") == "leaf"}
     needed = {f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING}
-    construct = cls.__init__
+    construct = cast(Any, cls).__init__
 
     @functools.wraps(construct)
     def __init__(self, *args, **values):
@@ -69,7 +95,7 @@ def component(cls):
                     values[name] = _converted(default(values))
         construct(self, *args, **values)
 
-    cls.__init__ = __init__
+    cast(Any, cls).__init__ = __init__
     _register(
         cls,
         tuple(f.name for f in fields if f.metadata.get("kind") != "static"),
@@ -109,17 +135,17 @@ def _converted(value):
     return value
 
 
-def is_component(value):
+def is_component(value: Any) -> bool:
     """True for an instance of a class made by `component`."""
     return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
-def number(value):
+def number(value: Any) -> Any:
     """`value` as a host array of the default float: the form in which constructors store leaves."""
     return np.asarray(value, dtype=np.float64)
 
 
-def is_real(value):
+def is_real(value: Any) -> bool:
     """Whether a value, or every entry of a list or array, is a real number: no text, truth value, complex number, random key or None."""
     if isinstance(value, list | tuple):
         return all(is_real(v) for v in value)
@@ -131,7 +157,9 @@ def is_real(value):
     return jnp.issubdtype(kind, np.integer) or jnp.issubdtype(kind, np.floating)  # jnp: its own short floats too
 
 
-def walk(tree, prefix="", kind="leaf", units=DEFAULT):
+def walk(
+    tree: Any, prefix: str = "", kind: str = "leaf", units: tuple[str, str] = DEFAULT
+) -> Iterator[tuple[str, Any, dict[str, Any]]]:
     """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`, units as the rig counts.
 
     A component whose fields mean what another one's do (the gains in `controllers.Scheduled`) has a method `metadata_of(field)` that returns
@@ -147,12 +175,12 @@ def walk(tree, prefix="", kind="leaf", units=DEFAULT):
             yield name, value, _localised({**field.metadata, **own}, units)
 
 
-def parameters(tree):
+def parameters(tree: Any) -> dict[str, Any]:
     """{dotted name: value} of every leaf of a component (a loop, a plant, a law). Absent optional leaves are left out."""
     return {name: value for name, value, _ in walk(tree) if value is not None}
 
 
-def describe(tree, name):
+def describe(tree: Any, name: str) -> dict[str, Any]:
     """The metadata (unit, doc, low, high, strict) of the leaf or static field `name`; InputError if there is none."""
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
@@ -163,7 +191,7 @@ def describe(tree, name):
     raise unknown("parameter", name, _all_names(tree))
 
 
-def get_value(tree, name):
+def get_value(tree: Any, name: str) -> Any:
     """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if there is none."""
     base, index = split_index(name)
     values = parameters(tree)
@@ -174,7 +202,7 @@ def get_value(tree, name):
     raise unknown("parameter", name, values)
 
 
-def with_values(tree, values):
+def with_values(tree: T, values: Mapping[str, Any]) -> T:
     """A copy of `tree` with the leaves named in `values` replaced.
 
     values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf fills it.
@@ -195,12 +223,13 @@ def with_values(tree, values):
     return tree
 
 
-def split_index(name):
+def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError for a malformed name."""
     parts = name.split(".")
-    if not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
+    last = _STEP.fullmatch(parts[-1])
+    if last is None or not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
         raise InputError(f"{name!r} is not a parameter name: write component.field or component.field[i]")
-    base, bracket = _STEP.fullmatch(parts[-1]).groups()
+    base, bracket = last.groups()
     index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()
     return ".".join([*parts[:-1], base]), index
 
@@ -211,7 +240,7 @@ def check_leaves(tree, names=None, vacant=()):
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
-        if isinstance(value, jax.core.Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
+        if isinstance(value, Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
             continue
         check_value(name, value, meta)
 

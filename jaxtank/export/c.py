@@ -170,7 +170,7 @@ def print_c(law, case, name, precision):
     lines += ["", f"typedef struct {{ real s[{upper}_STATE]; }} {name}_state;"]
     if has(law.step, cg.Matrix):
         used = {s.op for s in every(law.step) if isinstance(s, cg.Matrix)}
-        lines += [b for b in MATRIX_C.strip("\n").split("\n\n") if re.search(r"void (\w+)", b).group(1) in used]
+        lines += [b for b in MATRIX_C.strip("\n").split("\n\n") if used & set(re.findall(r"void (\w+)", b)[:1])]
     printer = C(begun)
     lines += ["", f"void {name}_init({name}_state *state, const real *y, const real *u)", "{", "    (void)y; (void)u;"]
     lines += printer.lines(law.begin) + [f"    state->s[{i}] = {as_real(printer, e)};" for i, e in enumerate(law.begun)]

@@ -357,7 +357,7 @@ def _equation(writer, eqn, operands):
     if name in ("cumsum", "cumprod", "cummax", "cummin"):
         return [_running(writer, operands[0], params["axis"], params["reverse"], SUMS.get(name[3:], name[3:]), kind)]
     if name == "dot_general":
-        return [_product(writer, *operands, params["dimension_numbers"])]
+        return [_product(writer, *operands, dimensions=params["dimension_numbers"])]
     if name == "scan":
         return _scan(writer, eqn, operands)
     if name == "while":
@@ -366,7 +366,7 @@ def _equation(writer, eqn, operands):
         n = operands[0].shape[-1]
         return [writer.matrix("cholesky", operands, (n,), (n, n))]
     if name == "triangular_solve":
-        return [_triangular(writer, *operands, params)]
+        return [_triangular(writer, *operands, params=params)]
     if name == "custom_linear_solve" and all(_number(e) and e == 0 for e in operands[-1].ravel()):
         return [operands[-1]]  # nothing to solve for: a term that carries derivatives alone
     if name == "lu":  # of a matrix whose equations have a right side of zero: see above
@@ -554,8 +554,8 @@ def _loop(writer, eqn, carry, count, once):
     for v, start in zip(eqn.outvars, carry):
         kind, mine = kind_of(v.aval.dtype), np.empty(start.shape, dtype=object)
         for i in np.ndindex(start.shape):
-            mine[i] = Ref(writer.fresh("c"))
-            carried.append((kind, mine[i].name, start[i]))
+            ref = mine[i] = Ref(writer.fresh("c"))
+            carried.append((kind, ref.name, start[i]))
         names.append(mine)
     writer.scopes.append([])
     writer.known.append({})

@@ -1,11 +1,13 @@
 """What the pumps make of a command: saturation or allocation, dead zone, lag, transport delay, in this order."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import at_least, clip
 from jaxtank.core.tree import component, leaf, static
 
@@ -49,7 +51,7 @@ class PumpBank:
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    dead_zone: np.ndarray | None = leaf("V", "(m,) input at or below which a pump stands still", low=0.0, like="low")
+    dead_zone: Any = leaf("V", "(m,) input at or below which a pump stands still", low=0.0, like="low", default=None)
     stop: np.ndarray = leaf(
         "V",
         "(m,) input below which a turning pump stops (hysteresis)",
@@ -63,7 +65,7 @@ class PumpBank:
         strict=True,
         default=lambda own: _largest(own["high"]),
     )
-    lag: np.ndarray | None = leaf("s", "(m,) time constant of each pump", low=0.0, like="low")
+    lag: Any = leaf("s", "(m,) time constant of each pump", low=0.0, like="low", default=None)
     initial: np.ndarray = leaf(
         "V",
         "(m,) input at which the pumps ran before t = 0",
@@ -74,11 +76,11 @@ class PumpBank:
     dead_zone_kind: str = static("-", "what the dead zone does", choices=DEAD_ZONES, default="plain")
 
     @property
-    def pumps(self):
+    def pumps(self) -> int:
         """Number of pumps m [-]."""
         return np.shape(self.low)[-1]
 
-    def init(self, clock):
+    def init(self, clock: Clock) -> ActuatorState:
         """State before the first sample: pumps turning steadily at `initial`."""
         pumps, delay = range(self.pumps), round(self.delay / clock.dt)
         start = tuple(self.initial[i] for i in pumps)
@@ -91,17 +93,23 @@ class PumpBank:
             head=jnp.int32(0),
         )
 
-    def limit(self, command, metric=None):
+    def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
         """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for "boxqp", or None."""
         if self.saturation == "boxqp":
             return allocate(command, metric, self.low, self.high)
         return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
 
-    def step(self, state, command, metric, dt):
+    def step(
+        self,
+        state: ActuatorState,
+        command: Sequence,
+        metric: tuple | None,
+        dt: Any,
+    ) -> tuple[tuple, ActuatorState]:
         """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then `deliver`."""
         return self.deliver(state, self.limit(command, metric), dt)
 
-    def deliver(self, state, u, dt):
+    def deliver(self, state: ActuatorState, u: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
         """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead zone, lag, delay."""
         if self.dead_zone is not None and self.dead_zone_kind != "offset":
             u, state = self._dead_zone(state, u, dt)
@@ -127,7 +135,7 @@ class PumpBank:
             return u
         return tuple(at_least(v, self.dead_zone[i]) for i, v in enumerate(u))
 
-    def driving(self, u):
+    def driving(self, u: tuple) -> tuple:
         """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead zone, else u itself."""
         if self.dead_zone is None or self.dead_zone_kind != "offset":
             return u

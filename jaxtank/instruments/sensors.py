@@ -1,8 +1,11 @@
 """What the computer sees of the levels."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxtank.core.clock import PIECE
 from jaxtank.core.errors import InputError
@@ -35,7 +38,7 @@ class LevelSensor:
         default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
     )
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
-    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain")
+    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain", default=None)
     full_scale: np.ndarray = leaf(
         "volt",
         "range of the ADC",
@@ -45,7 +48,12 @@ class LevelSensor:
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
-    def draw(self, key, samples, piece=None):
+    def draw(
+        self,
+        key: jax.Array | None,
+        samples: int,
+        piece: ArrayLike | None = None,
+    ) -> tuple | None:
         """(samples,) standard normal deviates per tank, drawn before the loop; None without a key. piece: the number of a long run's piece,
         whose samples they are; each has a key of its own, and the run's deviates are those of its pieces, end to end."""
         if key is None:
@@ -63,7 +71,7 @@ class LevelSensor:
             deviates = jnp.concatenate([jnp.moveaxis(pieces, 1, 0).reshape(tanks, -1), last], axis=1)
         return tuple(deviates[i] for i in range(tanks))
 
-    def read(self, x, xi):
+    def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
         """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or None."""
         y = x if self.offset is None else tuple(h + self.offset[i] for i, h in enumerate(x))
         y = y if xi is None else tuple(y[i] + self.noise[i] * xi[i] for i in range(len(x)))

@@ -1,5 +1,7 @@
 """Interoperability: a python-control system of any rig, the columns of a run for pandas or xarray."""
 
+from typing import Any
+
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium, linearise
@@ -43,7 +45,7 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
             raise InputError(f"to_control: setpoints = {setpoints!r}: must be {len(plant.outputs)} levels [{plant.units[0]}]")
         levels, inputs = equilibrium(plant, setpoints)
     for name, value, size in (("levels", levels, plant.tanks), ("inputs", inputs, plant.pumps)):
-        if np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
+        if value is None or np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")
     A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
     return control.ss(
@@ -70,7 +72,7 @@ FIELDS = (
 """Columns of a run: (name, field of `Trajectory`, unit)."""
 
 
-def columns(run, units=("cm", "V"), dimension=None):
+def columns(run, units=("cm", "V"), dimension=None) -> dict[str, Any]:
     """Return the columns of a Trajectory, for pandas or xarray.
 
     Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and what was lost over

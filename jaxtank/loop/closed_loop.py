@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import warnings
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -38,12 +39,12 @@ class ClosedLoop:
     x0: np.ndarray = leaf("cm", "(n,) levels at t = 0", low=0.0)
 
     @property
-    def units(self):
+    def units(self) -> tuple[str, str]:
         """(length, pump input) of the rig."""
         return self.plant.units
 
 
-def inputs(loop, clock, names, key, piece=None, samples=None):
+def inputs(loop, clock, names, key, piece=None, samples=0):
     """The samples of references, disturbances, noise and windows; of a long run's `piece`, a number, its `samples` alone."""
     if piece is not None:
         clock = Piece(first=piece * PIECE, samples=samples, dt=clock.dt)
@@ -54,7 +55,7 @@ def inputs(loop, clock, names, key, piece=None, samples=None):
         if not hasattr(loop.reference, "windows"):
             raise InputError("overshoot, rise and settling need a reference that changes (signals.Ramps)")
         window = loop.reference.windows(clock)
-    since = loop.disturbance.since(clock) if hasattr(loop.disturbance, "since") else None
+    since = cast(Any, loop.disturbance).since(clock) if hasattr(loop.disturbance, "since") else None
     if since is None and ms.wants_pours(names):
         raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
     if since is not None and window is not None:

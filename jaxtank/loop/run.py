@@ -7,10 +7,13 @@ derivatives of the measures along with the run. All are pure: jit, vmap, grad an
 
 import functools
 import math
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
 from jaxtank.core.clock import PIECE, Clock, is_pointwise
@@ -24,7 +27,12 @@ from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
 
 
-def simulate(loop, clock, key=None, save_every=1):
+def simulate(
+    loop: ClosedLoop,
+    clock: Clock,
+    key: jax.Array | None = None,
+    save_every: int = 1,
+) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
 
     loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a Trajectory.
@@ -38,7 +46,12 @@ def simulate(loop, clock, key=None, save_every=1):
     return trajectory
 
 
-def evaluate(loop, clock, measures, key=None):
+def evaluate(
+    loop: ClosedLoop,
+    clock: Clock,
+    measures: Sequence[str],
+    key: jax.Array | None = None,
+) -> dict[str, jax.Array]:
     """Run the loop and keep only running measures.
 
     measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or None; returns {name: scalar, or array with one
@@ -68,7 +81,14 @@ def evaluate_for_reverse(loop, clock, measures, key=None):
     return evaluate_compiled(loop, clock, names, key, True)[0]
 
 
-def sensitivities(loop, clock, measures, values, key=None, squares=None):
+def sensitivities(
+    loop: ClosedLoop,
+    clock: Clock,
+    measures: Sequence[str],
+    values: Mapping[str, ArrayLike],
+    key: jax.Array | None = None,
+    squares: Mapping[str, float] | None = None,
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
     """Measures, their exact derivatives, and a Gauss-Newton matrix, in one run.
 
     values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth
@@ -162,7 +182,7 @@ def simulate_compiled(loop, clock, key, save_every):
 
 def _report_broken(broken, loop, clock, key):
     """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
-    if isinstance(broken, jax.core.Tracer) or np.ndim(broken) or not broken:
+    if isinstance(broken, Tracer) or np.ndim(broken) or not broken:
         return
     loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same
     run = simulate_compiled(loop, clock, key, 1)[0]

@@ -16,6 +16,7 @@ that a pipe has made equal still oscillate.
 import functools
 import math
 import warnings
+from typing import Any, cast
 
 import numpy as np
 
@@ -26,7 +27,7 @@ LIMITS = {"rk4": 2.785, "midpoint": 2.0}
 SEEN = 0.01  # share of the levels that a run is about up to which one may be thrown without a word
 
 
-def film_rates(plant, orifices=1.5, pipes=2.0):
+def film_rates(plant, orifices=1.5, pipes=2.0) -> Any:
     """Return (n,) lambda of each tank [1/s], with these slopes of the film of its orifices and pipes; None of a plant of another kind, or
     one whose leaves are traced."""
     try:
@@ -104,7 +105,7 @@ def check_run(loop, clock, run):
         return
     least = _least_seen(loop, np.asarray(run.x))
     area, gain, dt = np.asarray(loop.plant.area), np.array(loop.plant.pump_gain, dtype=float), clock.dt
-    for k, (name, _, _) in enumerate(loop.faults.windows if loop.faults else ()):
+    for k, (name, _, _) in enumerate(cast(Any, loop.faults.windows if loop.faults else ())):
         field, (entry,) = split_index(name)
         if field == "pump_gain":
             gain[entry] = max(gain[entry], gain[entry] * loop.faults.factor[k] + loop.faults.extra[k])
@@ -131,7 +132,7 @@ def _seen(loop, clock):
     return [] if least is None else [one for one in found if one[1] > least[one[0]]]
 
 
-def _least_seen(loop, x=0.0):
+def _least_seen(loop, x: Any = 0.0) -> Any:
     """(n,) heights from which a throw shows: a share of the rim, or of the highest level of start, setpoint and the run's levels `x` where that
     is lower, for a rim may be a limit far above all that happens. Of a run from empty tanks to nowhere, of the rim. None of traced levels."""
     plant = loop.plant

@@ -2,14 +2,17 @@
 
 import dataclasses
 import re
+from typing import Any, cast
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
-from jaxtank.core.clock import check_clock
+from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
 from jaxtank.core.tree import check_leaves, is_component
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
@@ -28,14 +31,14 @@ def _check(tree, prefix, sizes, batch):
         sizes = _sizes(tree.plant)
     if isinstance(tree, Plant):
         sizes = _sizes(tree)
-    for field in dataclasses.fields(tree):
+    for field in dataclasses.fields(cast(Any, tree)):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
             _check(value, f"{name}.", sizes, batch)
         elif field.metadata.get("kind") == "leaf" and value is not None:
             said = _SAID.match(field.metadata.get("doc") or "")
             wanted = said and _shape(said.group(1), sizes)
-            if wanted is not None and np.shape(value) not in (wanted, batch + wanted):
+            if said and wanted is not None and np.shape(value) not in (wanted, batch + wanted):
                 raise InputError(f"{name} has shape {np.shape(value)}: must be {wanted}, ({said.group(1)})")
 
 
@@ -55,7 +58,7 @@ def _shape(said, sizes):
     return tuple(found)
 
 
-def check(loop, clock, key=None):
+def check(loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None = None) -> None:
     """Raise InputError for a loop or clock that cannot be run: values out of range, wrong shapes, a reference the law cannot serve.
 
     Only concrete leaves are looked at, so that it costs nothing inside a trace.
@@ -105,14 +108,14 @@ def check(loop, clock, key=None):
 
 def _plants(tree, prefix=""):
     """(dotted name, plant) of every plant below `tree`: that of the loop, and the models of law and observer."""
-    for field in dataclasses.fields(tree):
+    for field in dataclasses.fields(cast(Any, tree)):
         value = getattr(tree, field.name)
         if is_component(value):
             yield from [(f"{prefix}{field.name}", value)] if isinstance(value, Plant) else _plants(value, f"{prefix}{field.name}.")
 
 
 def _traced(*trees):
-    return any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(trees))
+    return any(isinstance(v, Tracer) for v in jax.tree.leaves(trees))
 
 
 def _check_order(actuator, lower, upper, equal=False):

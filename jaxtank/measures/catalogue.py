@@ -5,7 +5,7 @@ scalars. Only the accumulators that the requested measures need are carried.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -402,10 +402,14 @@ def residuals(run, states, sample, window, rest, squares):
     return tuple(v for m, _ in squares for a in [MEASURES[m].residual] for v in RESIDUALS[a](run, states[a], sample, window, rest))
 
 
+def _scale(measure) -> Any:
+    return MEASURES[measure].scale  # of a measure that is a sum of squares: never None
+
+
 def residual_weights(run, squares):
     """What the square of each of `residuals` counts in the weighted sum of the measures."""
     counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
-    return tuple(w * MEASURES[m].scale(run) for m, w in squares for _ in range(counts[MEASURES[m].per]))
+    return tuple(w * _scale(m)(run) for m, w in squares for _ in range(counts[MEASURES[m].per]))
 
 
 def read(run, states, names):

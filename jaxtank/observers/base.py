@@ -1,30 +1,33 @@
 """What every observer is to the loop, and the shortest one."""
 
 import abc
+from collections.abc import Sequence
+from typing import Any
 
-from jaxtank.core.records import Estimate
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component
+from jaxtank.plants.base import Plant
 
 
 class Observer(abc.ABC):
     """Turns measurements into an estimate: corrected by what is measured, carried on by what is applied. State is handed in and out."""
 
-    def init(self, x0):
+    def init(self, x0: tuple) -> Any:
         """State before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()
 
     @abc.abstractmethod
-    def step(self, state, tick, y):
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         """(Estimate, new state) for measured levels y (n) [cm] at `tick`."""
 
-    def predict(self, state, tick, command, applied):
+    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         """State at the next sample, for the law's command (m) and what the pumps were told after their limits, `applied` (m) [V].
 
         `applied` is known to the computer; dead zone, lag and delay of the pumps are not in it.
         """
         return state
 
-    def check(self, plant):  # noqa: B027  (an observer with nothing to check need not say so)
+    def check(self, plant: Plant) -> None:  # noqa: B027  (there may be nothing to check)
         """Raise InputError if the observer does not fit this plant."""
 
 
@@ -32,5 +35,5 @@ class Observer(abc.ABC):
 class Direct(Observer):
     """All levels are measured and taken as they are: x_hat = y (gouta2015, Fig. 3 and 4)."""
 
-    def step(self, state, tick, y):
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         return Estimate(x=y), state

@@ -1,8 +1,11 @@
 """The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25)."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Estimate
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
@@ -26,19 +29,19 @@ class DisturbanceObserver(Observer):
     """
 
     model: Plant
-    l: object = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
+    l: Any = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
     fed: str = static("-", "input that the observer is told", choices=FED, default="applied")
     before_compensation: bool = static("-", "as printed: told the input before eq. (28)", choices=(False, True), default=False)
 
-    def init(self, x0):
+    def init(self, x0: tuple) -> Any:
         return tuple(0.0 * h for h in x0), x0
 
-    def step(self, state, tick, y):
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         held, expected = state
         d = tuple(held[i] + self.l[i] * (y[i] - expected[i]) for i in range(len(y)))
         return Estimate(x=y, d=d), (d, y)
 
-    def predict(self, state, tick, command, applied):
+    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         d, y = state
         f, c2 = drift(self.model, y), authority(self.model)
         u = applied if self.fed == "applied" else command
@@ -46,7 +49,7 @@ class DisturbanceObserver(Observer):
         held = tuple((1.0 - self.l[i] * tick.dt) * d[i] for i in range(len(y)))
         return held, tuple(y[i] + tick.dt * rate[i] for i in range(len(y)))
 
-    def check(self, plant):
+    def check(self, plant: Plant) -> None:
         check_own_pumps(self.model)
         if self.model.tanks != plant.tanks:
             raise InputError(f"observer.model has {self.model.tanks} tanks, the plant {plant.tanks}")

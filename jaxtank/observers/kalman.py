@@ -1,6 +1,7 @@
 """Steady-state Kalman filter about an operating point."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
 from jaxtank.analysis.steady_state import linearise
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Estimate
+from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
@@ -19,7 +20,7 @@ from jaxtank.plants.runge_kutta import advance
 class Belief(NamedTuple):
     """What the filter carries on."""
 
-    x: tuple  # (n) levels [cm]
+    x: Sequence  # (n) levels [cm]
     P: tuple  # (n) rows of n covariances [cm^2]
 
 
@@ -40,17 +41,19 @@ class ExtendedKalman(Observer):
         "cm^2", "(n,) variance of each sensor's noise (r); of unmeasured tanks not used", low=0.0, strict=True
     )
     spread: np.ndarray = leaf("cm^2", "(n,) variance of the levels believed at t = 0", low=0.0)
-    start: np.ndarray | None = leaf("cm", "(n,) levels believed at t = 0; absent: the true ones", low=0.0, like="spread")
+    start: np.ndarray | None = leaf(
+        "cm", "(n,) levels believed at t = 0; absent: the true ones", low=0.0, like="spread", default=None
+    )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
     integrator: str = static(doc="how the model is carried on", choices=("rk4", "midpoint"), default="rk4")
 
-    def init(self, x0):
+    def init(self, x0: tuple) -> Any:
         n = range(len(x0))
         x = x0 if self.start is None else tuple(self.start[i] + 0.0 * x0[i] for i in n)
         return Belief(x=x, P=tuple(tuple(self.spread[i] + 0.0 * x0[i] if i == j else 0.0 * x0[i] for j in n) for i in n))
 
-    def step(self, state, tick, y):
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         x, P = state
         n = range(len(x))
         for i in self.measured:
@@ -59,7 +62,7 @@ class ExtendedKalman(Observer):
             P = _symmetric([[P[j][k] - K[j] * P[i][k] for k in n] for j in n])
         return Estimate(x=x), Belief(x, P)
 
-    def predict(self, state, tick, command, applied):
+    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         n = range(len(state.x))
 
         def onward(x):
@@ -71,7 +74,7 @@ class ExtendedKalman(Observer):
         P = [[sum(FP[i][k] * columns[k][j] for k in n) + (self.process[i] * tick.dt if i == j else 0.0) for j in n] for i in n]
         return Belief(onward(state.x), _symmetric(P))
 
-    def check(self, plant):
+    def check(self, plant: Plant) -> None:
         check_measured(self, plant)
 
 
@@ -101,7 +104,7 @@ class Kalman(Observer):
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
 
-    def design(self, dt):
+    def design(self, dt: float) -> tuple:
         """(Ad (n, n), Bd (n, m), drift (n,) [cm], L (n, measured)) for sampling every dt [s]."""
         A, B, _ = linearise(self.model, self.levels, self.inputs)
         rest = jnp.stack(self.model.derivative(0.0, tuple(jnp.asarray(self.levels)), tuple(jnp.asarray(self.inputs)), None))
@@ -111,22 +114,22 @@ class Kalman(Observer):
         P = discrete_riccati(Ad.T, C.T, jnp.diag(jnp.asarray(self.process) * dt), R)
         return Ad, held[:, :-1], held[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
 
-    def init(self, x0):
+    def init(self, x0: tuple) -> Any:
         return x0
 
-    def step(self, state, tick, y):
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         L = self.design(tick.dt)[3]
         innovation = [y[i] - state[i] for i in self.measured]
         x = tuple(state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(len(state)))
         return Estimate(x=x), x
 
-    def predict(self, state, tick, command, applied):
+    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         Ad, Bd, drift, _ = self.design(tick.dt)
         n, m = range(len(state)), range(len(applied))
         away, more = [state[i] - self.levels[i] for i in n], [applied[j] - self.inputs[j] for j in m]
         return tuple(self.levels[i] + drift[i] + sum(Ad[i, j] * away[j] for j in n) + sum(Bd[i, j] * more[j] for j in m) for i in n)
 
-    def check(self, plant):
+    def check(self, plant: Plant) -> None:
         check_measured(self, plant)
         if np.shape(self.inputs) != (plant.pumps,):
             raise InputError(f"observer.inputs has shape {np.shape(self.inputs)}: must be ({plant.pumps},), one per pump")

@@ -1,8 +1,12 @@
 """What every plant is to the loop, to observers and to the laws that carry one as their model."""
 
 import abc
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from jaxtank.core.units import DEFAULT
 
@@ -10,52 +14,57 @@ from jaxtank.core.units import DEFAULT
 class Plant(abc.ABC):
     """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of scalars.
 
-    Beside what follows a plant has two fields: `outputs`, the tanks (counted from 0) whose levels are controlled, and `rim`, (n,) the height
-    of each tank [cm]. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
+    A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
     """
 
-    units = DEFAULT
+    outputs: tuple[int, ...]
+    """Tanks, counted from 0, whose levels are controlled."""
+
+    rim: Any
+    """(n,) height of each tank [cm]."""
+
+    units: tuple[str, str] = DEFAULT
     """(length, pump input): the units that this plant counts in."""
 
-    overflow = False
+    overflow: bool = False
     """True where a level stops at its rim and what would rise past it is lost."""
 
-    bottom = False
+    bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
 
     @property
     @abc.abstractmethod
-    def tanks(self):
+    def tanks(self) -> int:
         """Number of levels n [-]."""
 
     @property
     @abc.abstractmethod
-    def pumps(self):
+    def pumps(self) -> int:
         """Number of inputs m [-]."""
 
     @abc.abstractmethod
-    def derivative(self, t, x, u, d):
+    def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
         """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or None; returns (n) [cm/s]."""
 
-    def limited(self, step):
+    def limited(self, step: ArrayLike) -> Callable:
         """Return the vector field of one integration step of `step` [s]: `derivative`, unless a plant
         limits what may leave a tank in that time."""
         return self.derivative
 
-    def shortfall(self, x):
+    def shortfall(self, x: Sequence) -> tuple:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
         tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
         return (0.0,) * len(x)
 
-    def rates(self, x, u):
+    def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """`derivative` of arrays x (n) and u (m), without time and inflows, as an array (n); a plant of many tanks may have one that is
         compiled in less time."""
         return jnp.stack(self.derivative(0.0, tuple(x), tuple(u), None))
 
-    def spill(self, x):
+    def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
         """(levels held at their rims, volume lost over each rim [cm^3]); unchanged and zeros where rims are not physics."""
         return x, (0.0,) * len(x)
 
-    def output(self, x):
+    def output(self, x: Sequence) -> tuple:
         """The levels that are controlled: those of the tanks in `outputs`, in that order."""
         return tuple(x[i] for i in self.outputs)

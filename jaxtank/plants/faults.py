@@ -1,13 +1,16 @@
 """What breaks while a rig runs: parameters of the plant that change for a while."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import pointwise, sample_times
+from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, get_value, leaf, number, split_index, static
+from jaxtank.plants.base import Plant
 
 
 @component
@@ -23,20 +26,20 @@ class Faults:
     windows: tuple = static(doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault')
 
     @pointwise
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple:
         """Tuple of arrays (samples,), one per fault: 1 from its start until before its end, else 0."""
         t = sample_times(clock)
         half = 1e-7 * clock.dt
         return tuple(jnp.where((t >= start - half) & (t < end - half), 1.0, 0.0) for _, start, end in self.windows)
 
-    def apply(self, plant, active):
+    def apply(self, plant: Plant, active: Sequence) -> Plant:
         """The plant of a sample; active: one number per fault, 1 while it lasts."""
         changed = {}
         for k, (name, _, _) in enumerate(self.windows):
             field, (index,) = split_index(name)
             entries = changed.setdefault(field, [getattr(plant, field)[i] for i in range(np.shape(getattr(plant, field))[0])])
             entries[index] = entries[index] * (1.0 + (self.factor[k] - 1.0) * active[k]) + self.extra[k] * active[k]
-        return dataclasses.replace(plant, **{field: tuple(entries) for field, entries in changed.items()})
+        return dataclasses.replace(cast(Any, plant), **{field: tuple(entries) for field, entries in changed.items()})
 
 
 def faults(plant, entries):

@@ -2,10 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
@@ -53,11 +57,11 @@ class TankNetwork(Plant):
     knee: float = static("cm", "level, or difference of levels, below which flow turns laminar", low=1e-15)
 
     @property
-    def tanks(self):
+    def tanks(self) -> int:
         return np.shape(self.rim)[-1]
 
     @property
-    def pumps(self):
+    def pumps(self) -> int:
         return len(self.feeds)
 
     def _shares(self):
@@ -70,10 +74,10 @@ class TankNetwork(Plant):
                 shares += [(j, first, self.pump_gain[j] * self.split[j]), (j, second, self.pump_gain[j] * (1.0 - self.split[j]))]
         return shares
 
-    def derivative(self, t, x, u, d):
+    def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
         return self._flows(t, x, u, d)
 
-    def limited(self, step):
+    def limited(self, step: ArrayLike) -> Callable:
         """Return the vector field of one integration step of `step` [s]: `derivative`; with `bottom`,
         no tank gives more than it holds.
 
@@ -115,7 +119,7 @@ class TankNetwork(Plant):
         rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
         for j, tank, gain in self._shares():
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
-        supply = None if step is None else self._supply(step)
+        supply = () if step is None else self._supply(step)
         q = [root(h, self.knee) if step is None else limited_root(h, self.knee, supply[i]) for i, h in enumerate(x)]
         held = x if step is None else [at_least(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
@@ -128,7 +132,7 @@ class TankNetwork(Plant):
             rate[other] = rate[other] + (self.pipe[k] * w / self.area[other]) * s
         return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
 
-    def rates(self, x, u):
+    def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
         if type(self).derivative is not TankNetwork.derivative:
             return super().rates(x, u)
         x, u, w, orifice, pipe = (
@@ -146,17 +150,17 @@ class TankNetwork(Plant):
         pump, tank, gain = (list(column) for column in zip(*self._shares()))
         return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(self.area)
 
-    def net_inflow(self, x, u, d):
+    def net_inflow(self, x: Sequence, u: Sequence, d: Sequence | None) -> Any:
         """Pumped and disturbing inflow less what leaves for the basin [cm^3/s]: the rate of change of the stored volume."""
         inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
         return inflow - sum(self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks))
 
-    def shortfall(self, x):
+    def shortfall(self, x: Sequence) -> tuple:
         if not self.bottom:
             return super().shortfall(x)
         return tuple(self.area[i] * (at_least(h, 0.0) - h) for i, h in enumerate(x))
 
-    def spill(self, x):
+    def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
         lost = [0.0] * self.tanks
         if self.bottom:
             x = tuple(at_least(h, 0.0) for h in x)
@@ -185,8 +189,8 @@ SURPLUS = 1e-6
 def check_caught(plant, name="plant"):
     """Raise InputError where the spills of one tank catch more than passes its rim: volume would come from nowhere. `plant` is called
     `name`; one whose shares are traced or of a batch, or that has none, is passed over."""
-    shares = getattr(plant, "caught", None)
-    if isinstance(shares, jax.core.Tracer) or np.ndim(shares) != 1:
+    shares: Any = getattr(plant, "caught", None)
+    if isinstance(shares, Tracer) or np.ndim(shares) != 1:
         return
     for tank in dict.fromkeys(source for source, _ in plant.spills):
         own = [float(share) for share, (source, _) in zip(shares, plant.spills) if source == tank]
@@ -212,25 +216,25 @@ def _downwards(spills, tanks):
 
 def network(
     *,
-    area,
-    drain,
-    pump_gain,
-    feeds,
-    rim,
-    links=(),
-    orifice=(),
-    pipes=(),
-    pipe=(),
-    spills=(),
-    caught=(),
-    split=None,
-    gravity=None,
-    outputs=(0,),
-    overflow=False,
-    bottom=False,
-    units=DEFAULT,
-    knee=None,
-):
+    area: ArrayLike,
+    drain: ArrayLike,
+    pump_gain: ArrayLike,
+    feeds: Sequence,
+    rim: ArrayLike,
+    links: Sequence = (),
+    orifice: ArrayLike = (),
+    pipes: Sequence = (),
+    pipe: ArrayLike = (),
+    spills: Sequence = (),
+    caught: ArrayLike = (),
+    split: ArrayLike | None = None,
+    gravity: float | None = None,
+    outputs: Sequence[int] = (0,),
+    overflow: bool = False,
+    bottom: bool = False,
+    units: tuple[str, str] = DEFAULT,
+    knee: float | None = None,
+) -> TankNetwork:
     """A `TankNetwork` from plain numbers; scalars fill. Raises InputError where shapes and topology do not agree.
 
     area, drain, rim: (n,) or a number; pump_gain, split: (m,) or a number; feeds: m pairs (first tank, second tank or None);

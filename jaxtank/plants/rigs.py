@@ -1,8 +1,13 @@
 """The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws know them."""
 
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import ArrayLike
+
 from jaxtank.core.errors import InputError
 from jaxtank.plants.hydraulics import disc
-from jaxtank.plants.network import network
+from jaxtank.plants.network import TankNetwork, network
 
 STATE_COUPLED_LINKS = ((2, 0), (2, 1), (3, 0), (3, 1))  # tank 3 to 1, 3 to 2, 4 to 1, 4 to 2 in the paper's count from 1
 STATE_COUPLED_FEEDS = ((2, None), (3, None))
@@ -11,7 +16,7 @@ QUADRUPLE_FEEDS = ((0, 3), (1, 2))  # pump 1 to tanks 1 and 4, pump 2 to tanks 2
 COUPLED_PIPES = ((0, 1),)
 
 
-def state_coupled_four_tank(area):
+def state_coupled_four_tank(area: float) -> TankNetwork:
     """The state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1): pumps fill the upper tanks 3 and 4, each of which
     pours into both lower tanks 1 and 2, whose levels are controlled.
 
@@ -31,7 +36,15 @@ def state_coupled_four_tank(area):
     )
 
 
-def quadruple_tank(*, area, outlet, pump_gain, split, rim, gravity=981.0):
+def quadruple_tank(
+    *,
+    area: ArrayLike,
+    outlet: Sequence[float],
+    pump_gain: ArrayLike,
+    split: ArrayLike,
+    rim: ArrayLike,
+    gravity: float = 981.0,
+) -> TankNetwork:
     """Johansson's quadruple tank: tank 3 pours into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4, pump 2 tanks 2 and 3 (mirakhorli eq. 2).
 
     area, outlet: (4,) cross-sections A and outlet areas a [cm^2]; pump_gain: (2,) k [cm^3/(s V)]; split: (2,) share gamma of each
@@ -70,7 +83,17 @@ def johansson(phase):
     return quadruple_tank(area=area, outlet=outlet, pump_gain=pump_gain, split=split, rim=20.0), voltages
 
 
-def coupled_tanks(*, area, drain, pipe, pump_gain, rim, outputs, feeds, **more):
+def coupled_tanks(
+    *,
+    area: ArrayLike,
+    drain: ArrayLike,
+    pipe: float,
+    pump_gain: ArrayLike,
+    rim: ArrayLike,
+    outputs: Sequence[int],
+    feeds: Sequence,
+    **more: Any,
+) -> TankNetwork:
     """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none): gouta2022, calofir, khalid.
 
     area, drain, rim: (2,) or a number; pipe: effective area; feeds: the tank that each pump fills; more: as in `network`.

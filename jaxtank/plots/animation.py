@@ -35,7 +35,7 @@ def animate(loop, trajectory, path, seconds=6):
     with tempfile.TemporaryDirectory() as folder, styled():
         film = _film(loop, trajectory, seconds)
         film.save(Path(folder) / "run.gif", writer=PillowWriter(fps=RATE), dpi=80)
-        plt.close(film._fig)
+        plt.close(film._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
         write_atomic(path, (Path(folder) / "run.gif").read_bytes())
     return path
 
@@ -48,7 +48,7 @@ def to_html(loop, trajectory, seconds=6):
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
         film = _film(loop, trajectory, seconds)
         page = film.to_jshtml(fps=RATE)
-        plt.close(film._fig)
+        plt.close(film._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
     page = re.sub(r"<link\b[^>]*>\s*", "", page)  # matplotlib takes the pictures on its buttons from the network
     for name, sign in SIGNS.items():
         page = re.sub(rf'<i class="fa [^"]*{name}"></i>', sign, page)

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import textwrap
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -28,7 +29,7 @@ COLUMNS, SHOWN = 4, 16  # panels side by side; tanks between pumps and outputs t
 PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
 """One colour for each pump and its pipework, of the same colour-blind safe set."""
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.grid": True,
@@ -52,7 +53,7 @@ def styled(more=None):
     drawn inside it, that takes back the interactive mode which the notebook's backend has just switched on, and no later figure is shown.
     """
     settings = STYLE | (more or {})
-    before = {name: plt.rcParams[name] for name in settings}
+    before: dict[Any, Any] = {name: plt.rcParams[name] for name in settings}
     plt.rcParams.update(settings)
     try:
         yield
@@ -125,7 +126,7 @@ def responses(loop, trajectories, title="", limits=None):
     if len(others) > SHOWN:
         near = {i: max(float(np.max(run.x[:, i])) for run in trajectories.values()) / _at(loop.plant.rim, i) for i in others}
         title += f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
-        others = sorted(sorted(others, key=near.get)[-SHOWN:])
+        others = sorted(sorted(others, key=near.__getitem__)[-SHOWN:])
     length, drive = loop.units
     rows = [
         [
@@ -319,7 +320,7 @@ def _whiskers(ax, y, values, ends):
     ax.errorbar(values, y, xerr=[low, high], fmt="none", ecolor=REFERENCE, elinewidth=1.0, capsize=2.5)
 
 
-def _at(array, i):
+def _at(array, i) -> Any:
     return None if array is None else float(np.asarray(array)[i])
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
-from matplotlib.patheffects import withStroke
+from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.plots.layout import place
 from jaxtank.plots.responses import AFTER, GLASS, PUMPS, REFERENCE, WATER
@@ -10,7 +10,7 @@ from jaxtank.plots.responses import AFTER, GLASS, PUMPS, REFERENCE, WATER
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
 """Water in free fall."""
 
-HALO = [withStroke(linewidth=2.2, foreground="white")]
+HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 """Around words that a water line may pass behind."""
 
 

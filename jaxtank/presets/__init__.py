@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import importlib
 import pkgutil
+from typing import cast
 
 from jaxtank.case import Case, Free, Mirror, Scenario
 from jaxtank.core.errors import InputError, unknown
@@ -18,14 +19,14 @@ from jaxtank.presets.paper import Claim, Preset, Published
 PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "paper" and not m.name.startswith("_")))
 
 
-def load(paper):
+def load(paper: str) -> Preset:
     """The Preset of `paper`, one of PAPERS; the Case of "paper/case", as `find`. Raises InputError for another name.
 
     >>> load("gouta2015/ngpc") is find("gouta2015/ngpc")
     True
     """
     if isinstance(paper, str) and "/" in paper:
-        return find(paper)
+        return cast("Preset", find(paper))
     if paper not in PAPERS:
         raise unknown("paper", str(paper), PAPERS)
     return _load(paper)
@@ -46,12 +47,12 @@ class Cases(dict):
         raise unknown("case", str(name), self)
 
 
-def names():
+def names() -> list[str]:
     """Every case as "paper/case", in the order of the papers."""
     return [f"{paper}/{case}" for paper in PAPERS for case in load(paper).cases]
 
 
-def find(name):
+def find(name: str) -> Case:
     """The Case of "paper/case". Raises InputError for an unknown one, with the nearest names."""
     if not isinstance(name, str):
         raise InputError(f"case {name!r}: must be a text, as 'gouta2015/ngpc'")

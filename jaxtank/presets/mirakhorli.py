@@ -181,8 +181,7 @@ def rehearsal():
     """The runs that tuning is judged by (notes S10): the case's own start, and from rest at the
     setpoint with one number of the plant off; 0.05 cm of noise on all levels, where the case has
     none. Without noise and travel the gains run away."""
-    rest = dict.fromkeys(("x0", "actuator.initial", "reference.initial"), "steady")
-    rest["clock.duration"] = "x0.75"
+    rest = {**dict.fromkeys(("x0", "actuator.initial", "reference.initial"), "steady"), "clock.duration": "x0.75"}
     off = {
         "pump 1 +30 %": {"plant.pump_gain[0]": "x1.3"},
         "pump 1 -20 %": {"plant.pump_gain[0]": "x0.8"},
@@ -232,7 +231,7 @@ def response(trajectory, output=0):
     outside = np.flatnonzero(np.abs(h - r) > 0.05 * r)
     return {
         "overshoot": float(100.0 * (h.max() - r) / r),
-        "rise": None if high is None else high - low,
+        "rise": None if high is None or low is None else high - low,
         "arrival": first(r),
         "settling": None if outside.size and outside[-1] == len(t) - 1 else float(t[outside[-1]]) if outside.size else 0.0,
         "mean_square": float(np.mean((h - r) ** 2) / r**2),

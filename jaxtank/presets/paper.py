@@ -49,6 +49,6 @@ class Preset:
     departures: tuple
 
     @property
-    def notes(self):
+    def notes(self) -> Path:
         """Path of the derivation: equations as used, errata, assumptions, reference values. Messages name its sections."""
         return Path(__file__).with_name("notes") / f"{self.paper}.md"

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import re
+from typing import Any
 
 import numpy as np
 
@@ -245,7 +246,7 @@ def keys_of(part, known):
     kind = kind_of(part, known)
     if kind is None:
         raise InputError(f"its {type(part).__name__} has no name in a rig file")
-    found = [("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)]
+    found: list[tuple[str, Any, Any]] = [("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)]
     if isinstance(part, controllers.OpenLoop):
         if not isinstance(part.signal, Ramps):
             raise InputError("its OpenLoop plays a signal that no rig file describes")

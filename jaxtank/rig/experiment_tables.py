@@ -46,4 +46,4 @@ def check_covariance(loop, table):
         raise InputError(
             f"covariance.matrix: must be a symmetric, positive definite {len(names)} by {len(names)} matrix of finite numbers"
         )
-    return tuple(names), tuple(tuple(map(float, row)) for row in rows)
+    return tuple(names), tuple(tuple(float(v) for v in row) for row in np.atleast_2d(rows))

@@ -3,10 +3,14 @@
 import dataclasses
 import re
 import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank import presets
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.tree import shortened
@@ -77,17 +81,17 @@ KINDS = {
 }
 
 
-def open_case(name):
+def open_case(name: str) -> Case:
     """The Case of "paper/case", or of a rig file where `name` ends in .toml, checked."""
     return load(name) if name.endswith(".toml") else presets.find(name)
 
 
-def load(path):
+def load(path: str | Path) -> Case:
     """The Case of a rig file. Raises InputError, naming the file, for anything in it that is unknown, misshapen or out of range."""
     return loads(read_text(path, "rig file"), f"rig file {str(path)!r}")
 
 
-def loads(text, words="rig file"):
+def loads(text: str, words: str = "rig file") -> Case:
     """The Case of the text of a rig file, called `words` in errors."""
     try:
         check_keys(text)
@@ -111,7 +115,7 @@ def loads(text, words="rig file"):
         raise InputError(f"{words}: a value is nested too deeply") from None
 
 
-def from_table(table):
+def from_table(table: Mapping[str, Any]) -> Case:
     """The Case described by a table of the form of a rig file."""
     case = start_of(table)
     table = {**table, **{key: by_dotted_name(table[key], key) for key in ("values", "free", "uncertain") if key in table}}

@@ -1,5 +1,6 @@
 """How values are written in a rig file, and what may be said of them: numbers, ranges, units."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ class Key(NamedTuple):
 
     name: str
     value: Any
-    meta: dict = BARE
+    meta: Mapping[str, Any] = BARE
     on: bool = True
 
 
@@ -48,7 +49,7 @@ def keys_of(found, units, on=True):
 SMALL_INT = (int, np.integer)
 
 
-def toml(value):
+def toml(value: Any) -> str:
     """`value` as TOML: numbers to their last digit, texts escaped, lists and tuples as arrays."""
     if isinstance(value, (np.generic, np.ndarray)):
         value = value.tolist()

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
+from jaxtank.core.tree import describe, get_value, is_component, number, parameters, walk
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.rig import components, signals
@@ -148,8 +148,8 @@ def sections(case, have):
     add("[observer]", _observer(loop), f"Another observer than the preset's: {', '.join(components.OBSERVERS)}.")
     if signals.steps(loop.reference) is loop.reference and isinstance(loop.reference, Ramps) and not _refers(case):
         start = signals.Sine(
-            amplitude=np.float64(0.0),
-            offset=np.float64(0.0),
+            amplitude=number(0.0),
+            offset=number(0.0),
             period=seconds(0.1),
             zero=0.0,
             start=0.0,

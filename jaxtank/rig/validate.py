@@ -1,16 +1,19 @@
 """Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain, scenarios."""
 
 import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
-from jaxtank.case import Free, Scenario
-from jaxtank.core.clock import CLOCK_UNITS
+from jaxtank.case import Case, Free, Scenario
+from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import check_value, describe, get_value, is_component, shortened, split_index, walk
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures.catalogue import check_names, entries
 from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.rig import schedule
@@ -21,7 +24,7 @@ from jaxtank.signals.inflows import Pours
 from jaxtank.signals.setpoints import Ramps
 
 
-def doubts(case):
+def doubts(case: Case) -> list[str]:
     """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours after the end of the run, changes
     that overlap, levels and setpoints above the rim, pumps that start outside their limits, models
     that differ from the plant. (Steps that are too long: `step_length`.)"""
@@ -32,13 +35,13 @@ def doubts(case):
     _late(found, "changes of the reference", [t for t, _ in events], end)
     if isinstance(loop.disturbance, Pours):
         _late(found, "pours", [t for t, *_ in loop.disturbance.events], end)
-    over, early = {}, []
+    over, early, ramp = {}, [], 0.0 if reference is None else reference.ramp
     for t, i in events:
         early += [(i, t)] if t < over.get(i, 0.0) - 1e-7 * case.clock.dt else []
-        over[i] = t + reference.ramp
+        over[i] = t + ramp
     if early:
         found.append(
-            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {reference.ramp:g} s), the first "
+            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {ramp:g} s), the first "
             f"of output {early[0][0] + 1} at {early[0][1]:g} s: each starts from where that one has got to"
         )
     lost = "what is above it is lost at once" if loop.plant.overflow else "rims are limits here and not physics"
@@ -46,7 +49,9 @@ def doubts(case):
         if level > rim[i]:
             found.append(f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
     never = "a level cannot get there" if loop.plant.overflow else lost
-    for i, tank in enumerate(loop.plant.outputs if reference is not None else ()):
+    for i, tank in enumerate(loop.plant.outputs):
+        if reference is None:
+            break
         asked = [reference.initial[i], *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i)]
         if max(asked) > rim[tank]:
             found.append(
@@ -59,7 +64,7 @@ def doubts(case):
     return [*found, *model_doubts(case)]
 
 
-def model_doubts(case):
+def model_doubts(case: Case) -> list[str]:
     """Return a sentence for each parameter in a model of controller or observer that differs from
     the plant's by more than its uncertainty.
 
@@ -115,7 +120,7 @@ def _listed(value):
     return "[" + ", ".join(f"{v:.6g}" for v in value) + "]" if np.ndim(value) else f"{value:.6g}"
 
 
-def clock_doubts(clock):
+def clock_doubts(clock: Clock) -> list[str]:
     """Sentences on a clock: where the run does not end when it is asked to, for it is made of whole samples."""
     end = (clock.samples - 1) * clock.dt
     if abs(end - clock.duration) <= 1e-6 * clock.dt:
@@ -139,7 +144,7 @@ def _late(found, what, times, end):
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 
 
-def check(case):
+def check(case: Case) -> Case:
     """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
     lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
     if case.reachable and (why := unreachable(case)):
@@ -147,7 +152,7 @@ def check(case):
     return case
 
 
-def unreachable(case):
+def unreachable(case: Case) -> str | None:
     """Which plateau of the reference has no steady state on this plant, and why, in a sentence; None where all of them have one."""
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
@@ -159,7 +164,7 @@ def unreachable(case):
     return None
 
 
-def check_uncertain(loop, uncertain):
+def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str, float]:
     """`uncertain` as a dict, if every one is a parameter in use with a spread above 0 and below 1."""
     for name, share in uncertain.items():
         get_value(loop, name)
@@ -168,7 +173,12 @@ def check_uncertain(loop, uncertain):
     return {name: float(share) for name, share in uncertain.items()}
 
 
-def uncovered(loop, name, share, covered):
+def uncovered(
+    loop: ClosedLoop,
+    name: str,
+    share: float,
+    covered: Iterable[str],
+) -> dict[str, float]:
     """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry where that is part of an array; a
     share of nothing is left out."""
     if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
@@ -180,7 +190,7 @@ def uncovered(loop, name, share, covered):
     return {n: share for n in entries if n not in covered}
 
 
-def check_limits(loop, limits):
+def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
     """`limits` as a dict, if every one is a measure with a finite number, one for each of its entries, or "rim" for max_level."""
     check_names(limits)
     for measure, value in limits.items():
@@ -196,7 +206,7 @@ def check_limits(loop, limits):
     return dict(limits)
 
 
-def check_objective(objective):
+def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
     """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one of them above."""
     check_names(objective)
     for measure, weight in objective.items():
@@ -207,7 +217,7 @@ def check_objective(objective):
     return {measure: float(weight) for measure, weight in objective.items()}
 
 
-def check_free(loop, name, low, high, scale="log"):
+def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
     """The Free of a parameter, if it is a leaf in use and its range lies within what it allows."""
     if name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS:
         meta = {"kind": "static"}

@@ -2,13 +2,17 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import check_value, describe, get_value, shortened, split_index, walk, with_values
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import schedule
 from jaxtank.rig.schema import is_numeric, plain, static_value, unit
 
@@ -38,7 +42,7 @@ def by_dotted_name(table, where):
     return found
 
 
-def set_values(case, values):
+def set_values(case: Case, values: Mapping[str, Any]) -> Case:
     """A copy of `case` with leaves, static fields and clock fields set by dotted name.
 
     values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with the nearest), a value of the wrong
@@ -87,7 +91,7 @@ def with_models(loop, values):
     return {**plants, **{n: v for n, v in found.items() if n not in values}, **values}
 
 
-def set_scenario(case, values):
+def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
     """Return a copy of `case` with the values of a Scenario, which may be relative to the case.
 
     Parameters
@@ -119,12 +123,12 @@ def set_scenario(case, values):
             levels, inputs = equilibrium(case.loop.plant, setpoints)
         except EquilibriumError as error:
             raise EquilibriumError(f'{steady[0]} = "steady": {error}') from None
-        known = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
+        known: dict[str, Any] = dict(zip(STEADY, (levels.tolist(), inputs.tolist(), setpoints)))
         found |= {name: known[name] for name in steady}
     return set_values(case, found)
 
 
-def overridden(case, values):
+def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
     """Let values that were set in a case take the place of those of its scenarios.
 
     Parameters
@@ -151,12 +155,12 @@ def overridden(case, values):
     return case.replace(scenarios=tuple(scenarios)), replaced
 
 
-def overlap(one, other):
+def overlap(one: str, other: str) -> bool:
     """Whether two dotted names have an entry in common."""
     return one == other or split_index(one)[0] == other or one == split_index(other)[0]
 
 
-def is_change(value):
+def is_change(value: Any) -> bool:
     """Whether the value of a scenario is a factor or an offset on the case's own."""
     found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
     return found is not None and found["default"] is None
@@ -190,7 +194,7 @@ def _absolute(case, name, value):
 def _number_of(case, name):
     """The number or array that `name` is in a case, None where it is no number."""
     if name.startswith("clock."):
-        value = getattr(case.clock, name.removeprefix("clock."), None)
+        value: Any = getattr(case.clock, name.removeprefix("clock."), None)
     elif _meta(case, name)["kind"] == "leaf":
         return get_value(case.loop, name)
     else:
@@ -204,7 +208,7 @@ def _meta(case, name):
     return describe(case.loop, name)
 
 
-def set_and_schedule(case, values, table):
+def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
     """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What the case has by name is set before the
     schedule is made, which starts from it; what only the scheduled case has, as controller.values, after."""
     if table:
@@ -213,7 +217,7 @@ def set_and_schedule(case, values, table):
     return set_values(case, values)
 
 
-def has(loop, name):
+def has(loop: ClosedLoop, name: str) -> bool:
     """Whether a loop has the leaf `name`, an entry of it for "name[i]"."""
     try:
         get_value(loop, name)

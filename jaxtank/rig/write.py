@@ -4,6 +4,7 @@ import textwrap
 from pathlib import Path
 
 from jaxtank import presets
+from jaxtank.case import Case
 from jaxtank.core.files import write_atomic
 from jaxtank.rig.preset_match import origin_of
 from jaxtank.rig.schema import allowed, lines_of, toml
@@ -13,7 +14,7 @@ WIDTH = 110
 SHORT = ("[limits]", "[free]", "[objective]")
 
 
-def dump(case, tankwise=False):
+def dump(case: Case, tankwise: bool = False) -> str:
     """The rig file of `case` as text: every leaf, every static field that a file may set, what is tuned and what is uncertain.
 
     tankwise: described tank by tank even where a preset has the same rig. Raises InputError for a case that no file can describe.
@@ -21,18 +22,18 @@ def dump(case, tankwise=False):
     return _text([lines_of(s) for s in sections(case, tankwise) if s.on])
 
 
-def save(case, path):
+def save(case: Case, path: str | Path) -> None:
     """Write `dump(case)` to a file, whole or not at all."""
     write_atomic(Path(path), dump(case))
 
 
-def complete(case, tankwise=False):
+def complete(case: Case, tankwise: bool = False) -> str:
     """`dump` with every other key that can be set, and every table that could be there, commented out; each key below its unit, range
     and meaning. A line that begins with "#" and no space is one that may be used as it stands; those of a table go together."""
     return _text([HEAD.splitlines()] + [_commented(s) for s in sections(case, tankwise)])
 
 
-def short(case):
+def short(case: Case) -> str:
     """What differs from the preset that `case` came from, and what is tuned; `complete` where there is no preset."""
     origin, _ = origin_of(case)
     if origin is None:

@@ -1,11 +1,12 @@
 """The interface of a signal, and signals that hold for any purpose: constant, table, sum."""
 
 import abc
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import pointwise, sample_times
+from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.tree import component, leaf, static
 
 
@@ -14,11 +15,11 @@ class Signal(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def channels(self):
+    def channels(self) -> int:
         """Number of channels [-]."""
 
     @abc.abstractmethod
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for a Clock. A signal whose every sample
         follows from `sample_times(clock)` alone may be marked `pieces.pointwise`: a long run then asks for it piece by piece."""
 
@@ -32,11 +33,11 @@ class Constant(Signal):
     )
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return np.shape(self.level)[0]
 
     @pointwise
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
         return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
@@ -54,10 +55,10 @@ class Table(Signal):
     between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return np.shape(self.values)[0]
 
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         last = np.shape(self.values)[1] - 1
         # which sample, and how far past it, is known to the host: a little forgiveness makes 3 * 0.1 s sample 3
         at = np.arange(clock.samples) * (clock.dt / self.period)
@@ -79,20 +80,22 @@ class Sum(Signal):
     second: Signal
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return self.first.channels
 
     @pointwise
-    def sample(self, clock):
-        return tuple(
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+        value, rate, second = (
             tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
         )
+        return value, rate, second
 
     @pointwise
-    def windows(self, clock):
+    def windows(self, clock: Clock) -> tuple:
         """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
         t = sample_times(clock)
-        found = list(self.first.windows(clock))
-        still = t < self.second.start - 1e-7 * clock.dt
-        found[self.second.channel] = tuple(jnp.where(still, a, 0.0) for a in found[self.second.channel])
+        steps, sine = cast(Any, self.first), cast(Any, self.second)  # a Ramps, with a Sine on it
+        found = list(steps.windows(clock))
+        still = t < sine.start - 1e-7 * clock.dt
+        found[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in found[sine.channel])
         return tuple(found)

@@ -1,9 +1,12 @@
 """Inflow disturbances: volumes added to a tank for a while."""
 
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import pointwise, sample_times
+from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.signals.base import Signal
@@ -22,11 +25,11 @@ class Pours(Signal):
     window: float = static("s", "how long after a pour a tank is watched for its recovery", low=0.0, strict=True, default=60.0)
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return self.width
 
     @pointwise
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         t = sample_times(clock)
         flow = [jnp.zeros_like(t) for _ in range(self.width)]
         for j, (start, duration, tank) in enumerate(self.events):
@@ -36,7 +39,7 @@ class Pours(Signal):
         return tuple(flow), still, still
 
     @pointwise
-    def since(self, clock):
+    def since(self, clock: Clock) -> jax.Array:
         """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
         t = sample_times(clock)
         since = -jnp.ones_like(t)
@@ -46,7 +49,7 @@ class Pours(Signal):
         return since
 
 
-def pours(tanks, entries):
+def pours(tanks: int, entries: Sequence[tuple[float, float, int, float]]) -> Pours:
     """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0, volume [cm^3]). InputError for a bad one."""
     for time, duration, tank, _ in entries:
         if not (time >= 0 and duration > 0 and 0 <= tank < tanks):

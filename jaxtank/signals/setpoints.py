@@ -5,11 +5,12 @@ samples are inputs of the loop: interpolating inside it would cost more than the
 """
 
 import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import Piece, indices, pointwise, sample_times
+from jaxtank.core.clock import Clock, Piece, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.signals.base import Signal
@@ -38,11 +39,11 @@ class Ramps(Signal):
     )
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return np.shape(self.initial)[0]
 
     @pointwise
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]  # of each channel: (first sample, function of time)
         for j, (start, i) in enumerate(self.changes):
             level = pieces[i][-1][1](start)[0]  # the last target, or how far a change that is not over has come
@@ -55,7 +56,7 @@ class Ramps(Signal):
         return value, rate, second
 
     @pointwise
-    def windows(self, clock):
+    def windows(self, clock: Clock) -> tuple:
         """Per channel (target, step, time since the change ended, settling band), each (samples,): what overshoot and settling refer to.
 
         Before a channel's first change the step is 0. Times in s, levels in cm.
@@ -73,7 +74,7 @@ class Ramps(Signal):
             last[i] = self.targets[j]
         return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
 
-    def plateaus(self, until=math.inf):
+    def plateaus(self, until: float = math.inf) -> np.ndarray:
         """(plateaus, channels) the values held between changes, as host numbers: those whose changes end before the next and `until` [s]."""
         values, now = [], np.array(self.initial, dtype=float)
         values.append(now.copy())
@@ -108,20 +109,27 @@ class Sine(Signal):
     width: int = static("-", "number of channels", low=1, high=100)
 
     @property
-    def channels(self):
+    def channels(self) -> int:
         return self.width
 
     @pointwise
-    def sample(self, clock):
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         t, omega = sample_times(clock), 2.0 * math.pi / self.period
         inside, angle = (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt), omega * (t - self.zero)
         sine, cosine = self.amplitude * jnp.sin(angle), self.amplitude * jnp.cos(angle)
         moving = [jnp.where(inside, v, 0.0) for v in (self.offset + sine, omega * cosine, -omega * omega * sine)]
         still = jnp.zeros_like(t)
-        return tuple(tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+        value, rate, second = (tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+        return value, rate, second
 
 
-def ramps(initial, changes, ramp=60.0, shape="linear", band=0.05):
+def ramps(
+    initial: Sequence[float],
+    changes: Sequence[tuple[float, int, float]],
+    ramp: float = 60.0,
+    shape: str = "linear",
+    band: float = 0.05,
+) -> Ramps:
     """A `Ramps` from a list of (time [s], channel, target [cm]); band: share of each step.
 
     Raises InputError for a bad time, channel or shape.

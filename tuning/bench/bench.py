@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -22,6 +23,11 @@ from tuning.search.provenance import provenance
 MEASURES = ("rms_error_total", "max_level")
 CASES = ("gouta2015/backstepping", "gouta2015/ngpc", "gouta2015/backstepping-ff", "gouta2015/ngpc-boxqp")
 SOURCE = Path(__file__).with_name("floor.c")
+
+
+def _compilations():
+    """How often `evaluate` has been compiled."""
+    return cast(Any, lp.evaluate_compiled)._cache_size()
 
 
 def c_loop(folder):
@@ -208,7 +214,7 @@ def measure_cases(cases, rounds=3):
         first = time.perf_counter() - began
         seconds, results = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
         median = statistics.median(seconds[name])
-        before = lp.evaluate_compiled._cache_size()
+        before = _compilations()
         for _ in range(3):
             lp.evaluate(case.loop, case.clock, MEASURES, key)
         found[name] = {
@@ -222,7 +228,7 @@ def measure_cases(cases, rounds=3):
                 case.clock.samples,
                 provenance(case, None)["xla_option"],
                 results[name]["rms_error_total"].dtype,
-                lp.evaluate_compiled._cache_size() - before,
+                _compilations() - before,
             ),
         }
     return found

@@ -6,7 +6,7 @@ compilation, in a run. Only a search that has found something (`Interrupts`) goe
 Ctrl-C, to report the best point so far.
 """
 
-import _signal  # `signal` adds enumerations to it, whose import takes longer than all of this
+import _signal  # pyright: ignore[reportMissingImports]  no stubs; `signal` adds enumerations to it, whose import takes longer than all of this
 import _thread
 import atexit
 import os

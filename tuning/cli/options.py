@@ -66,7 +66,7 @@ def tradeoff_of(args):
     if args.tradeoff is None:
         return None
     measure, text = pair("--tradeoff", args.tradeoff, str)
-    parts = text.split(":")
+    parts, low, high, count = text.split(":"), 0.0, 0.0, 0
     try:
         low, high = (float(plain_number(p)) for p in parts[:2])
         count = int(parts[2]) if len(parts) > 2 else 6

@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+from typing import Any
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
@@ -72,7 +73,7 @@ def schedule(texts):
     return {}
 
 
-def pair(option, text, read=None):
+def pair(option, text, read=None) -> tuple[str, Any]:
     """(name, value) of NAME=VALUE; read: makes the value of its text, `parse_value` where it is None."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
@@ -157,7 +158,7 @@ def seed(args):
     return whole("--seed", args.seed, 0, 2**31 - 1)
 
 
-def folder_of(args):
+def folder_of(args) -> Any:
     """The folder that a command writes to, None where it writes to none. Raises InputError where it cannot; nothing is made yet."""
     out, resume = getattr(args, "out", None), getattr(args, "resume", None)
     for option, folder in (("--out", out), ("--resume", resume)):

@@ -3,17 +3,22 @@
 import dataclasses
 import functools
 import time
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import experiment as lg
 from tuning.identification import simulation as pb
 from tuning.identification.confidence import ROUND_OFF, VAGUE
+from tuning.identification.experiment import Log
 from tuning.identification.problem import Estimation, check_length
 
 ROOM = 256 * 2**20
@@ -50,7 +55,17 @@ class Identifications:
         return len(self.values)
 
 
-def identify_many(case, logs, free=None, *, start="free", noise=None, substeps=None, iterations=50, gap=1.5):
+def identify_many(
+    case: Case,
+    logs: Sequence[Log],
+    free: Mapping[str, Any] | None = None,
+    *,
+    start: str = "free",
+    noise: ArrayLike | None = None,
+    substeps: int | None = None,
+    iterations: int = 50,
+    gap: float = 1.5,
+) -> Identifications:
     """Estimate the same parameters from each of many logs by itself, in one compiled program: Monte Carlo, a log a day, a rig of each kind.
 
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2      for each log
@@ -61,7 +76,7 @@ def identify_many(case, logs, free=None, *, start="free", noise=None, substeps=N
     Returns Identifications. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
     began, logs = time.perf_counter(), list(logs)
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     if not logs:
         raise InputError("no log is given")
@@ -224,12 +239,12 @@ def _spread(lanes, e, z, cost, matrix):
     scale = 2 * cost / max(lanes.readings[e] - moving.size, 1)
     full, hidden = np.zeros((size, size)), held.copy()
     if moving.size and np.all(np.isfinite(matrix)):
-        squares, axes = np.linalg.eigh(matrix[np.ix_(moving, moving)])
+        squares, axes = np.linalg.eigh(matrix[np.ix_(moving, moving)])  # pyright: ignore[reportCallIssue]  (stubs know lists only)
         singular = np.sqrt(np.maximum(squares, 0.0))
         sd = np.sqrt(scale) / np.maximum(singular, 1e-300)
         # squares know a singular value to half of the digits only
         open_ = (sd > VAGUE) | (singular < np.sqrt(ROUND_OFF) * 1e-3 * singular.max())
-        full[np.ix_(moving, moving)] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T
+        full[np.ix_(moving, moving)] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T  # pyright: ignore[reportCallIssue]  (stubs know lists only)
         own = np.sqrt(np.diag(full))[moving]
         for axis, reach in zip(axes[:, open_].T, np.minimum(sd[open_], 1.0)):
             hidden[moving[np.abs(axis) * reach > np.maximum(0.5 * own, 1e-6)]] = True

@@ -1,6 +1,7 @@
 """How far a fit is to be believed: residuals, intervals, what the data cannot tell apart, and what experiment would."""
 
 import math
+from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import qr
@@ -237,7 +238,7 @@ class Spread:
         """(names, (n, n)) of the parameters that have an interval, in their own units."""
         shared = self.estimation.coordinates.size
         seen = np.flatnonzero(~self._hidden()[:shared])
-        return tuple(self.estimation.coordinates.names[i] for i in seen), self._values()[np.ix_(seen, seen)]
+        return tuple(self.estimation.coordinates.names[i] for i in seen), self._values()[np.ix_(seen, seen)]  # pyright: ignore[reportCallIssue]  (stubs know lists only)
 
     def correlation(self):
         """(names, (n, n)) correlation of the same."""
@@ -281,7 +282,8 @@ class Spread:
         axes, sd = self.axes[self.open][::-1], self.sd_of_axes[self.open][::-1]
         if len(axes) < 2:
             return axes, sd
-        lead = qr(axes, pivoting=True, mode="r")[1][: len(axes)]
+        _, order = cast(Any, qr(axes, pivoting=True, mode="r"))
+        lead = order[: len(axes)]
         plain = np.linalg.solve(axes[:, lead], axes)
         reach = np.sqrt(np.square(np.minimum(sd, 1e150)) @ np.square(axes[:, lead]))  # of the unknown that leads each combination
         order = np.argsort(-reach, kind="stable")
@@ -306,7 +308,7 @@ class Spread:
         slopes = np.diag(plain.slopes(plain.point(values)))
         own = dict(zip(est.coordinates.names, np.sqrt(np.diag(self._values()))))
         sd = {n: own[n] / abs(slopes[i]) for i, n in enumerate(plain.names)}
-        name = max(sd, key=sd.get)
+        name = max(sd, key=sd.__getitem__)
         return name, float(sd[name])
 
 

@@ -4,14 +4,17 @@ import csv
 import io
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
 from jaxtank.core.text import printable
-from tuning.identification.experiment import FLOWS, LENGTHS, VOLTS, log
+from jaxtank.loop.closed_loop import ClosedLoop
+from tuning.identification.experiment import FLOWS, LENGTHS, VOLTS, Log, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
@@ -26,7 +29,12 @@ NAMES = {
 }
 
 
-def read_log(path, loop, columns=None, decimal="."):
+def read_log(
+    path: str | Path,
+    loop: ClosedLoop,
+    columns: Mapping[str, Any] | None = None,
+    decimal: str = ".",
+) -> Log:
     """The Log of a CSV file, for the rig of `loop` (a ClosedLoop).
 
     columns: {"t", "pump1", .., "h1", ..: a column's header, or (header, unit)}, where the header does not say it in its own words ("h1 [cm]",

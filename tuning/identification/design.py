@@ -1,8 +1,13 @@
 """Which experiment tells most: candidate inputs compared by the standard deviations they would leave."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError
 from tuning.identification import simulation as pb
 from tuning.identification.parametrisation import coordinates, nominal, usual
@@ -103,8 +108,19 @@ def _operating(loop):
 
 
 def compare_experiments(
-    case, free=None, *, noise, duration, dt, levels=None, start="known", voltage=None, size=None, bit=None, inputs=None
-):
+    case: Case,
+    free: Mapping[str, Any] | None = None,
+    *,
+    noise: ArrayLike,
+    duration: float,
+    dt: float,
+    levels: Sequence[int] | None = None,
+    start: str = "known",
+    voltage: ArrayLike | None = None,
+    size: ArrayLike | None = None,
+    bit: float | None = None,
+    inputs: Mapping[str, Any] | None = None,
+) -> dict[str, dict[str, Any]]:
     """Predicted standard deviations of the free parameters for each candidate experiment (of `candidates`, or `inputs`: {words: (t (samples,)
     [s], u (samples, pumps), x0 (tanks,))}).
 
@@ -151,7 +167,7 @@ def most_telling(found):
     """The words of the experiment, of those `compare_experiments` compared, whose standard deviations have the smallest product; None where
     each leaves something open."""
     whole = {words: np.sum(np.log(list(row["sd"].values()))) for words, row in found.items() if None not in row["sd"].values()}
-    return min(whole, key=whole.get) if whole else None
+    return min(whole, key=whole.__getitem__) if whole else None
 
 
 def _substeps(rig, t, u, x0, tanks):

@@ -1,8 +1,10 @@
 """A record of an experiment: when, what the pumps were given, what the level sensors said."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import DataError
 from jaxtank.core.units import DEFAULT
@@ -40,24 +42,24 @@ class Log:
     units: tuple | None = None
 
     @property
-    def samples(self):
+    def samples(self) -> int:
         """Number of samples [-]."""
         return len(self.t)
 
-    def part(self, start, stop):
+    def part(self, start: int, stop: int | None) -> "Log":
         """The samples start .. stop - 1 as a Log."""
         cut = slice(start, stop)
         lines = None if self.lines is None else self.lines[cut]
         return dataclasses.replace(self, t=self.t[cut], u=self.u[cut], y=self.y[cut], lines=lines)
 
-    def where(self, k=None, column=None):
+    def where(self, k: int | None = None, column: int | None = None) -> str:
         """Words for sample k: its line in the file, or its number; column: counted over t, u and y."""
         words = self.name
         if k is not None:
             words += f", sample {k + 1}" if self.lines is None else f", line {self.lines[k]}"
         return words if column is None or self.headers is None else f"{words}, column {self.headers[column]!r}"
 
-    def word(self, column):
+    def word(self, column: int) -> str:
         """What a column is, in the words of a rig: t, pump1, .., h1, .."""
         pumps = self.u.shape[1]
         if column == 0:
@@ -65,7 +67,18 @@ class Log:
         return f"pump{column}" if column <= pumps else f"h{self.tanks[column - 1 - pumps] + 1}"
 
 
-def log(*, t, u, y, tanks=None, in_volts=None, name="log", lines=None, headers=None, units=None):
+def log(
+    *,
+    t: ArrayLike,
+    u: ArrayLike,
+    y: ArrayLike,
+    tanks: Sequence[int] | None = None,
+    in_volts: Sequence[bool] | None = None,
+    name: str = "log",
+    lines: ArrayLike | None = None,
+    headers: tuple | None = None,
+    units: tuple | None = None,
+) -> Log:
     """A Log from arrays. t: (samples,) [s]; u: (samples,) or (samples, pumps); y: (samples,) or (samples, channels), NaN where missing; tanks:
     the tank of each channel (0, 1, ... where None); in_volts: per channel, False where None; name, lines, headers, units: of a Log, for messages.
     Raises DataError for shapes that do not agree, inputs that are not finite, and times that do not increase.

@@ -3,13 +3,17 @@
 import dataclasses
 import functools
 import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 import jaxtank
+from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
 from tuning.identification import confidence as idf
@@ -49,17 +53,17 @@ class Identification:
     law: str | None = None  # controller that is proposed for the rig
 
     @functools.cached_property
-    def proposed(self):
+    def proposed(self) -> tuple[Case, str | None]:
         """(`identified`, why): why no controller of the kind `law` could be proposed, None where it was, or none was asked for."""
         return proposed(self)
 
     @property
-    def identified(self):
+    def identified(self) -> Case:
         """The case with the estimated plant in it, in the law's and the observer's models too, with covariance and noise."""
         return self.proposed[0]
 
     @property
-    def message(self):
+    def message(self) -> str:
         """In words: how it ended."""
         from tuning.report import identification
 
@@ -70,19 +74,19 @@ class Identification:
 
         return identification.text(self)
 
-    def to_json(self):
+    def to_json(self) -> dict[str, Any]:
         """The JSON object of `jaxtank identify --json`."""
         from tuning.report import identification
 
         return identification.json_of(self)
 
-    def plot(self):
+    def plot(self) -> dict[str, Any]:
         """{name: matplotlib Figure}."""
         from tuning.report import identification
 
         return identification.figures(self)
 
-    def save(self, folder, command=None):
+    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and report.html; returns the paths.
 
         command: the line that made it, for the report, where there is one.
@@ -93,27 +97,27 @@ class Identification:
 
 
 def identify(
-    case,
-    log,
-    free=None,
+    case: Case | Plant,
+    log: lg.Log | Sequence[lg.Log],
+    free: Mapping[str, Any] | None = None,
     *,
-    start="free",
-    starts=8,
-    seed=0,
-    hold_back=0.25,
-    noise=None,
-    loss="linear",
-    substeps=None,
-    profile=False,
-    iterations=100,
-    gap=1.5,
-    folder=None,
-    checkpoint=None,
-    resume=False,
-    progress=None,
-    ready=None,
-    law=None,
-):
+    start: str = "free",
+    starts: int = 8,
+    seed: int = 0,
+    hold_back: float = 0.25,
+    noise: ArrayLike | None = None,
+    loss: str = "linear",
+    substeps: int | None = None,
+    profile: bool = False,
+    iterations: int = 100,
+    gap: float = 1.5,
+    folder: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable | None = None,
+    ready: Callable | None = None,
+    law: str | None = None,
+) -> Identification:
     """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
 
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2
@@ -134,7 +138,7 @@ def identify(
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
     """
     began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
-    if not jax.config.jax_enable_x64:
+    if not jax.config.read("jax_enable_x64"):
         raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
     case = bare(case) if isinstance(case, Plant) else case
     check_law(law, case)

@@ -1,6 +1,7 @@
 """What a fit moves: logarithms of positive parameters, branch gains of a pump that feeds two tanks, the rest as shares of its range."""
 
 import dataclasses
+from typing import Any, cast
 
 import numpy as np
 
@@ -130,7 +131,8 @@ def usual(loop):
         for i, value in enumerate(np.ravel(values)):
             if value > 0:
                 found[f"plant.{name}[{i}]"] = (float(value) / 10, float(value) * 10, "log")
-    for j, (_, second) in enumerate(getattr(plant, "feeds", ())):
+    feeds = cast(Any, getattr(plant, "feeds", ()))
+    for j, (_, second) in enumerate(feeds):
         if second is not None:
             found[f"plant.split[{j}]"] = (0.02, 0.98, "linear")
     if getattr(plant, "overflow", False):

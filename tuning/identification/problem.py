@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+from collections.abc import Mapping
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -109,7 +111,7 @@ class Estimation:
         return found
 
     @property
-    def names(self):
+    def names(self) -> tuple[str, ...]:
         """(unknowns,) words for every unknown: parameters, then levels at the start."""
         logs = len(self.logs)
         where = [f"h{i + 1}(0)" + (f" of log {e + 1}" if logs > 1 else "") for e in range(logs) for i in self.tanks]
@@ -126,7 +128,7 @@ class Estimation:
             np.concatenate([high, np.tile(top, count) / self.level_scale]),
         )
 
-    def plainly(self):
+    def plainly(self) -> "Estimation":
         """The same problem in coordinates of which each is that of one parameter: no branch gains."""
         other = copy.copy(self)
         other.coordinates = coordinates(self.bounds, branches=False)
@@ -146,27 +148,27 @@ class Estimation:
                     x0[e, tank] = max(level - (0.0 if sensor.offset is None else float(sensor.offset[tank])), 0.0)
         return x0
 
-    def origin(self):
+    def origin(self) -> np.ndarray:
         """(unknowns,) the case's own values, levels as measured."""
         p = self.coordinates.point(nominal(self.case.loop, self.coordinates.names))
         return np.clip(np.concatenate([p, self.first[:, list(self.tanks)].ravel() / self.level_scale]), *self.box)
 
-    def parts(self, z):
+    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(p (shared,), own (logs, free levels) in the rig's unit) of an unknown vector z."""
         own = (z[self.coordinates.size :] * self.level_scale).reshape(len(self.logs), len(self.tanks))
         return z[: self.coordinates.size], own
 
-    def at(self, z):
+    def at(self, z: np.ndarray) -> Any:
         """The Rig at z."""
         return with_values(self.rig, self.coordinates.values(self.parts(z)[0]))
 
-    def levels(self, z):
+    def levels(self, z: np.ndarray) -> np.ndarray:
         """(logs, tanks) levels at the first sample of each log, at z."""
         own = self.first.copy()
         own[:, list(self.tanks)] = self.parts(z)[1]
         return own
 
-    def predicted(self, z):
+    def predicted(self, z: np.ndarray) -> np.ndarray:
         """(logs, samples, channels) readings at z."""
         return np.asarray(
             pb.play(
@@ -174,7 +176,7 @@ class Estimation:
             )
         )
 
-    def pass_at(self, z):
+    def pass_at(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(residual (rows,), jacobian (rows, unknowns)), weighted by the noise; rows are the readings that there are."""
         p, own = self.parts(z)
         rig = self.rig
@@ -209,7 +211,15 @@ class Estimation:
             residual, jacobian = np.full_like(residual, np.nan), np.zeros_like(jacobian)
         return residual, jacobian
 
-    def solve(self, z, loss="linear", iterations=100, fixed=None, tolerance=1e-14, pull=None):
+    def solve(
+        self,
+        z: np.ndarray,
+        loss: str = "linear",
+        iterations: int = 100,
+        fixed: Mapping[int, float] | None = None,
+        tolerance: float = 1e-14,
+        pull: Any = None,
+    ) -> Fit:
         """The Fit from the start z. fixed: {index: value} of unknowns that stay, in coordinates; tolerance: gain of an iteration, as a share
         of the cost, at which it ends; pull: (point (unknowns,), strength) to which every unknown is drawn, as readings of
         it with a standard deviation of 1 / strength would, a level's of a tenth of that."""
@@ -224,8 +234,12 @@ class Estimation:
                 kept["v"], kept["at"] = v.copy(), self.pass_at(whole)
             return kept["at"]
 
+        def slope(v):
+            inner = both(v)[1][:, moving]
+            return inner if pull is None else np.concatenate([inner, np.diag(drawn)])
+
         low, high = self.box[0][moving], self.box[1][moving]
-        drawn = None if pull is None else pull[1] * np.where(moving < self.coordinates.size, 1.0, 10.0)
+        drawn: Any = None if pull is None else pull[1] * np.where(moving < self.coordinates.size, 1.0, 10.0)
         before = self.passes
         if not np.all(np.isfinite(both(np.clip(whole[moving], low, high))[0])):
             p, own = self.parts(whole)
@@ -237,7 +251,7 @@ class Estimation:
             found = least_squares(
                 lambda v: both(v)[0] if pull is None else np.concatenate([both(v)[0], drawn * (v - pull[0][moving])]),
                 np.clip(whole[moving], low, high),
-                lambda v: both(v)[1][:, moving] if pull is None else np.concatenate([both(v)[1][:, moving], np.diag(drawn)]),
+                cast(Any, slope),
                 bounds=(low - 1e-12, high + 1e-12),
                 x_scale=1.0,
                 loss=loss,
@@ -261,11 +275,11 @@ class Estimation:
             loss=loss,
         )
 
-    def unknowns(self, fit):
+    def unknowns(self, fit: Fit) -> np.ndarray:
         """(unknowns,) the vector that `solve` and `pass_at` take, of a Fit."""
         return np.concatenate([fit.p, fit.own.ravel() / self.level_scale])
 
-    def begin(self, count, seed):
+    def begin(self, count: int, seed: int) -> np.ndarray:
         """(count, unknowns) starts: the case's own values, then Sobol points of the box; measured levels stay as measured."""
         origin = self.origin()
         starts = np.tile(origin, (count, 1))
@@ -285,7 +299,7 @@ class Estimation:
 
 def _felt(loop, spec, found):
     """`found` Bounds less the splits of pumps that feed one tank, which nothing depends on: an array's are left out, one by name refused."""
-    feeds = getattr(loop.plant, "feeds", ())
+    feeds = cast(Any, getattr(loop.plant, "feeds", ()))
     idle = {f"plant.split[{j}]" for j, (_, second) in enumerate(feeds) if second is None}
     for name in idle & set(spec):
         raise InputError(f"free {name}: this pump feeds one tank alone, its split changes nothing")

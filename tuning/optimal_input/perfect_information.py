@@ -2,11 +2,13 @@
 
 import dataclasses
 import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case
 from jaxtank.core.errors import NonFiniteError
 from jaxtank.loop import run as lp
 from tuning.optimal_input.cost import open_loop
@@ -112,7 +114,15 @@ class InputBound:
 NOTE = "a numerical optimum of a problem with more than one, on a grid of inputs, for a run known in advance and without noise: not a certificate"
 
 
-def bound(case, objective=None, limits=None, *, interval=None, iterations=200, progress=None):
+def bound(
+    case: Case,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    *,
+    interval: float | None = None,
+    iterations: int = 200,
+    progress: Callable | None = None,
+) -> InputBound:
     """The inputs that make a case's cost smallest when the whole run is known in advance: what no law could beat.
 
         min over u_1 .. u_K in [low, high] of  sum_m weight_m measure_m(run with u)   under the limits, at every sample

@@ -1,9 +1,10 @@
 """Where a value may lie, and the scale on which it is searched."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, split_index
@@ -19,13 +20,13 @@ class Bound(NamedTuple):
     scale: str  # "log" or "linear"
     unit: str
 
-    def to_unit(self, value):
+    def to_unit(self, value: Any) -> Any:
         """z in [0, 1] of a value; values outside the range give z outside [0, 1]."""
         if self.scale == "log":
             return np.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
-    def from_unit(self, z):
+    def from_unit(self, z: ArrayLike) -> Any:
         """The value at z; the ends are met exactly. Numbers or arrays."""
         z = np.asarray(z, dtype=float)
         if self.scale == "log":
@@ -34,7 +35,7 @@ class Bound(NamedTuple):
             value = self.low + z * (self.high - self.low)
         return np.where(z <= 0, self.low, np.where(z >= 1, self.high, value))
 
-    def slope(self, value):
+    def slope(self, value: Any) -> Any:
         """d value / d z."""
         return value * math.log(self.high / self.low) if self.scale == "log" else np.full_like(value, self.high - self.low)
 

@@ -1,6 +1,7 @@
 """What is made small and what must hold, as numbers with exact derivatives."""
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
 from tuning.problem.bounds import bounds
@@ -84,7 +86,7 @@ class Problem:
         self.memo = Memo() if memo is None else memo
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
 
-    def limit(self, limits):
+    def limit(self, limits: Mapping[str, Any] | None) -> None:
         """Replace the limits by `limits`, as in `resolve_limits`.
 
         The evaluation cache holds margins of the former limits, and is emptied."""
@@ -95,12 +97,12 @@ class Problem:
         self.memo = Memo()
 
     @property
-    def names(self):
+    def names(self) -> list[str]:
         """Dotted names of the P free scalars."""
         return [b.name for b in self.bounds]
 
     @property
-    def model(self):
+    def model(self) -> str | None:
         """What the Gauss-Newton matrix is the second derivative of: "square" (the cost is one root mean square: its square), "cost", or
         None where no term of the cost is made of squares, or the parameters are too many to carry slopes of."""
         if len(self.bounds) > FORWARD_LIMIT:
@@ -111,7 +113,7 @@ class Problem:
             return "square"
         return "cost" if any(m == ROOT or m in ms.SQUARES for m in self.objective) else None
 
-    def start(self):
+    def start(self) -> np.ndarray:
         """(P,) z of the case's own values. Raises InputError if one lies outside its range."""
         z = []
         for b in self.bounds:
@@ -121,24 +123,24 @@ class Problem:
             z.append(float(b.to_unit(value)))
         return np.array(z)
 
-    def values(self, z):
+    def values(self, z: np.ndarray) -> dict[str, float]:
         """{name: value in its unit} at z."""
         return {b.name: float(b.from_unit(v)) for b, v in zip(self.bounds, z)}
 
-    def loop_at(self, z):
+    def loop_at(self, z: np.ndarray) -> ClosedLoop:
         """The loop with the values at z."""
         return with_values(self.loop, self.values(z))
 
-    def cost(self, measures):
+    def cost(self, measures: Mapping[str, Any]) -> float:
         """Weighted sum of the measures of one run."""
         return sum(w * float(np.sum(measures[m])) for m, w in self.objective.items())
 
-    def total(self, table):
+    def total(self, table: Sequence[Mapping[str, Any]]) -> float:
         """The cost of `table`, the measures of every scenario: what their costs come to by `risk`."""
         costs = np.array([self.cost(row) for row in table])
         return float(self.shares(costs, range(len(self.lanes))) @ costs)
 
-    def shares(self, costs, lanes):
+    def shares(self, costs: np.ndarray, lanes: Sequence[int]) -> np.ndarray:
         """What the cost of each of `lanes` counts, given all their costs: its weight, or where it is among the worst. Sums to 1."""
         weights = np.array([self.lanes[i].weight for i in lanes])
         if self.risk == "mean" or not np.all(np.isfinite(costs)):
@@ -149,19 +151,22 @@ class Problem:
         chosen[order[:count]] = weights[order[:count]]
         return chosen / chosen.sum()
 
-    def margins(self, table):
+    def margins(self, table: Sequence[Mapping[str, Any]]) -> np.ndarray:
         """(limits,) margin of each limit, of the measures of every scenario."""
         return np.array([limit.margin(table[limit.lane]) for limit in self.limits])
 
-    def screen(self, zs, coarse=False):
+    def screen(self, zs: np.ndarray, coarse: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """(costs (points,), margins (points, limits)) at many points (points, P), without derivatives; coarse: at the coarse clock."""
         zs = np.asarray(zs, dtype=float)
         self.simulations += len(zs) * len(self.lanes)
         return tuple(v.copy() for v in self.memo.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse)))
 
+    def _per_lane(self) -> list[Any]:
+        return [None] * len(self.lanes)
+
     def _screen(self, zs, coarse):
         points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
-        tables, broken = [[None] * len(self.lanes) for _ in zs], np.zeros(len(zs), dtype=bool)
+        tables, broken = [self._per_lane() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
             clock = sc.coarse_clock(group.clock) if coarse else group.clock
             measures, flags = sc.values_of(group, self.needed, points, clock)
@@ -172,7 +177,7 @@ class Problem:
         costs = np.where(broken, np.nan, [self.total(table) for table in tables])
         return costs, np.array([self.margins(table) for table in tables]).reshape(len(zs), -1)
 
-    def point(self, z):
+    def point(self, z: np.ndarray) -> Point:
         """The Point at z: every scenario at its own step, with derivatives."""
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         self.simulations, self.gradients = self.simulations + len(self.lanes), self.gradients + len(self.lanes)
@@ -180,14 +185,14 @@ class Problem:
         self.non_finite += not found.finite
         return found
 
-    def rough(self, z):
+    def rough(self, z: np.ndarray) -> Point:
         """The Point at z with a tenth of the samples, near enough to search with before the true one is asked."""
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         self.simulations, self.gradients = self.simulations + len(self.lanes), self.gradients + len(self.lanes)
         groups = [group._replace(clock=sc.rough_clock(group.clock)) for group in self.groups]
         return Point(z, *self.memo.recall("rough", [z], lambda: self._point(z, groups)))
 
-    def part(self, z, batch, rng):
+    def part(self, z: np.ndarray, batch: int, rng: np.random.Generator) -> Point:
         """The Point at z of about `batch` scenarios drawn by rng, the same number of every group, so that nothing is compiled twice."""
         z, groups = np.clip(np.asarray(z, dtype=float), 0.0, 1.0), []
         for group in self.groups:
@@ -204,7 +209,7 @@ class Problem:
         values = {name: np.float64(v) for name, v in self.values(z).items()}
         per_z = np.array([float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())])
         count, ruined = len(z), False
-        table, slopes, matrices = ([None] * len(self.lanes) for _ in range(3))
+        table, slopes, matrices = (self._per_lane() for _ in range(3))
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
             ruined = ruined or bool(np.any(broken))

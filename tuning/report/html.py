@@ -6,6 +6,7 @@ Pictures are inside as SVG; nothing is asked of the network, and there is no scr
 import html
 import io
 import re
+from typing import Any
 
 from tuning.report.figures import failed
 
@@ -227,7 +228,12 @@ def _saved(figure, name):
     import matplotlib
 
     out = io.StringIO()
-    settings = {"svg.hashsalt": str(name), "svg.fonttype": "none", "path.simplify": True, "path.simplify_threshold": 0.3}
+    settings: dict[Any, Any] = {
+        "svg.hashsalt": str(name),
+        "svg.fonttype": "none",
+        "path.simplify": True,
+        "path.simplify_threshold": 0.3,
+    }
     with matplotlib.rc_context(settings):
         figure.savefig(out, format="svg", dpi=130, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     return out.getvalue()

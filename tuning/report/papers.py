@@ -4,6 +4,7 @@ import numbers
 import textwrap
 from collections import Counter
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtank import presets, rig
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
+from jaxtank.plants.network import TankNetwork
 from jaxtank.presets.paper import Claim
 from tuning.report import artifacts, figures, tables
 from tuning.report.case import noisy
@@ -147,7 +149,7 @@ def save(pages, folder, command=None):
         for paper, found in pages.items():
             seen = []
             for name, case in presets.load(paper).cases.items():
-                plant = case.loop.plant
+                plant = cast(TankNetwork, case.loop.plant)  # as every preset's
                 drawing = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs, np.asarray(plant.rim).tolist())
                 if drawing not in seen:  # cases of one paper share their rig, but for some
                     seen.append(drawing)

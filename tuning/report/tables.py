@@ -2,6 +2,7 @@
 
 import json
 import math
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def numbers(value, digits=5):
     return "  ".join(number(v, digits) for v in np.ravel(value))
 
 
-def clean(value):
+def clean(value) -> Any:
     """`value` for JSON: arrays as lists, NaN and infinity as null."""
     if isinstance(value, dict):
         return {k: clean(v) for k, v in value.items()}

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from typing import Any
 
 import jax
 import numpy as np
@@ -233,10 +234,10 @@ def mirror_of(problem, outcomes, values):
     return {"words": problem.case.mirror.words, "values": there, "objective": cost, "starts": starts}
 
 
-def table_of(problem, values):
+def table_of(problem, values) -> list[Any]:
     """Measures of every scenario at {parameter: value}: a list of {name: value}, with all that is reported where it is served."""
     points = {n: np.array([v]) for n, v in values.items()}
-    table = [None] * len(problem.lanes)
+    table: list[Any] = [None] * len(problem.lanes)
     for group in problem.groups:
         loop = problem.lanes[group.lanes[0]].case.loop
         names = (*(m for m in REPORTED if ms.serves(m, loop)), *ms.TIMES.values())

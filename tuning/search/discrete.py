@@ -46,7 +46,7 @@ def tune_choices(tune, case, method, choices, *, log=None, resume=False, **optio
     results = []
     for i, (values, variant) in enumerate(variants):
         folder = None if log is None else _folder(log, i)
-        old = resume and (folder / NAME).exists()
+        old = resume and folder is not None and (folder / NAME).exists()
         results.append((values, tune(variant, method, log=folder, resume=old, **options)))
     rows = [
         {

@@ -123,7 +123,9 @@ def trf(search, z, iterations, tolerance=1e-10):
             value, slope, normal = cost + 1.0, 0.5 * point.gradient / search.scale, 0.5 * point.gauss_newton / search.scale
         root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
         head = np.linalg.solve(root, slope)
-        excess = max(1.0, float(head @ head) / max(value, 1e-300))  # terms without squares may slope more than the model's curvature allows
+        excess = max(
+            1.0, float(head @ head) / max(value, 1e-300)
+        )  # terms without squares may slope more than the model's curvature allows
         return np.append(head / excess**0.5, max(value - head @ head / excess, 0.0) ** 0.5), np.vstack(
             [root.T * excess**0.5, 0 * z]
         )

@@ -1,11 +1,13 @@
 """What a limit costs: the problem solved again for a row of values of one limit, each search begun where a neighbour's ended."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
@@ -17,20 +19,20 @@ MANY = 50
 
 
 def tradeoff(
-    case,
-    measure,
-    values,
+    case: Case,
+    measure: str,
+    values: Sequence[float],
     *,
-    free=None,
-    objective=None,
-    limits=None,
-    scenarios=None,
-    seed=0,
-    iterations=60,
-    screening=64,
-    start=None,
-    progress=None,
-):
+    free: Mapping[str, Any] | None = None,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    scenarios: Sequence[Scenario] | None = None,
+    seed: int = 0,
+    iterations: int = 60,
+    screening: int = 64,
+    start: Any = None,
+    progress: Callable | None = None,
+) -> dict[str, Any]:
     """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
 
     Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the

@@ -5,6 +5,7 @@ import os
 import platform
 
 import jax
+import jaxlib.version
 import numpy as np
 
 import jaxtank
@@ -51,7 +52,7 @@ def provenance(case, seed):
         "jaxtank": jaxtank.__version__,
         "python": platform.python_version(),
         "jax": jax.__version__,
-        "jaxlib": jax.lib.__version__,
+        "jaxlib": jaxlib.version.__version__,
         "numpy": np.__version__,
         "scipy": scipy.__version__,
         "optax": optax.__version__,

@@ -1,6 +1,7 @@
 """A tuning result, and what it says of itself in words."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,7 @@ class TuningResult:
     cloud: dict | None = None
 
     @property
-    def success(self):
+    def success(self) -> bool:
         """True if a search converged and every limit holds at the case's own step, in every scenario."""
         return self.status == Status.CONVERGED
 
@@ -99,17 +100,17 @@ class TuningResult:
 
         return json_of(self)
 
-    def replace(self, **changes):
+    def replace(self, **changes: Any) -> "TuningResult":
         """A copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def save(self, folder, command=None):
+    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, rig.toml, trajectory.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report.tuning_figures import save
 
         return save(self, folder, command)
 
-    def plot(self):
+    def plot(self) -> dict[str, Any]:
         """Matplotlib figures {name: figure}: responses before and after, convergence, landscape, and what else there is to show."""
         from tuning.report.tuning_figures import figures
 

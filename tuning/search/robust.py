@@ -2,22 +2,23 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Scenario
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.problem.problem import Problem
 from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
+from tuning.search.result import TuningResult
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
-from tuning.uncertainty.study import ensemble
+from tuning.uncertainty.study import Ensemble, ensemble
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
@@ -78,17 +79,17 @@ def scenario_bound(scenarios, support, beta=CONFIDENCE):
 
 
 def tune_robust(
-    case,
+    case: Case,
     distributions: Mapping[str, Any] | None = None,
-    risk="mean",
-    samples=64,
-    fresh=1024,
-    seed=0,
-    back_off=0.0,
-    tolerance=TOLERANCE,
-    validation=64,
-    **options,
-):
+    risk: str = "mean",
+    samples: int = 64,
+    fresh: int = 1024,
+    seed: int = 0,
+    back_off: float = 0.0,
+    tolerance: float = TOLERANCE,
+    validation: int = 64,
+    **options: Any,
+) -> TuningResult:
     """`tune` on `samples` plants drawn from `distributions` (the case's own spread where None), every limit held on every plant.
 
     risk: "mean", "cvar" or "worst" of their costs; fresh: plants drawn afterwards, with seeds of their own, on which the values before and
@@ -153,7 +154,10 @@ def _kept_off(case, limits, share):
 
 def _run(case, distributions, limits, names, fresh, seed):
     """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit or leaves the numbers)."""
-    seen = ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False)
+    seen = cast(
+        Ensemble,
+        ensemble(case, distributions, samples=fresh, key=(HELD_OUT + seed) % 2**31, measures=names, limits=limits, fan=False),
+    )
     past = [limit.margins(seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0 for limit in seen.limits]
     return seen, seen.failed | np.any(past, axis=0) if past else seen.failed
 

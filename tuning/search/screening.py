@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
+from jax.flatten_util import ravel_pytree
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
@@ -82,7 +83,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             out = jax.tree.leaves(step(here, clock, state, now)[0])
             return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
 
-        flat, unravel = jax.flatten_util.ravel_pytree([v for v, m in zip(leaves, moves) if m])
+        flat, unravel = ravel_pytree([v for v, m in zip(leaves, moves) if m])
         return jax.jacfwd(after)(flat)
 
     return jax.vmap(lambda v: jax.vmap(lambda *at: jacobian(v, *at))(r, x, u))(values)

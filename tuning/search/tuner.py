@@ -1,11 +1,15 @@
 """tune: better gains for a case, found through the simulation and checked at its own step."""
 
 import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
 
 import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
@@ -39,27 +43,27 @@ MANY = 4
 
 
 def tune(
-    case,
-    method="auto",
+    case: Case,
+    method: str = "auto",
     *,
-    free=None,
-    objective=None,
-    limits=None,
-    scenarios=None,
-    risk="mean",
-    choices=None,
-    starts=8,
-    seed=0,
-    screening=64,
-    iterations=60,
-    batch=None,
-    validation=64,
-    tolerance=None,
-    log=None,
-    checkpoint=None,
-    resume=False,
-    progress=None,
-):
+    free: Mapping[str, Any] | None = None,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    scenarios: Sequence[Scenario] | None = None,
+    risk: str = "mean",
+    choices: Mapping[str, Sequence] | None = None,
+    starts: int = 8,
+    seed: int = 0,
+    screening: int = 64,
+    iterations: int = 60,
+    batch: int | None = None,
+    validation: int = 64,
+    tolerance: float | None = None,
+    log: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable | None = None,
+) -> TuningResult:
     """Better values for the free parameters of a case, under its limits.
 
     case: presets Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its own (and its seed, unless another
@@ -227,7 +231,7 @@ def tune(
     )
     result = result.replace(message=message(result, z, felt, redone, of_answer(problem, tuned, values, key)))
     if log is not None:
-        problem.memo = problem.memo.memo()
+        problem.memo = cast(Log, problem.memo).memo()
     return result
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
@@ -18,7 +19,7 @@ PATIENCE = 0.2
 
 
 @contextlib.contextmanager
-def hold(folder, shared=False, leaving=contextlib.nullcontext):
+def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
     """Hold `folder`, made if need be, against other runs; shared=True: against all but those that share it.
 
     The lock is the system's own (flock on a file with the process id in it): it ends with its process however that ends, so that what a
@@ -62,6 +63,7 @@ def hold(folder, shared=False, leaving=contextlib.nullcontext):
 
 def _locked(folder, shared, opened):
     """The open lock file of a folder, None where there are no locks; opened: list that holds what is open meanwhile."""
+    assert fcntl is not None  # `hold` comes no further without it
     path, kind, until = folder / LOCK, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
@@ -95,6 +97,7 @@ def _let_go(path, file):
     """Remove the lock file, unless others share it, and close it."""
     if file is None:
         return
+    assert fcntl is not None  # there is a file
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.unlink(path)

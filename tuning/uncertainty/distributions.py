@@ -21,18 +21,19 @@ class Uniform:
     relative: float | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
+        assert self.low is not None and self.high is not None  # `check`
         return self.low + (self.high - self.low) * p
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the range is one."""
         _one_kind(self, name, ("low", "high"), "relative")
         if self.relative is not None and not self.relative > 0:
             raise InputError(f"{name}: uniform of relative width {self.relative:g} must be wider than 0")
-        if self.relative is None and not self.low < self.high:
+        if self.low is not None and self.high is not None and not self.low < self.high:
             raise InputError(f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below its high one")
 
 
@@ -45,18 +46,19 @@ class LogUniform:
     factor: float | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
+        assert self.low is not None and self.high is not None  # `check`
         return self.low * (self.high / self.low) ** p
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the range is one, above 0."""
         _one_kind(self, name, ("low", "high"), "factor")
         if self.factor is not None and not self.factor > 1:
             raise InputError(f"{name}: log-uniform factor = {self.factor:g} must be above 1")
-        if self.factor is None and not 0 < self.low < self.high:
+        if self.low is not None and self.high is not None and not 0 < self.low < self.high:
             raise InputError(
                 f"{name}: log-uniform from {self.low:g} to {self.high:g} must lie above 0, its low end below its high one"
             )
@@ -73,17 +75,18 @@ class Normal:
     cut: float = 3.0
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
         tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
         return centre + spread * scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * p)
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the width is one."""
         _one_kind(self, name, ("sd",), "relative")
         width = self.sd if self.relative is None else self.relative
+        assert width is not None  # `_one_kind`
         if not (width > 0 and self.cut > 0):
             raise InputError(f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both must be above 0")
 
@@ -96,13 +99,13 @@ class Discrete:
     weights: tuple | None = None
     tied: bool = False
 
-    def quantile(self, p, nominal):
+    def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...)."""
         weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=float)
         edges = np.cumsum(weights / weights.sum())[:-1]
         return np.asarray(self.values, dtype=float)[np.searchsorted(edges, p, side="right")]
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless there are values, and a weight of at least 0 for each."""
         good = len(self.values) > 0 and all(math.isfinite(v) for v in self.values)
         weights = self.weights or (1.0,) * len(self.values)
@@ -123,11 +126,11 @@ class Correlated:
     mean: tuple | None = None
     cut: float = 3.0
 
-    def factor(self):
+    def factor(self) -> np.ndarray:
         """(n, n) lower Cholesky factor."""
         return np.linalg.cholesky(np.asarray(self.covariance, dtype=float))
 
-    def check(self, name):
+    def check(self, name: str) -> None:
         """Raise InputError unless the covariance is symmetric and positive definite, one row for each name."""
         try:
             matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)

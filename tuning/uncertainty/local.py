@@ -1,6 +1,6 @@
 """The columns of a sensitivity study, and how exact derivatives fill them."""
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -94,7 +94,7 @@ def half_widths(draws):
 
 def _half_width(d, nominal):
     if isinstance(d, Normal):
-        return min(NORMAL_WIDTH, d.cut) * (d.sd if d.relative is None else d.relative * np.abs(nominal))
+        return min(NORMAL_WIDTH, d.cut) * (cast(float, d.sd) if d.relative is None else d.relative * np.abs(nominal))
     if isinstance(d, Discrete):
         return 0.5 * (max(d.values) - min(d.values))
     return 0.5 * (d.quantile(np.ones(nominal.shape), nominal) - d.quantile(np.zeros(nominal.shape), nominal))

@@ -1,6 +1,7 @@
 """What the shards of an ensemble are of, as JSON in their manifest: enough to join them without saying it again."""
 
 import dataclasses
+from typing import Any, cast
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def from_json(found):
     """{name: distribution} of what `to_json` gives. Raises InputError for anything else."""
     built = {}
     for name, fields in found.items():
-        kind = KINDS.get(fields.get("kind")) if isinstance(fields, dict) else None
+        kind = KINDS.get(cast(Any, fields.get("kind"))) if isinstance(fields, dict) else None
         if kind is None or set(fields) != {"kind", *(f.name for f in dataclasses.fields(kind))}:
             raise InputError(f"manifest: {name} is not a distribution of this program")
         built[name] = kind(**{k: _tuples(v) for k, v in fields.items() if k != "kind"})
@@ -45,7 +46,7 @@ def from_json(found):
     return built
 
 
-def _tuples(value):
+def _tuples(value) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
@@ -91,18 +93,18 @@ class SensitivityResult:
 
 
 def sensitivity(
-    case,
-    distributions=None,
+    case: Case,
+    distributions: Mapping[str, Any] | None = None,
     *,
-    method="local",
-    measures=None,
-    samples=None,
-    spread=None,
-    seed=0,
-    batch=None,
-    devices=1,
-    progress=None,
-):
+    method: str = "local",
+    measures: Sequence[str] | None = None,
+    samples: int | None = None,
+    spread: float | None = None,
+    seed: int = 0,
+    batch: int | None = None,
+    devices: int = 1,
+    progress: Callable | None = None,
+) -> SensitivityResult:
     """Which uncertain parameter moves which measure of a case.
 
     distributions: {dotted name: distribution}; what the case calls uncertain, uniform within its own share, where None; spread: one share
@@ -219,7 +221,8 @@ class Runs:
         self.own = {name: np.asarray(get_value(case.loop, name))[None] for name in draws.values(np.zeros((0, draws.dimensions)))}
         self.draws, self.names, self.progress = draws, names, progress
         self.batch = batch or max(8, min(LANES, 1 << (max(1, NUMBERS // case.clock.samples).bit_length() - 1)))
-        self.nominal, self.failed = None, 0
+        self.nominal: Any = None
+        self.failed = 0
         self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
 
     def _batch(self, device, values):

@@ -4,8 +4,10 @@ import dataclasses
 import functools
 import math
 import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_flows
+from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
@@ -64,11 +67,11 @@ class Ensemble:
     method: str
 
     @property
-    def samples(self):
+    def samples(self) -> int:
         """Number of draws N."""
         return len(self.failed)
 
-    def summary(self):
+    def summary(self) -> dict[str, Any]:
         """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
         or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's
         interval, which is cut at what the measure cannot pass, are None for a single draw."""
@@ -98,7 +101,7 @@ class Ensemble:
                     found[name] |= {"sd": None, "mean_interval95": None}
         return found
 
-    def violations(self):
+    def violations(self) -> list[dict[str, Any]]:
         """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run that failed counts as breaking it. The
         intervals are those of Clopper and Pearson."""
         rows = []
@@ -117,7 +120,7 @@ class Ensemble:
             )
         return rows
 
-    def to_json(self):
+    def to_json(self) -> dict[str, Any]:
         """The JSON object of `jaxtank uncertainty --json`."""
         from tuning.report.uncertainty import json_of
 
@@ -129,7 +132,7 @@ class Ensemble:
 
         return figures(self)
 
-    def save(self, folder, command=None):
+    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
         from tuning.report.uncertainty import save
 
@@ -151,24 +154,24 @@ def _within(name, values, end):
 
 
 def ensemble(
-    case,
-    distributions=None,
-    samples=1000,
-    key=0,
+    case: Case,
+    distributions: Mapping[str, Any] | None = None,
+    samples: int = 1000,
+    key: int = 0,
     *,
-    draws="random",
-    measures=None,
-    limits=None,
-    fan=True,
-    lanes=None,
-    devices=1,
-    shard=None,
-    folder=None,
-    checkpoint=None,
-    resume=False,
-    merge=False,
-    progress=None,
-):
+    draws: str = "random",
+    measures: Sequence[str] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    fan: bool = True,
+    lanes: int | None = None,
+    devices: int = 1,
+    shard: tuple[int, int] | None = None,
+    folder: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    merge: bool = False,
+    progress: Callable | None = None,
+) -> Ensemble | None:
     """Run a case on `samples` draws of what is uncertain.
 
     distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's own where None; key: seed of draws
@@ -199,7 +202,7 @@ def ensemble(
     lanes = lanes or _lanes(case, random, samples)
     p = probabilities(draws, space.dimensions, samples, key)
     count = -(-samples // lanes)
-    store = None
+    store: Any = None
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
         manifest["told"] = shards.told(case, case.limits if limits is None else limits)
@@ -227,7 +230,7 @@ def ensemble(
     shapes = {m: (lanes,) if ms.MEASURES[m].per == "run" else (lanes, ms.entries(m, case.loop.plant)) for m in wanted}
     for k in mine:
         if k not in batches:
-            batches[k] = store.get(k, {**shapes, "failed": (lanes,)})
+            batches[k] = cast(Any, store).get(k, {**shapes, "failed": (lanes,)})
     if jax.process_count() > 1:
         batches = _gather(batches, count)
     whole = {name: np.concatenate([batches[k][name] for k in range(count)])[:samples] for name in batches[0]}

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import sys
+from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cli.interrupts import Interrupts, put_back
@@ -43,7 +44,8 @@ def _tune(args):
     only = (args.samples, args.fresh, args.back_off)
     if (varied is not None or any(v is not None for v in only)) and args.robust is None:
         raise InputError("--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust")
-    finder, more = tuner.tune, {"choices": choices}
+    finder = tuner.tune
+    more: dict[str, Any] = {"choices": choices, "scenarios": scenarios}
     if args.robust is not None:
         from tuning.search.robust import tune_robust
 
@@ -67,7 +69,6 @@ def _tune(args):
         free=free,
         objective=objective,
         limits=limits,
-        **({} if args.robust else {"scenarios": scenarios}),
         **more,
         batch=None if args.batch is None else whole("--batch", args.batch, 1, 100_000),
         validation=whole("--validation", args.validation, 0, 100_000),
