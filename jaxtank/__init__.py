@@ -16,11 +16,11 @@ import to leave XLA as it is.
 """
 
 import importlib
-from typing import TYPE_CHECKING
 
 from jaxtank.xla import flags
 
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
+TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
     from jaxtank import analysis as analysis
     from jaxtank import controllers as controllers

@@ -9,9 +9,9 @@ result.save("tuned")
 """
 
 import importlib
-from typing import TYPE_CHECKING
 
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
+TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
     from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
