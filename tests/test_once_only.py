@@ -55,6 +55,11 @@ def test_one_file_calls_it_and_a_second_caller_is_found(texts, name):
     assert callers(name, texts | {"tuning/mine.py": planted}) == {ONLY[name], "tuning/mine.py"}
 
 
+def test_one_function_decides_whether_a_run_draws_noise(texts):
+    found = [path for path, text in texts.items() if "\ndef noisy(" in text]
+    assert found == ["tuning/problem/scenarios.py"]
+
+
 PLANT = dataclasses.replace(
     state_coupled_four_tank(15.0), overflow=True, bottom=True, rim=np.full(4, 0.5)
 )  # so low that all tanks overflow

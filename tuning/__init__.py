@@ -25,7 +25,13 @@ if TYPE_CHECKING:
     from tuning.optimal_input.perfect_information import bound as bound
     from tuning.problem.bounds import Bound as Bound
     from tuning.problem.problem import Problem as Problem
+    from tuning.problem.status import Status as Status
+    from tuning.search.options import LBFGS as LBFGS
+    from tuning.search.options import SQP as SQP
+    from tuning.search.options import TRF as TRF
+    from tuning.search.options import Adam as Adam
     from tuning.search.pareto import tradeoff as tradeoff
+    from tuning.search.result import ParameterChange as ParameterChange
     from tuning.search.result import TuningResult as TuningResult
     from tuning.search.robust import Certificate as Certificate
     from tuning.search.robust import tune_robust as tune_robust

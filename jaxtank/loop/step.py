@@ -1,5 +1,6 @@
 """One sample of the closed loop: what it needs, and what it hands to the next."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ class Decision(NamedTuple):
     """What observer and controller make of one sample."""
 
     estimate: Any  # Estimate of the levels [cm] and inflows [cm^3/s]
-    command: tuple  # (m) inputs before their limits [V]
+    command: Sequence  # (m) inputs before their limits [V]
     applied: tuple  # (m) inputs within them [V]
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample

@@ -341,7 +341,7 @@ def check_names(names):
 def placed(field):
     """Return the names of the measures with a place in `field`, "shown" or "summary", in order."""
     found = {m: getattr(spec, field) for m, spec in MEASURES.items()}
-    return tuple(sorted((m for m in found if found[m]), key=found.get))
+    return tuple(sorted((m for m in found if found[m]), key=lambda m: found[m]))
 
 
 def unit(name, units=DEFAULT):

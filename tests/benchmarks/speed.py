@@ -28,8 +28,8 @@ from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla import flags
 from tuning.bench import bench
+from tuning.problem.scenarios import noisy
 from tuning.report import tables
-from tuning.report.case import noisy
 
 README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"

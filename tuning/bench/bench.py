@@ -16,8 +16,8 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from tuning.problem.scenarios import noisy
 from tuning.report import tables
-from tuning.report.case import noisy
 from tuning.search.provenance import provenance
 
 MEASURES = ("rms_error_total", "max_level")

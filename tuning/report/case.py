@@ -118,11 +118,6 @@ WIDTH = 100
 BELIEFS = ("controller.model.", "controller.law.model.", "observer.model.")
 
 
-def noisy(case):
-    """True if a run of the case draws noise."""
-    return bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
-
-
 def clock(clock):
     """The clock as a table."""
     return dataclasses.asdict(clock)

@@ -16,8 +16,8 @@ from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.plants.network import TankNetwork
 from jaxtank.presets.paper import Claim
+from tuning.problem.scenarios import noisy
 from tuning.report import artifacts, figures, tables
-from tuning.report.case import noisy
 from tuning.report.html import document, drawings
 
 QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"

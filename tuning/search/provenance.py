@@ -12,13 +12,7 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.xla.flags import KEY
-from tuning.problem import scenarios
 from tuning.problem.scenarios import coarse_clock
-
-
-def noisy(case):
-    """True if a run of the case draws noise."""
-    return scenarios.noisy(case)
 
 
 def fingerprint(problem, method, options):

@@ -14,6 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from tuning.problem.problem import Problem
+from tuning.problem.scenarios import noisy
 from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.baseline import own_values, run_measures
@@ -24,7 +25,7 @@ from tuning.search.first_order import minibatches
 from tuning.search.kkt import UNSTABLE, downhill, optimality
 from tuning.search.methods import METHODS, approach, restore, slsqp
 from tuning.search.options import Solver, check_options, spelled_out
-from tuning.search.provenance import fingerprint, noisy, provenance
+from tuning.search.provenance import fingerprint, provenance
 from tuning.search.result import TuningResult, constraint_rows, message
 from tuning.search.screening import best_screened, distinct_starts, screen
 from tuning.storage.evaluation_log import Log, folder_of

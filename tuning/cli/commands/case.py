@@ -82,11 +82,12 @@ def simulate(args):
 
     from jaxtank import measures as ms
     from jaxtank.loop import run, step_size
+    from tuning.problem.scenarios import noisy
     from tuning.report import artifacts, tables
     from tuning.report import case as manual
     from tuning.search import baseline, provenance
 
-    key = jax.random.key(seed) if manual.noisy(case) else None
+    key = jax.random.key(seed) if noisy(case) else None
     if step_size.doubts(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = {m: v for m, v in baseline.run_measures(case.loop, case.clock, key).items()}
