@@ -93,6 +93,7 @@ SAME_NAME = (
     "atanh",
     "ceil",
 )
+"""Functions that C and MATLAB have by the same name."""
 
 
 def wrapped(head, items, indent, tail, width=130, more=""):

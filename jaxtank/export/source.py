@@ -38,6 +38,5 @@ def export(case, language="c", precision="double", name=None):
     return (print_c if language == "c" else print_matlab)(law, case, name, precision)
 
 
-"""Functions that C and MATLAB have by the same name."""
 C_CALLS |= {name: name.upper() for name in (*SAME_NAME, "cbrt", "exp2")}
 C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT", "rem": "FMOD", "is_finite": "isfinite"}

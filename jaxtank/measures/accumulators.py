@@ -9,6 +9,7 @@ from jaxtank.core.kahan import nothing, plus
 from jaxtank.core.numerics import at_least, magnitude, root_of_mean
 
 BAND = 0.05
+"""Half width of the recovery band, as a share of the setpoint [-]."""
 
 
 class Run(NamedTuple):
@@ -221,6 +222,7 @@ RESIDUALS = {
     "changes2": lambda run, state, sample, window, rest: _changes(state, sample),
     "over_rim2": lambda run, state, sample, window, rest: _over_rim(run, sample),
 }
+"""{accumulator: (run, its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
 
 
 def mean(run, values):

@@ -15,8 +15,6 @@ from jaxtank.core.numerics import at_least, root_of_mean
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, RESIDUALS, as_list, mean, recovery, root_mean, settled
 
-"""Half width of the recovery band, as a share of the setpoint [-]."""
-
 
 class Measure(NamedTuple):
     """A named number or list: read(run, {accumulator: state}) -> scalar or array."""
@@ -42,9 +40,6 @@ class Measure(NamedTuple):
     undefined: str = "the value is not a finite number"  # why a run has no value of it
     unserved: str = ""  # why a case has none, reported where it is not computed
     nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
-
-
-"""{accumulator: (run, its state, sample, window, rest) -> the numbers whose squares it sums at this sample}: what Gauss-Newton works on."""
 
 
 def _extremes(name, index=0):

@@ -10,10 +10,14 @@ from jaxtank.rig import check_limits
 from tuning.problem import scenarios as sc
 
 NOT_A_NUMBER = 1e6
+"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of the
+step) is taken to break its limit."""
 
 NOTHING = 1e-3
+"""Share of what a measure is about, below which a limit is as good as 0 [-]."""
 
 SPILL = 1e-6
+"""Volume over a rim that counts as none, where rims are physics, as a share of what the tank holds [-]."""
 
 
 class Limit(NamedTuple):

@@ -23,7 +23,6 @@ reverse, without a Gauss-Newton matrix."""
 ROOT = "rms_error_total"
 """The measure that is the root of a sum of squares over all outputs."""
 
-"""Measures whose limit is a lower one."""
 
 EXPLODED = 1e9
 """Size at which a cost, a margin or a slope is no longer a number to search with."""
@@ -33,13 +32,6 @@ RISKS = ("mean", "cvar", "worst")
 
 TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
-
-"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of the
-step) is taken to break its limit."""
-
-"""Share of what a measure is about, below which a limit is as good as 0 [-]."""
-
-"""Volume over a rim that counts as none, where rims are physics, as a share of what the tank holds [-]."""
 
 
 class Point(NamedTuple):

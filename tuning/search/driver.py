@@ -5,8 +5,10 @@ import numpy as np
 from tuning.problem.problem import EXPLODED
 
 BACKOFF = 1e-6
+"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
 
 SETTLED = 0.02
+"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as converged."""
 
 
 class Search:

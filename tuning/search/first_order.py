@@ -6,6 +6,7 @@ from tuning.search.driver import SETTLED
 from tuning.search.kkt import optimality
 
 STEEPEST = 10.0
+"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
 
 
 def lbfgs(search, z, iterations):

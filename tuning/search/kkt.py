@@ -4,6 +4,7 @@ import numpy as np
 import scipy
 
 SLOPING = 0.05
+"""KKT residual, of the scaled cost per unit of z, above which an answer is looked at once more: see `downhill`."""
 
 
 def optimality(search, point):
@@ -41,10 +42,14 @@ def _left(search, point):
 
 
 STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+"""Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
 
 UNSTABLE = 1.0 / STRIDES[-1]
+"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the least
+of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step."""
 
 LOWER_BY = 1e-4
+"""Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""
 
 
 def downhill(search, point):

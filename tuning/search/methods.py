@@ -8,15 +8,6 @@ from tuning.search.driver import Rough
 from tuning.search.first_order import adam, lbfgs
 from tuning.search.kkt import LOWER_BY
 
-"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
-
-"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as converged."""
-
-"""KKT residual, of the scaled cost per unit of z, above which an answer is looked at once more: see `downhill`."""
-
-"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
-
-
 STILL, LONG = 1e-9, 25
 """Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a line search never ends by itself [-]."""
 
@@ -221,13 +212,6 @@ def approach(search):
 
 NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
-
-"""Steps along the slope that is left at an answer, in the unit cube, at which something better is looked for."""
-
-"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the least
-of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step."""
-
-"""Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""
 
 
 METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam, "trf-slsqp": gauss_newton_first, "coarse-trf": coarse_first}
