@@ -99,7 +99,7 @@ def measure(name):
         "starts": len(result.starts),
         "evaluations": result.evaluations,
         "wall_s": result.wall_s,
-        "versions": {n: result.made_with[n] for n in VERSIONS},
+        "versions": {n: result.provenance[n] for n in VERSIONS},
     }
 
 
