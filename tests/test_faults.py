@@ -360,6 +360,8 @@ def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folde
 ENTRY = """
 import os, signal, sys
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with it ignored
+
 class Interrupting:
     def find_spec(self, name, path, target=None):
         if name == {module!r}:

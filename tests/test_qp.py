@@ -328,5 +328,5 @@ def test_the_loop_of_a_large_programme_is_one_compiled_function():
     case = presets.find("khalid/gpc-nc30-constrained")
     changes = {"controller.Nc": 44, "controller.Np": 50, "clock.duration": 80 * case.clock.dt}
     case = rig.set_values(case, changes)
-    program = loop._evaluate.lower(case.loop, case.clock, ("rms_error_total",), None, False)
+    program = loop.evaluate_compiled.lower(case.loop, case.clock, ("rms_error_total",), None, False)
     assert is_one_function(program.compile().as_text(), case.clock.samples)

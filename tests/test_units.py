@@ -66,7 +66,7 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
 def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_path, capsys):
     file = tmp_path / "rig.toml"
     file.write_text(
-        'name = "r"\nunits = ["cm", "L/min"]\n'
+        'name = "litres"\nunits = ["cm", "L/min"]\n'
         "[[tank]]\narea = 100.0\nrim = 50.0\ndrain = 0.5\nlevel = 10.0\n"
         "[[pump]]\ngain = 16.67\nto = 1\nlow = 0.0\nhigh = 20.0\n"
         '[law]\nkind = "pid"\nKc = 1.0\nTi = 30.0\n'
