@@ -1,4 +1,4 @@
-"""`python -m jaxtank` is the command `jaxtank`: the one door in this package that looks up to `tuning`."""
+"""`python -m jaxtank` is the command `jaxtank`: the only import of `tuning` in this package."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Errors at the door: one line that names the thing, its value, what is allowed, and the nearest valid name."""
+"""Input validation errors: one line that names the thing, its value, what is allowed, and the nearest valid name."""
 
 import difflib
 

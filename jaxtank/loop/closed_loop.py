@@ -103,7 +103,7 @@ def initial(loop, clock):
 
 def keyed(loop, key):
     """`loop`, if its noise can be drawn: without a key its levels are NaN from the start where `sensor.noise` is above 0. A traced noise is
-    not seen at the door, and a run without it, whose slope by it is 0, would look like an answer."""
+    not seen by input validation, and a run without it, whose slope by it is 0, would look like an answer."""
     if key is not None:
         return loop
     noise = jnp.asarray(loop.sensor.noise)

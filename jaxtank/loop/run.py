@@ -36,7 +36,7 @@ def simulate(
     """Run the loop and keep every `save_every`-th sample.
 
     loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a Trajectory.
-    Raises InputError at the door and NonFiniteError if a level stops being finite (outside a trace).
+    Raises InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace).
     """
     check(loop, clock, key)
     if not isinstance(save_every, int) or save_every < 1:
@@ -55,7 +55,7 @@ def evaluate(
     """Run the loop and keep only running measures.
 
     measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or None; returns {name: scalar, or array with one
-    entry per output, tank or pump}. Raises InputError at the door and NonFiniteError if a level stops being finite (outside a trace; inside
+    entry per output, tank or pump}. Raises InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace; inside
     one, the values of such a run are NaN, and so are those of a run with noise and no key).
     """
     names = _names(measures)
@@ -95,7 +95,7 @@ def sensitivities(
     it to about ten). squares: {measure: weight} of measures that are sums of squares, sum_k w_k v_k^2: the matrix is
     2 sum_k w_k grad(v_k) grad(v_k)', the second derivative of their weighted sum but for the residuals' own curvature; None: the mean
     square tracking error of all outputs. Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix, True if
-    the run stopped being finite), P in the order of `values`. key as in `evaluate`. Raises InputError at the door; a run that is not
+    the run stopped being finite), P in the order of `values`. key as in `evaluate`. Raises InputError for invalid input; a run that is not
     finite is told by the flag.
     """
     if not values:

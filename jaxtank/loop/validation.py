@@ -1,4 +1,4 @@
-"""Checks at the door: a loop and a clock that cannot be run are told so before anything is compiled."""
+"""Input validation of a loop and a clock: what cannot be run is refused before anything is compiled."""
 
 import dataclasses
 import re

@@ -145,7 +145,7 @@ SCENARIO_KEYS = ("name", "values", "seed", "weight")
 
 
 def check(case: Case) -> Case:
-    """`case`, after every check at the door: the loop and clock can be run, and every plateau of the reference has a steady state."""
+    """`case`, after input validation: the loop and clock can be run, and every plateau of the reference has a steady state."""
     lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
     if case.reachable and (why := unreachable(case)):
         raise EquilibriumError(why)
