@@ -9,7 +9,9 @@ from jaxtank.loop.closed_loop import ClosedLoop
 
 
 class Free(NamedTuple):
-    """Where a tunable parameter may lie, in its own unit; "log" for gains and times, "linear" for what may pass through 0."""
+    """Where a tunable parameter may lie, in its own unit; "log" for gains and times, "linear" for
+    what may pass through 0.
+    """
 
     low: float
     high: float
@@ -32,7 +34,9 @@ class Scenario(NamedTuple):
 
 
 class Mirror(NamedTuple):
-    """Gains that exchange roles: image({name: value}) are the values, of some or all names, that give the same loop or nearly so."""
+    """Gains that exchange roles: image({name: value}) are the values, of some or all names, that
+    give the same loop or nearly so.
+    """
 
     words: str
     image: Callable
@@ -42,13 +46,17 @@ class Mirror(NamedTuple):
 class Case:
     """One rig, one law, one reference, one clock, with the gains its paper prints.
 
-    limits: {measure: upper limit (number, or one per entry), or "rim" for the rim of each tank}; free: {parameter: Free}, what
-    `tune` tunes unless told otherwise; objective: {measure: weight}, what it makes small; reachable: whether every plateau of the
-    reference must have a steady state within the pumps' direction (False where the paper asks for one that has none); scenarios: what
-    `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange roles, where the law has such;
-    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on; covariance: (names (n,), covariance (n, n) in
-    their units) of parameters that were identified together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its
-    header}, where a log of this rig names them otherwise; names: {"tank" or "pump": a name of each, "" for none}, where a rig gives them.
+    limits: {measure: upper limit (number, or one per entry), or "rim" for the rim of each tank};
+    free: {parameter: Free}, what `tune` tunes unless told otherwise; objective: {measure: weight},
+    what it makes small; reachable: whether every plateau of the reference must have a steady state
+    within the pumps' direction (False where the paper asks for one that has none); scenarios: what
+    `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange
+    roles, where the law has such;
+    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on;
+    covariance: (names (n,), covariance (n, n) in their units) of parameters that were identified
+    together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its header}, where
+    a log of this rig names them otherwise; names: {"tank" or "pump": a name of each, "" for none},
+    where a rig gives them.
     """
 
     name: str

@@ -1,5 +1,6 @@
-"""What the audit of gradients looks at, function by function, each at random points of every kind: dry, full, level with a neighbour,
-limited."""
+"""What the audit of gradients looks at, function by function, each at random points of every kind:
+dry, full, level with a neighbour, limited.
+"""
 
 import dataclasses
 import functools
@@ -29,8 +30,9 @@ POINTS = 12
 
 
 def scales_of(tree):
-    """What counts as a change of 1 of every number in a tree: itself, but not less than a twentieth of the largest beside it; 0.01 where
-    all are zero."""
+    """What counts as a change of 1 of every number in a tree: itself, but not less than a twentieth
+    of the largest beside it; 0.01 where all are zero.
+    """
 
     def one(a):
         size = np.abs(np.asarray(a, dtype=float))
@@ -44,11 +46,19 @@ def over(trees, function, name="", **more):
     trees = [jax.tree.map(lambda a: np.asarray(a, dtype=float), tree) for tree in trees]
     unravel = ravel_pytree(trees[0])[1]
     flat = lambda theta: ravel_pytree(function(unravel(theta)))[0]
-    return Subject(name, flat, np.array([ravel_pytree(t)[0] for t in trees]), np.array([scales_of(t) for t in trees]), **more)
+    return Subject(
+        name,
+        flat,
+        np.array([ravel_pytree(t)[0] for t in trees]),
+        np.array([scales_of(t) for t in trees]),
+        **more,
+    )
 
 
 def subject(name, quick=False, points=POINTS, **more):
-    """Register `make(rng) -> (a point's tree, function)`; called once per point, the function of the first is taken."""
+    """Register `make(rng) -> (a point's tree, function)`; called once per point, the function of
+    the first is taken.
+    """
 
     def register(make):
         def build():
@@ -65,7 +75,9 @@ def subject(name, quick=False, points=POINTS, **more):
 
 
 def near(rng, tree, by=0.05):
-    return jax.tree.map(lambda a: np.asarray(a, dtype=float) * (1.0 + by * rng.standard_normal(np.shape(a))), tree)
+    return jax.tree.map(
+        lambda a: np.asarray(a, dtype=float) * (1.0 + by * rng.standard_normal(np.shape(a))), tree
+    )
 
 
 # numerics: levels from far below zero to a full tank, most of them about the knee
@@ -94,7 +106,11 @@ def _(rng):
 @subject("numerics.limited_root limited_flow", quick=True, points=60)
 def _(rng):
     """Levels from empty up, the limit and the flow holding in about half of the points each."""
-    h, supply, s = 10 ** rng.uniform(-4, 1, 2), 10 ** rng.uniform(-1, 1.1), rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1)
+    h, supply, s = (
+        10 ** rng.uniform(-4, 1, 2),
+        10 ** rng.uniform(-1, 1.1),
+        rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1),
+    )
     return (*h, supply, s), lambda p: (
         numerics.limited_root(p[0], 0.01, p[2]),
         numerics.limited_root(-p[0], 0.01, p[2]),
@@ -120,7 +136,10 @@ def _(rng):
 
 @subject("hydraulics.efflux disc", quick=True, points=20)
 def _(rng):
-    return (10 ** rng.uniform(-3, 1.4), rng.uniform(900, 1000)), lambda p: (hydraulics.efflux(*p, 0.01), hydraulics.disc(p[0]))
+    return (10 ** rng.uniform(-3, 1.4), rng.uniform(900, 1000)), lambda p: (
+        hydraulics.efflux(*p, 0.01),
+        hydraulics.disc(p[0]),
+    )
 
 
 @subject("controllers.fuzzy.membership", quick=True, points=40)
@@ -197,7 +216,12 @@ def _(rng):
 def _(rng):
     plant = small_network(rng)
     broken = faults.faults(
-        plant, [("drain[1]", 1.0, 2.0, 1.0, 0.2), ("pump_gain[0]", 1.0, 3.0, 0.6, 0.0), ("pipe[1]", 0.0, 2.0, 1.3, 0.1)]
+        plant,
+        [
+            ("drain[1]", 1.0, 2.0, 1.0, 0.2),
+            ("pump_gain[0]", 1.0, 3.0, 0.6, 0.0),
+            ("pipe[1]", 0.0, 2.0, 1.3, 0.1),
+        ],
     )
     active = (1.0, 1.0, 0.0)
 
@@ -225,15 +249,30 @@ of_signal("Ramps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0), windows
 of_signal("Ramps cut short", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=6.0), windows=True)
 of_signal("Ramps quintic", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0, shape="quintic"))
 of_signal("Ramps steps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=0.0))
-SINE = {"amplitude": np.array(2.0), "offset": np.array(1.0), "period": 7.0, "zero": 1.0, "start": 3.0, "end": 15.0}
+SINE = {
+    "amplitude": np.array(2.0),
+    "offset": np.array(1.0),
+    "period": 7.0,
+    "zero": 1.0,
+    "start": 3.0,
+    "end": 15.0,
+}
 of_signal("Sine", lambda: signals.Sine(**SINE, channel=1, width=2))
 of_signal(
     "Sum",
-    lambda: signals.Sum(first=signals.ramps((3.0, 8.0), CHANGES, ramp=3.0), second=signals.Sine(**SINE, channel=1, width=2)),
+    lambda: signals.Sum(
+        first=signals.ramps((3.0, 8.0), CHANGES, ramp=3.0),
+        second=signals.Sine(**SINE, channel=1, width=2),
+    ),
     windows=True,
 )
-of_signal("Table hold", lambda: signals.Table(values=np.arange(1.0, 15.0).reshape(2, 7), period=1.7))
-of_signal("Table linear", lambda: signals.Table(values=np.arange(1.0, 15.0).reshape(2, 7), period=1.7, between="linear"))
+of_signal(
+    "Table hold", lambda: signals.Table(values=np.arange(1.0, 15.0).reshape(2, 7), period=1.7)
+)
+of_signal(
+    "Table linear",
+    lambda: signals.Table(values=np.arange(1.0, 15.0).reshape(2, 7), period=1.7, between="linear"),
+)
 of_signal("Pours", lambda: signals.pours(3, [(1.0, 1.1, 0, 500.0), (4.0, 2.3, 2, -100.0)]))
 
 
@@ -245,9 +284,9 @@ def _(rng):
     T = 30
     t = 0.5 * np.arange(T)
     r = np.stack([np.where(t < 2, 5.0, 8.0), np.where(t < 2, 9.0, 7.0)])
-    e = (np.where(t < 2, 0.0, np.array([[-3.0], [2.0]])) * np.exp(-(t - 2) / 1.5) * np.cos(t - 2)) + 0.05 * rng.standard_normal(
-        (2, T)
-    )
+    e = (
+        np.where(t < 2, 0.0, np.array([[-3.0], [2.0]])) * np.exp(-(t - 2) / 1.5) * np.cos(t - 2)
+    ) + 0.05 * rng.standard_normal((2, T))
     e[:, -4:] *= 0.2
     tree = {  # not the setpoint: the time measures ask whether it has changed, to the last bit
         "e": e, "x_hat": r + e + 0.1 * rng.standard_normal((2, T)), "command": rng.uniform(-2, 14, (2, T)),
@@ -257,10 +296,19 @@ def _(rng):
     names = tuple(measures.MEASURES)
 
     def function(p):
-        run = measures.Run(2, 2, 2, T, 0.5, tuple(p["low"]), tuple(p["high"]), tuple(p["rim"]), jnp.zeros(()))
+        run = measures.Run(
+            2, 2, 2, T, 0.5, tuple(p["low"]), tuple(p["high"]), tuple(p["rim"]), jnp.zeros(())
+        )
         after = t >= 2
-        still = {"t": t, "after": after, "since": np.where(after, t - 2, 0.0), "poured": np.where(t >= 3, t - 3.0, -1.0)}
-        moving = {"r": r.T} | {name: p[name].T for name in ("e", "x_hat", "command", "u", "spilled", "rest")}
+        still = {
+            "t": t,
+            "after": after,
+            "since": np.where(after, t - 2, 0.0),
+            "poured": np.where(t >= 3, t - 3.0, -1.0),
+        }
+        moving = {"r": r.T} | {
+            name: p[name].T for name in ("e", "x_hat", "command", "u", "spilled", "rest")
+        }
 
         def update(acc, now):
             pair = {name: tuple(now[name][i] for i in range(2)) for name in moving}
@@ -306,7 +354,11 @@ def delivered(p):
 def of_pumps(name, **more):
     @subject(f"actuators.PumpBank {name}", points=20)
     def _(rng):
-        return (near(rng, bank(rng, **more)), rng.uniform(-4, 16, (5, 2)), rng.uniform(0.5, 2, 3)), delivered
+        return (
+            near(rng, bank(rng, **more)),
+            rng.uniform(-4, 16, (5, 2)),
+            rng.uniform(0.5, 2, 3),
+        ), delivered
 
 
 ZONE = {"dead_zone": np.array([3.0, 2.5])}
@@ -321,9 +373,14 @@ of_pumps("hysteresis", **ZONE, dead_zone_kind="hysteresis")
 @subject("sensors.LevelSensor", quick=True)
 def _(rng):
     sensor = sensors.LevelSensor(
-        gain=np.array([5.0, 4.0]), noise=np.array([0.1, 0.2]), offset=np.array([0.3, -0.2]), full_scale=np.array(5.0)
+        gain=np.array([5.0, 4.0]),
+        noise=np.array([0.1, 0.2]),
+        offset=np.array([0.3, -0.2]),
+        full_scale=np.array(5.0),
     )
-    return (near(rng, sensor), rng.uniform(0, 20, 2), rng.normal(size=2)), lambda p: p[0].read(tuple(p[1]), tuple(p[2]))
+    return (near(rng, sensor), rng.uniform(0, 20, 2), rng.normal(size=2)), lambda p: p[0].read(
+        tuple(p[1]), tuple(p[2])
+    )
 
 
 # linear, qp, analysis
@@ -348,20 +405,33 @@ def _(rng):
 
 @subject("linear.lyapunov discrete_lyapunov")
 def _(rng):
-    return matrices(rng), lambda p: (riccati.lyapunov(p[0], weights(p)[0]), riccati.discrete_lyapunov(0.1 * p[0], weights(p)[0]))
+    return matrices(rng), lambda p: (
+        riccati.lyapunov(p[0], weights(p)[0]),
+        riccati.discrete_lyapunov(0.1 * p[0], weights(p)[0]),
+    )
 
 
 @subject("linear.riccati lqr")
 def _(rng):
-    return matrices(rng), lambda p: (riccati.riccati(p[0], p[1], *weights(p)), riccati.lqr(p[0], p[1], *weights(p)))
+    return matrices(rng), lambda p: (
+        riccati.riccati(p[0], p[1], *weights(p)),
+        riccati.lqr(p[0], p[1], *weights(p)),
+    )
 
 
 @subject("linear.discrete_riccati")
 def _(rng):
-    return matrices(rng), lambda p: riccati.discrete_riccati(*riccati.zero_order_hold(p[0], p[1], 0.5), *weights(p))
+    return matrices(rng), lambda p: riccati.discrete_riccati(
+        *riccati.zero_order_hold(p[0], p[1], 0.5), *weights(p)
+    )
 
 
-@subject("qp.solve", points=40, tolerance=1e-5, why="the interior point stops at a complementarity of 1e-12")
+@subject(
+    "qp.solve",
+    points=40,
+    tolerance=1e-5,
+    why="the interior point stops at a complementarity of 1e-12",
+)
 def _(rng):
     """Three variables, four two-sided rows: about half of the points have a row that binds."""
     l = -rng.uniform(0.1, 1.5, 4)
@@ -415,8 +485,12 @@ def observed():
 FOUR = functools.partial(state_coupled_four_tank, FAST_AREA)
 FILTER = {"process": np.full(4, 0.02), "measurement": np.full(4, 0.05), "measured": (0, 1)}
 OBSERVERS = {
-    "Kalman": lambda: observers.Kalman(model=FOUR(), levels=np.array([8.0, 7.0, 6.0, 9.0]), inputs=np.array([3.0, 3.1]), **FILTER),
-    "ExtendedKalman": lambda: observers.ExtendedKalman(model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **FILTER),
+    "Kalman": lambda: observers.Kalman(
+        model=FOUR(), levels=np.array([8.0, 7.0, 6.0, 9.0]), inputs=np.array([3.0, 3.1]), **FILTER
+    ),
+    "ExtendedKalman": lambda: observers.ExtendedKalman(
+        model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **FILTER
+    ),
     "DisturbanceObserver": lambda: presets.find("gouta2022/chadpc").loop.observer,
 }
 
@@ -437,11 +511,17 @@ of_observer("DisturbanceObserver", 2, 3)
 
 
 def commanded(case):
-    low, high, dt = np.asarray(case.loop.actuator.low), np.asarray(case.loop.actuator.high), case.clock.dt
+    low, high, dt = (
+        np.asarray(case.loop.actuator.low),
+        np.asarray(case.loop.actuator.high),
+        case.clock.dt,
+    )
 
     def function(p):
         law, x, r, dr, ddr, d, u0 = p
-        plan = jax.tree.map(lambda a: a[0], law.prepare(*(tuple(v[None] for v in s) for s in (r, dr, ddr))))
+        plan = jax.tree.map(
+            lambda a: a[0], law.prepare(*(tuple(v[None] for v in s) for s in (r, dr, ddr)))
+        )
         state, out = law.init(tuple(x[0]), tuple(u0)), []
         for k in range(2):
             tick = Tick(t=0.0, r=tuple(r), dr=tuple(dr), ddr=tuple(ddr), dt=dt, plan=plan)
@@ -472,7 +552,15 @@ def of_law(name, points=12, change=lambda case: case, **more):
         u0 = np.asarray(loop.actuator.low) + rng.uniform(0.2, 0.8, m) * (
             np.asarray(loop.actuator.high) - np.asarray(loop.actuator.low)
         )
-        return (near(rng, loop.controller, 0.02), x, r, rate[0], 0.1 * rate[1], 0.01 * rng.normal(size=n), u0), commanded(case)
+        return (
+            near(rng, loop.controller, 0.02),
+            x,
+            r,
+            rate[0],
+            0.1 * rate[1],
+            0.01 * rng.normal(size=n),
+            u0,
+        ), commanded(case)
 
 
 LAWS = {
@@ -483,12 +571,18 @@ LAWS = {
     "khalid": ("gpc", "gpc-nc2-constrained", "laguerre-mimo", "laguerre-mimo-constrained"),
 }
 ROUGH = {
-    "gpc-nc2-constrained": {"tolerance": 1e-4, "why": "the interior point stops at a complementarity of 1e-12"},
+    "gpc-nc2-constrained": {
+        "tolerance": 1e-4,
+        "why": "the interior point stops at a complementarity of 1e-12",
+    },
     "laguerre-mimo-constrained": {
         "tolerance": 1e-4,
         "floor": 1.0,
-        "why": "where many of its rows bind, the 15 iterations leave 4e-7 V, which differences feel and the slope of the implicit function "
-        "does not: -1e-4 against -2e-8 V at point 10, direction 23; with 30 iterations both are 0 to 1e-10",
+        "why": (
+            "where many of its rows bind, the 15 iterations leave 4e-7 V, which differences feel"
+            " and the slope of the implicit function does not: -1e-4 against -2e-8 V at point 10,"
+            " direction 23; with 30 iterations both are 0 to 1e-10"
+        ),
     },
 }
 for _paper, _names in LAWS.items():

@@ -1,4 +1,6 @@
-"""Everything here runs in float64; a test of float32 says so and runs in a process of its own. What slow.txt lists is marked slow."""
+"""Everything here runs in float64; a test of float32 says so and runs in a process of its own. What
+slow.txt lists is marked slow.
+"""
 
 from pathlib import Path
 
@@ -10,7 +12,11 @@ import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 jax.config.update("jax_enable_x64", True)
 
 
-SLOW = {line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if line and not line.startswith("#")}
+SLOW = {
+    line
+    for line in (Path(__file__).parent / "slow.txt").read_text().splitlines()
+    if line and not line.startswith("#")
+}
 
 
 @pytest.hookimpl(tryfirst=True)  # before the marker is looked for
@@ -23,7 +29,9 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def gouta():
-    """Cases of gouta2015 by name, with overrides by dotted name: gouta("ngpc", {"reference.ramp": 30.0})."""
+    """Cases of gouta2015 by name, with overrides by dotted name: gouta("ngpc", {"reference.ramp":
+    30.0}).
+    """
     from jaxtank import presets, rig
 
     cases = presets.load("gouta2015").cases

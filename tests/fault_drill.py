@@ -1,12 +1,15 @@
-"""Kills `jaxtank tune`, `uncertainty` and `identify` at random moments and goes on: python tests/fault_drill.py 50 [uncertainty ...] [--record]
+"""Kills `jaxtank tune`, `uncertainty` and `identify` at random moments and goes on: python
+tests/fault_drill.py 50 [uncertainty ...] [--record]
 
-Each trial starts one of the commands with --out, sends SIGKILL at a seeded moment, half of them anywhere in the time that an undisturbed run
-takes, half just after some number of evaluations has been kept, and goes on with --resume (or once more, where nothing had been kept yet).
-What goes on may be killed as well, up to four times. The folder must then hold the files of an undisturbed run, byte by byte but for the wall
-time and the command line that the report tells, and nothing else.
+Each trial starts one of the commands with --out, sends SIGKILL at a seeded moment, half of them
+anywhere in the time that an undisturbed run takes, half just after some number of evaluations has
+been kept, and goes on with --resume (or once more, where nothing had been kept yet). What goes on
+may be killed as well, up to four times. The folder must then hold the files of an undisturbed run,
+byte by byte but for the wall time and the command line that the report tells, and nothing else.
 
-Processes are forked from one that has imported everything and started no jax, and find the programs that the runs left alone compiled (jax's
-compilation cache): a kill tells more in a search than in seconds of imports and compilation.
+Processes are forked from one that has imported everything and started no jax, and find the programs
+that the runs left alone compiled (jax's compilation cache): a kill tells more in a search than in
+seconds of imports and compilation.
 """
 
 import json
@@ -90,8 +93,9 @@ def kept(folder):
 
 
 def kill(child, folder, seconds, count):
-    """SIGKILL after `seconds`, or, where count is given, that long after `count` has been kept. The exit code of a run that had ended before,
-    else None."""
+    """SIGKILL after `seconds`, or, where count is given, that long after `count` has been kept. The
+    exit code of a run that had ended before, else None.
+    """
     until = time.monotonic() + PATIENCE
     while count is not None and kept(folder) < count:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -124,7 +128,9 @@ def contents(folder):
 
 
 def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
-    """{"kills", "trials", "afresh", "wrong"}: kills in all until there are `count`, runs begun once more, what did not come out right."""
+    """{"kills", "trials", "afresh", "wrong"}: kills in all until there are `count`, runs begun once
+    more, what did not come out right.
+    """
     home, here = Path(tempfile.mkdtemp()), Path.cwd()
     cli, rng = prepare(str(home / "cache")), random.Random(seed)
     os.chdir(home)
@@ -138,7 +144,10 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
             began = time.monotonic()
             code, steps = undisturbed(cli, COMMANDS[name], Path("alone") / name)
             whole[name] = code, steps, time.monotonic() - began, contents(Path("alone") / name)
-            tell(f"{name}: exit code {code}, {steps} kept on the way, {whole[name][2]:.1f} s", flush=True)
+            tell(
+                f"{name}: exit code {code}, {steps} kept on the way, {whole[name][2]:.1f} s",
+                flush=True,
+            )
         told = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
         while told["kills"] < count:
             name = commands[told["trials"] % len(commands)]
@@ -150,7 +159,9 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                 child = start(cli, [*COMMANDS[name], option, str(folder)])
                 if attempt < 4 and (attempt == 0 or rng.random() < 0.5) and told["kills"] < count:
                     few = rng.randint(1, max(1, whole[name][1])) if rng.random() < 0.5 else None
-                    code = kill(child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few)
+                    code = kill(
+                        child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few
+                    )
                     if code is None:
                         told["kills"] += 1
                         again = True
@@ -158,20 +169,28 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                 else:
                     code = ended(child)
                 if again and code == 2 and AFRESH.search(Path("said.txt").read_text()):
-                    again = False  # nothing had been kept yet, or all was done and only the log went
+                    # nothing had been kept yet, or all was done and only the log went
+                    again = False
                     told["afresh"] += 1
                     continue
                 break
             if code != whole[name][0]:
-                told["wrong"].append(f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}")
+                told["wrong"].append(
+                    f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}"
+                )
             elif contents(folder) != whole[name][3]:
                 mine, theirs = contents(folder), whole[name][3]
                 told["wrong"].append(
-                    f"{name}: differs in {sorted(n for n in mine.keys() | theirs.keys() if mine.get(n) != theirs.get(n))}"
+                    f"{name}: differs in"
+                    f" {sorted(n for n in mine.keys() | theirs.keys() if mine.get(n) != theirs.get(n))}"
                 )
                 if os.environ.get("KEEP"):
                     shutil.copytree(folder, Path(os.environ["KEEP"]) / f"{name}{told['trials']}")
-            tell(f"{name}: {told['kills'] - first} killed, {told['kills']} in all; {len(told['wrong'])} wrong", flush=True)
+            tell(
+                f"{name}: {told['kills'] - first} killed, {told['kills']} in all;"
+                f" {len(told['wrong'])} wrong",
+                flush=True,
+            )
         return told
     finally:
         os.chdir(here)
@@ -194,13 +213,18 @@ if __name__ == "__main__":
     began = time.monotonic()
     found = drill(count, commands=tuple(n for n in COMMANDS if n in sys.argv) or tuple(COMMANDS))
     print(
-        f"{found['kills']} kills of {found['trials']} runs in {time.monotonic() - began:.0f} s; "
-        f"{found['afresh']} had kept nothing yet; {len(found['wrong'])} did not end as the run left alone"
+        f"{found['kills']} kills of {found['trials']} runs in {time.monotonic() - began:.0f} s;"
+        f" {found['afresh']} had kept nothing yet; {len(found['wrong'])} did not end as the run"
+        " left alone"
     )
     print("\n".join(found["wrong"]))
     if "--record" in sys.argv:
         from survived import record
 
         right = found["trials"] - len(found["wrong"])
-        record("kills", found["kills"], f"{right} of {found['trials']} runs ended with the bytes of a run left alone")
+        record(
+            "kills",
+            found["kills"],
+            f"{right} of {found['trials']} runs ended with the bytes of a run left alone",
+        )
     sys.exit(1 if found["wrong"] else 0)

@@ -2,11 +2,11 @@
 
     python tests/interrupt_drill.py 200 [tune ...] [--record]
 
-Half of the moments are SIGINT, half SIGTERM. Each run must end with exit code 130 or 143 and one line,
-without a traceback or an abort, and leave no lock and no unfinished file in its folder; a search that
-was interrupted must have written its result. A signal before the first line of this program, or after
-its last, is answered by the interpreter or the system; a shell sees 130 or 143 then, too. These are
-counted apart.
+Half of the moments are SIGINT, half SIGTERM. Each run must end with exit code 130 or 143 and one
+line, without a traceback or an abort, and leave no lock and no unfinished file in its folder; a
+search that was interrupted must have written its result. A signal before the first line of this
+program, or after its last, is answered by the interpreter or the system; a shell sees 130 or 143
+then, too. These are counted apart.
 """
 
 import json
@@ -49,7 +49,9 @@ PATIENCE = 300.0  # s
 def launch(name, folder):
     """The process of a command that writes to `folder`, if it writes."""
     words = [*COMMANDS[name], *(["--out", str(folder)] if name in WRITE else [])]
-    return subprocess.Popen([*JAXTANK, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [*JAXTANK, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def duration(name, folder):
@@ -66,11 +68,19 @@ def duration(name, folder):
 
 def wrong(number, code, out, err, folder):
     """What is wrong with a run that got signal `number`, None where it ended as it should."""
-    lines = [line for line in err.splitlines() if line.startswith("jaxtank: ") and "note: " not in line]
+    lines = [
+        line for line in err.splitlines() if line.startswith("jaxtank: ") and "note: " not in line
+    ]
     word = "interrupted" if number == signal.SIGINT else "terminated"
     if code != 128 + number:
         return f"exit code {code}"
-    if "Traceback" in err or "Exception" in err or "Fatal" in err or len(lines) != 1 or word not in lines[0]:
+    if (
+        "Traceback" in err
+        or "Exception" in err
+        or "Fatal" in err
+        or len(lines) != 1
+        or word not in lines[0]
+    ):
         return "more or less than one line"
     if "best point so far" in lines[0] and not (folder / "result.json").exists():
         return "no result"
@@ -83,12 +93,13 @@ def wrong(number, code, out, err, folder):
 def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
     """Send `count` signals; takes: {command: seconds it takes}, measured where None.
 
-    Returns {"signals", "outside", "slowest", "wrong"}: how many were sent, how many of them before the
-    first line of the program or after its last, the longest time until the end [s], and what did not
-    end as it should.
+    Returns {"signals", "outside", "slowest", "wrong"}: how many were sent, how many of them before
+    the first line of the program or after its last, the longest time until the end [s], and what
+    did not end as it should.
     """
     rng, home, here = random.Random(seed), Path(tempfile.mkdtemp()), Path.cwd()
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # what is ignored here is ignored in a child
+    # what is ignored here is ignored in a child
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(home)
     try:
         if "identify" in commands:
@@ -121,10 +132,16 @@ def drill(count, seed=0, commands=tuple(COMMANDS), takes=None, report=print):
             outside = code == -number and "jaxtank: " not in err
             found["outside"] += outside
             why = None if outside else wrong(number, code, out, err, folder)
-            row = f"{found['signals']} {name} {number.name} at {moment:.2f} s: {code} after {took:.2f} s"
+            row = (
+                f"{found['signals']} {name} {number.name} at {moment:.2f} s: {code} after"
+                f" {took:.2f} s"
+            )
             if why:
                 found["wrong"].append(f"{row}: {why}: {err[-1500:]}")
-            report(row + (" (interpreter)" if outside else "") + (f" WRONG: {why}" if why else ""), flush=True)
+            report(
+                row + (" (interpreter)" if outside else "") + (f" WRONG: {why}" if why else ""),
+                flush=True,
+            )
         return found
     finally:
         os.chdir(here)
@@ -142,8 +159,8 @@ if __name__ == "__main__":
         record(
             "interrupts",
             found["signals"],
-            f"{good} ended with 130 or 143 and one line, the slowest after {found['slowest']:.1f} s; "
-            f"{found['outside']} came before the first line of this program or after its last, where the interpreter answers; "
-            f"{len(found['wrong'])} ended otherwise",
+            f"{good} ended with 130 or 143 and one line, the slowest after {found['slowest']:.1f}"
+            f" s; {found['outside']} came before the first line of this program or after its last,"
+            f" where the interpreter answers; {len(found['wrong'])} ended otherwise",
         )
     sys.exit(1 if found["wrong"] else 0)

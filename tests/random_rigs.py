@@ -1,5 +1,6 @@
-"""Random rigs of one to six tanks that share one compiled program: every orifice, pipe, spill and pump that six tanks can have is there,
-and what a rig does not have is closed. A rig of fewer tanks is padded with dry ones that nothing feeds.
+"""Random rigs of one to six tanks that share one compiled program: every orifice, pipe, spill and
+pump that six tanks can have is there, and what a rig does not have is closed. A rig of fewer tanks
+is padded with dry ones that nothing feeds.
 """
 
 import dataclasses
@@ -12,7 +13,8 @@ from jaxtank.plants.network import network
 SIZE = 6
 LINKS = tuple(itertools.permutations(range(SIZE), 2))
 PIPES = tuple(itertools.combinations(range(SIZE), 2))
-FEEDS = PIPES  # a pump for every pair, split between the two; alone on a tank where the split is 0 or 1
+# a pump for every pair, split between the two; alone on a tank where the split is 0 or 1
+FEEDS = PIPES
 SPILLS = PIPES  # an upper tank spills into those after it
 KINDS = ("series", "parallel", "valve-coupled", "quadruple", "mixed")
 RIM = 20.0
@@ -26,7 +28,11 @@ class Parts:
         self.area = np.r_[rng.uniform(50, 400, tanks), np.full(SIZE - tanks, 50.0)]
         # padded tanks have an outlet too, so that a linear balance has one solution
         self.drain = np.r_[rng.uniform(0.05, 0.3, tanks), np.full(SIZE - tanks, 0.1)]
-        self.orifice, self.pipe, self.caught = np.zeros(len(LINKS)), np.zeros(len(PIPES)), np.zeros(len(SPILLS))
+        self.orifice, self.pipe, self.caught = (
+            np.zeros(len(LINKS)),
+            np.zeros(len(PIPES)),
+            np.zeros(len(SPILLS)),
+        )
         self.split = np.ones(len(FEEDS))
         self.pumps = []
 
@@ -38,7 +44,8 @@ class Parts:
 
     def feed(self, one, other=None):
         """A pump into one tank, or split between two."""
-        # alone: any pair with the tank in it; one that is not in use yet, for every pump has an input of its own
+        # alone: any pair with the tank in it; one that is not in use yet, for every pump has an
+        # input of its own
         pairs = [(one, other)] if other is not None else [(one, k) for k in range(SIZE) if k != one]
         first, second = next(p for p in pairs if FEEDS.index((min(p), max(p))) not in self.pumps)
         pump = FEEDS.index((min(first, second), max(first, second)))
@@ -48,8 +55,9 @@ class Parts:
 
 
 def random_rig(seed, tanks, kind, *, rim=1e6, knee=0.01):
-    """(TankNetwork of SIZE tanks of which `tanks` are in use, numpy generator, pumps in use) of one of KINDS. Rims are physics; by default they
-    are out of reach [cm]."""
+    """(TankNetwork of SIZE tanks of which `tanks` are in use, numpy generator, pumps in use) of one
+    of KINDS. Rims are physics; by default they are out of reach [cm].
+    """
     rng = np.random.default_rng([seed, tanks, KINDS.index(kind)])
     parts, every = Parts(rng, tanks), range(tanks)
     if kind == "series":  # a cascade that the last tank leaves
@@ -69,7 +77,8 @@ def random_rig(seed, tanks, kind, *, rim=1e6, knee=0.01):
         parts.feed(0)
         if tanks > 1:
             parts.feed(tanks - 1)
-    elif kind == "quadruple":  # upper tanks pour into lower ones, pumps feed a lower tank and the upper one of its neighbour
+    # upper tanks pour into lower ones, pumps feed a lower tank and the upper one of its neighbour
+    elif kind == "quadruple":
         half = tanks // 2
         for i in range(half):
             parts.pour(half + i, i, 0.05, 0.3)
@@ -126,8 +135,9 @@ def voltages(rng, pumps, low=0.0, high=10.0):
 
 
 def flows(plant, x, u, d):
-    """(net inflow of each tank [cm^3/s], what leaves for the basin [cm^3/s]) by matrices and numpy, from the equations and not the library;
-    for levels above the knee."""
+    """(net inflow of each tank [cm^3/s], what leaves for the basin [cm^3/s]) by matrices and numpy,
+    from the equations and not the library; for levels above the knee.
+    """
     w = np.sqrt(2.0 * float(plant.gravity))
     q = np.where(x > 0, w * np.sqrt(np.abs(x)), 0.0)
     pour, valve = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE))
@@ -146,12 +156,24 @@ def flows(plant, x, u, d):
 
 
 def relabelled(plant, order):
-    """The same rig with its tanks in another order: new tank k is the old tank order[k]. Spills are closed, for they go downwards only.
-    Returns (rig, pumps: new pump k is the old pump pumps[k])."""
+    """The same rig with its tanks in another order: new tank k is the old tank order[k]. Spills are
+    closed, for they go downwards only. Returns (rig, pumps: new pump k is the old pump pumps[k]).
+    """
     links = [LINKS.index((order[a], order[b])) for a, b in LINKS]
     pairs = [PIPES.index((min(order[a], order[b]), max(order[a], order[b]))) for a, b in PIPES]
     turned = np.array([order[a] > order[b] for a, b in PIPES])
-    changed = {name: np.asarray(getattr(plant, name))[list(order)] for name in ("area", "drain", "rim")}
+    changed = {
+        name: np.asarray(getattr(plant, name))[list(order)] for name in ("area", "drain", "rim")
+    }
     split = np.asarray(plant.split)[pairs]
-    changed |= {"orifice": plant.orifice[links], "pipe": plant.pipe[pairs], "pump_gain": plant.pump_gain[pairs]}
-    return dataclasses.replace(plant, **changed, split=np.where(turned, 1.0 - split, split), caught=0.0 * plant.caught), pairs
+    changed |= {
+        "orifice": plant.orifice[links],
+        "pipe": plant.pipe[pairs],
+        "pump_gain": plant.pump_gain[pairs],
+    }
+    return (
+        dataclasses.replace(
+            plant, **changed, split=np.where(turned, 1.0 - split, split), caught=0.0 * plant.caught
+        ),
+        pairs,
+    )

@@ -1,7 +1,9 @@
-"""Trajectories and measures of every case, recorded: a change of structure must not change a number.
+"""Trajectories and measures of every case, recorded: a change of structure must not change a
+number.
 
 python tests/recorded_runs.py            compare every case with the record
-python tests/recorded_runs.py --record   record them again (after a change that is meant to change numbers)
+python tests/recorded_runs.py --record   record them again (after a change that is meant to change
+numbers)
 
 On a machine with the recorded processor and versions, runs agree to the last bit; elsewhere
 samples of them agree to 1e-12 of their size (1e-6 where quadratic programmes end their iterations).
@@ -34,7 +36,9 @@ def machine():
 
 
 def run(name):
-    """{bits, points, measures} of a case: a digest of its trajectory, a few samples of it, its measures."""
+    """{bits, points, measures} of a case: a digest of its trajectory, a few samples of it, its
+    measures.
+    """
     case = presets.find(name)
     noisy = bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
     key = jax.random.key(0) if noisy else None
@@ -79,9 +83,16 @@ def differences(name, found, recorded, exact):
         for key, value in recorded[group].items():
             a, b = np.asarray(found[group][key], float), np.asarray(value, float)
             if a.shape != b.shape or not np.allclose(
-                a, b, rtol=rtol, atol=rtol * max(1.0, np.nanmax(np.abs(b), initial=0.0)), equal_nan=True
+                a,
+                b,
+                rtol=rtol,
+                atol=rtol * max(1.0, np.nanmax(np.abs(b), initial=0.0)),
+                equal_nan=True,
             ):
-                lines.append(f"{name}: {key} differs by {np.max(np.abs(a - b)) if a.shape == b.shape else 'shape'}")
+                lines.append(
+                    f"{name}: {key} differs by"
+                    f" {np.max(np.abs(a - b)) if a.shape == b.shape else 'shape'}"
+                )
     return lines
 
 
@@ -98,9 +109,17 @@ def main():
     lines = [
         line
         for name in presets.names()
-        for line in differences(name, run(name), record["cases"].get(name, {"bits": "", "points": {}, "measures": {}}), exact)
+        for line in differences(
+            name,
+            run(name),
+            record["cases"].get(name, {"bits": "", "points": {}, "measures": {}}),
+            exact,
+        )
     ]
-    print("\n".join(lines) or f"{len(record['cases'])} cases as recorded, {'to the last bit' if exact else 'to 1e-12'}")
+    print(
+        "\n".join(lines)
+        or f"{len(record['cases'])} cases as recorded, {'to the last bit' if exact else 'to 1e-12'}"
+    )
     return 1 if lines else 0
 
 

@@ -1,11 +1,13 @@
 """Random stiff rigs with negative inflows into tanks that run empty, against small steps of numpy.
 
-    python tests/stiff_rigs.py 120             120 rigs of each of the four kinds: how many are off, and how many of these in silence
-    python tests/stiff_rigs.py 120 --record    also keeps that in survived.json
+    python tests/stiff_rigs.py 120             120 rigs of each of the four kinds: how many are off,
+    and how many of these in silence python tests/stiff_rigs.py 120 --record    also keeps that in
+    survived.json
 
-A rig is off where a level differs from the reference by more than 5 % of its rim at any sample, in silence where no StepWarning was
-given. The reference is the projected Euler rule on the equations written in numpy (levels at or above zero, no flow out of an empty tank,
-rims and spills), in steps that follow the film, driven by the inputs of the run: it shares no code with the package.
+A rig is off where a level differs from the reference by more than 5 % of its rim at any sample, in
+silence where no StepWarning was given. The reference is the projected Euler rule on the equations
+written in numpy (levels at or above zero, no flow out of an empty tank, rims and spills), in steps
+that follow the film, driven by the inputs of the run: it shares no code with the package.
 """
 
 import sys
@@ -87,13 +89,17 @@ def other(kind, rng):
     m, each = len(feeds), np.ones(len(feeds))
     drawn = np.zeros(n)
     drawn[rng.integers(n)] = -rng.uniform(0.0, 0.3)
-    changes = [(80.0, j, 0.0) for j in range(m)] + [(160.0, j, float(rng.uniform(0.5, 5.0))) for j in range(m)]
+    changes = [(80.0, j, 0.0) for j in range(m)] + [
+        (160.0, j, float(rng.uniform(0.5, 5.0))) for j in range(m)
+    ]
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(gain=np.ones(n), noise=np.zeros(n), full_scale=np.asarray(RIM)),
         observer=Direct(),
         controller=OpenLoop(signal=ramps(list(rng.uniform(0.5, 5.0, m)), changes, ramp=0.0)),
-        actuator=PumpBank(low=0 * each, high=10 * each, stop=0 * each, pulse=10 * each, initial=0 * each),
+        actuator=PumpBank(
+            low=0 * each, high=10 * each, stop=0 * each, pulse=10 * each, initial=0 * each
+        ),
         reference=ramps([1.0], [(80.0, 0, 2.0)], ramp=0.0),
         disturbance=Constant(level=drawn * area),
         x0=rng.uniform(0.0, RIM, n),
@@ -110,11 +116,19 @@ def drawn(kind, seed):
 
 
 def reference(loops, inputs, dt):
-    """(rigs, samples, n) levels of rigs of one kind with `inputs` (rigs, samples, m) held for dt [s] each."""
+    """(rigs, samples, n) levels of rigs of one kind with `inputs` (rigs, samples, m) held for dt
+    [s] each.
+    """
     plant = loops[0].plant
     stack = lambda read: np.array([np.asarray(read(loop), dtype=float) for loop in loops])
-    area, drain, orifice, pipe = (stack(lambda loop, k=k: getattr(loop.plant, k)) for k in ("area", "drain", "orifice", "pipe"))
-    gain, split, rim, caught = (stack(lambda loop, k=k: getattr(loop.plant, k)) for k in ("pump_gain", "split", "rim", "caught"))
+    area, drain, orifice, pipe = (
+        stack(lambda loop, k=k: getattr(loop.plant, k))
+        for k in ("area", "drain", "orifice", "pipe")
+    )
+    gain, split, rim, caught = (
+        stack(lambda loop, k=k: getattr(loop.plant, k))
+        for k in ("pump_gain", "split", "rim", "caught")
+    )
     x, d, knee = stack(lambda loop: loop.x0), stack(lambda loop: loop.disturbance.level), plant.knee
     fastest = max(step_size.film_rates(loop.plant).max() for loop in loops)
     parts = int(np.ceil(dt * fastest / FINE))
@@ -128,7 +142,9 @@ def reference(loops, inputs, dt):
             if second is not None:
                 into[:, second] += gain[:, j] * (1.0 - share) * inputs[:, k, j]
         for _ in range(parts):
-            q = np.where(x >= knee, np.sqrt(x), knee**0.5 * (1.5 * x / knee - 0.5 * (x / knee) ** 2))
+            q = np.where(
+                x >= knee, np.sqrt(x), knee**0.5 * (1.5 * x / knee - 0.5 * (x / knee) ** 2)
+            )
             flow = into - drain * q
             for i, (a, b) in enumerate(plant.links):
                 flow[:, a] -= orifice[:, i] * q[:, a]
@@ -139,13 +155,17 @@ def reference(loops, inputs, dt):
                 flow[:, b] += pipe[:, i] * apart / (apart**2 + knee**2) ** 0.25
             x = np.maximum(x + dt / parts * flow / area, 0.0)
             for i, (a, b) in enumerate(plant.spills):
-                x[:, b] += caught[:, i] * area[:, a] * np.maximum(x[:, a] - rim[:, a], 0.0) / area[:, b]
+                x[:, b] += (
+                    caught[:, i] * area[:, a] * np.maximum(x[:, a] - rim[:, a], 0.0) / area[:, b]
+                )
             x = np.minimum(x, rim)
     return np.stack(path, axis=1)
 
 
 def tried(kind, seeds):
-    """[(error as a share of the rim, True if it was reported)] of rigs of a kind; None of one that is refused beforehand."""
+    """[(error as a share of the rim, True if it was reported)] of rigs of a kind; None of one that
+    is refused beforehand.
+    """
     loops, runs, reported = [], [], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
@@ -159,7 +179,9 @@ def tried(kind, seeds):
             loops.append(loop)
             runs.append(run)
             reported.append(bool(step_size.doubts(loop, clock)))
-    levels, inputs = (np.stack([np.asarray(getattr(run, name)) for run in runs]) for name in ("x", "u"))
+    levels, inputs = (
+        np.stack([np.asarray(getattr(run, name)) for run in runs]) for name in ("x", "u")
+    )
     error = np.abs(levels - reference(loops, inputs, clock.dt)).max(axis=(1, 2)) / RIM
     return list(zip(error, reported))
 

@@ -37,8 +37,12 @@ def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):
     assert path.stat().st_size < 1_000_000 and [p.name for p in tmp_path.iterdir()] == ["run.gif"]
     seen = np.array([blue(f) for f in frames(path)])
     assert len(seen) == animation.RATE
-    stored = np.asarray(run.x)[np.linspace(0, len(run.t) - 1, len(seen)).round().astype(int)].sum(axis=1)  # tanks of one size
-    # a straight line: what is not the tanks' water (none) plus pixels per cm; edges and words cost some
+    # tanks of one size
+    stored = np.asarray(run.x)[np.linspace(0, len(run.t) - 1, len(seen)).round().astype(int)].sum(
+        axis=1
+    )
+    # a straight line: what is not the tanks' water (none) plus pixels per cm; edges and words cost
+    # some
     slope = np.polyfit(stored, seen, 1)
     assert stored[-1] > 2 * stored[0] and slope[0] > 0
     assert np.abs(np.polyval(slope, stored) - seen).max() < 0.05 * np.ptp(seen)
@@ -58,7 +62,9 @@ def test_the_fragment_for_notebooks_asks_nothing_of_the_network_and_is_the_same_
     page = animation.to_html(*short, seconds=1)
     assert page == animation.to_html(*short, seconds=1)
     tags = Tags(page).found
-    assert not any(tag == "link" or str(a.get("src", "")).startswith(("http", "//")) for tag, a in tags)
+    assert not any(
+        tag == "link" or str(a.get("src", "")).startswith(("http", "//")) for tag, a in tags
+    )
     assert "http" not in page and "fa-" not in page
     buttons = [a["title"] for tag, a in tags if tag == "button"]
     assert {"Play", "Pause", "Next frame"} <= set(buttons)
@@ -76,13 +82,23 @@ def test_what_is_no_gif_or_another_rig_is_refused(short, tmp_path):
     with pytest.raises(InputError, match="end in"):
         animation.animate(*short, tmp_path / "run.mp4")
     with pytest.raises(InputError, match="the rig has 2 and 2"):
-        animation.animate(jaxtank.presets.find("gouta2022/enmpc").loop, short[1], tmp_path / "run.gif")
+        animation.animate(
+            jaxtank.presets.find("gouta2022/enmpc").loop, short[1], tmp_path / "run.gif"
+        )
 
 
 def test_simulate_writes_one_where_asked(tmp_path, capsys):
     from tuning.cli import main
 
-    asked = ["simulate", "gouta2015/backstepping", "--set", "clock.duration=60", "--dt", "0.1", "--gif"]
+    asked = [
+        "simulate",
+        "gouta2015/backstepping",
+        "--set",
+        "clock.duration=60",
+        "--dt",
+        "0.1",
+        "--gif",
+    ]
     assert main.main(asked) == 2 and "--out DIR" in capsys.readouterr().err
     assert main.main([*asked, "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert matplotlib.image.imread(tmp_path / "out" / "run.gif").size > 0

@@ -200,7 +200,14 @@ def test_a_constructor_refuses_what_it_cannot_fill():
 
 def test_what_is_no_number_passes_a_constructor_and_a_transformation_untouched():
     bank = PumpBank(low=[0.0], high=[12.0])
-    marks = [object(), jax.ShapeDtypeStruct((1,), np.float64), None, "x", np.float32(1.0), [[1.0], 2.0]]
+    marks = [
+        object(),
+        jax.ShapeDtypeStruct((1,), np.float64),
+        None,
+        "x",
+        np.float32(1.0),
+        [[1.0], 2.0],
+    ]
     for mark in marks:
         assert PumpBank(low=mark, high=[12.0], stop=0.0, initial=0.0).low is mark
     for mark in (*marks, 0, 1.0, (1, 2)):
@@ -253,7 +260,13 @@ def test_solver_options_name_a_method_and_keep_its_numbers():
         assert (
             options.options()
             == {"starts": 8, "screening": 64, "iterations": 60}
-            | ({"tolerance": None} if method == "slsqp" else {"batch": None} if method == "adam" else {})
+            | (
+                {"tolerance": None}
+                if method == "slsqp"
+                else {"batch": None}
+                if method == "adam"
+                else {}
+            )
             | more
         )
         with pytest.raises(dataclasses.FrozenInstanceError):
@@ -266,7 +279,10 @@ def test_solver_options_are_checked_when_they_are_made_and_against_keywords(own)
         (lambda: tuning.SQP(tolerance=2.0), "tolerance = 2.0: must be"),
         (lambda: tuning.Adam(batch=True), "batch = True: must be"),
         (lambda: tuning.TRF(coarse=1), "coarse = 1: must be True or False"),
-        (lambda: tuning.tune(own, tuning.SQP(starts=4), starts=2), "starts = 2: SQP has starts = 4"),
+        (
+            lambda: tuning.tune(own, tuning.SQP(starts=4), starts=2),
+            "starts = 2: SQP has starts = 4",
+        ),
         (lambda: tuning.tune(tuning.Problem(own), limits={}), "limits: the Problem has it already"),
         (lambda: tuning.tune(tuning.Problem(own), risk="worst"), "risk: the Problem has it"),
     ):
@@ -331,7 +347,9 @@ def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tm
     assert (tmp_path / "evaluations.jsonl").read_text().splitlines() == lines
 
 
-@pytest.mark.parametrize("run", [tuning.tune, tuning.ensemble, lambda case, **more: tuning.identify(case, [], **more)])
+@pytest.mark.parametrize(
+    "run", [tuning.tune, tuning.ensemble, lambda case, **more: tuning.identify(case, [], **more)]
+)
 def test_a_checkpoint_and_its_former_name_are_one_folder(own, run):
     name = "log" if run is tuning.tune else "folder"
     with pytest.raises(InputError, match=f"checkpoint and {name} are two names"):

@@ -26,8 +26,12 @@ def short(paper, name, values=None, duration=60.0):
 
 @pytest.fixture(scope="module")
 def climb():
-    """Plant B of gouta2015 to 60 s: both setpoints climb by 5 cm, with a limit that the climb would pass."""
-    return short("gouta2015", "backstepping", {"reference.ramp": 20.0}).replace(limits={"max_level": 7.5})
+    """Plant B of gouta2015 to 60 s: both setpoints climb by 5 cm, with a limit that the climb would
+    pass.
+    """
+    return short("gouta2015", "backstepping", {"reference.ramp": 20.0}).replace(
+        limits={"max_level": 7.5}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +40,19 @@ def climbed(climb):
 
 
 def test_gradient_is_that_of_central_differences(climb):
-    """Of cost and multipliers together, at inputs that break the limit; the tolerance is that of differences of step 1e-5 V."""
+    """Of cost and multipliers together, at inputs that break the limit; the tolerance is that of
+    differences of step 1e-5 V.
+    """
     objective = {"rms_error_total": 1.0, "input_travel": 0.01, "iae": 0.01}
-    search = InputSearch(climb, objective, {"max_level": 7.5, "min_level": 2.7, "rms_input": 3.0}, 5.0, 10, None)
+    search = InputSearch(
+        climb, objective, {"max_level": 7.5, "min_level": 2.7, "rms_input": 3.0}, 5.0, 10, None
+    )
     rng = np.random.default_rng(0)
     u = rng.uniform(2.0, 6.0, (2, search.count))
     held = search.held._replace(
-        weight=np.float64(50.0), forces=tuple(rng.uniform(0, 1, len(f)) for f in search.held.forces), pulls=np.array([0.3, 0.2])
+        weight=np.float64(50.0),
+        forces=tuple(rng.uniform(0, 1, len(f)) for f in search.held.forces),
+        pulls=np.array([0.3, 0.2]),
     )
     gradient = value_and_gradient(search._loop(), search.coarse, search.terms, u, held)[1]
 
@@ -56,14 +66,22 @@ def test_gradient_is_that_of_central_differences(climb):
 
 
 def test_five_intervals_against_another_solver():
-    """SLSQP on differences of `evaluate`, with the exact maxima as constraints: five inputs of 12 s to each pump."""
-    case = short("gouta2015", "backstepping", {"reference.ramp": 20.0}).replace(limits={"max_level": 7.0})
+    """SLSQP on differences of `evaluate`, with the exact maxima as constraints: five inputs of 12 s
+    to each pump.
+    """
+    case = short("gouta2015", "backstepping", {"reference.ramp": 20.0}).replace(
+        limits={"max_level": 7.0}
+    )
     found = bound(case, interval=12.0)
     assert found.u.shape == (5, 2) and found.holds
 
     @jax.jit
     def run(z):
-        values = jaxtank.evaluate(open_loop(case.loop, z.reshape(2, 5), 12.0), case.clock, ["rms_error_total", "max_level"])
+        values = jaxtank.evaluate(
+            open_loop(case.loop, z.reshape(2, 5), 12.0),
+            case.clock,
+            ["rms_error_total", "max_level"],
+        )
         return values["rms_error_total"], values["max_level"]
 
     best = np.inf
@@ -82,12 +100,17 @@ def test_five_intervals_against_another_solver():
 
 
 def test_it_goes_below_the_law_and_keeps_the_limit(climb, climbed):
-    again = jaxtank.evaluate(open_loop(climb.loop, climbed.u.T, 1.0), climb.clock, ["rms_error_total", "max_level"])
+    again = jaxtank.evaluate(
+        open_loop(climb.loop, climbed.u.T, 1.0), climb.clock, ["rms_error_total", "max_level"]
+    )
     assert climbed.cost == pytest.approx(float(again["rms_error_total"]), rel=1e-9)
     assert climbed.holds and float(again["max_level"].max()) <= 7.5 * (1 + TOLERANCE)
-    assert climbed.worst["limit"] == 7.5 and climbed.worst["value"] == pytest.approx(float(again["max_level"].max()), abs=1e-6)
+    assert climbed.worst["limit"] == 7.5 and climbed.worst["value"] == pytest.approx(
+        float(again["max_level"].max()), abs=1e-6
+    )
     assert climbed.cost < 0.5 * climbed.closed_loop["cost"] and not climbed.closed_loop["holds"]
-    assert climbed.gain_percent is None  # the law breaks the limit: the two are not on the same terms
+    # the law breaks the limit: the two are not on the same terms
+    assert climbed.gain_percent is None
     assert np.all(climbed.u >= 0) and np.all(climbed.u <= 12) and climbed.source == "search"
 
 
@@ -101,7 +124,9 @@ def test_a_looser_limit_and_a_finer_grid_cost_less(climb, climbed):
 
 def test_what_is_said_of_it(climbed):
     told = json.loads(json.dumps(climbed.to_json(), allow_nan=False))
-    assert told["intervals"] == 60 and told["cost"] == climbed.cost and "certificate" in told["note"]
+    assert (
+        told["intervals"] == 60 and told["cost"] == climbed.cost and "certificate" in told["note"]
+    )
     text = str(climbed)
     assert "limits held; tightest: max_level of tank" in text and "not a certificate" in text
     assert climbed.trajectory(save_every=10).x.shape == (61, 4)
@@ -128,17 +153,28 @@ def test_never_above_the_law_itself(paper, name, values):
 
 
 def test_a_law_that_no_search_beats_is_its_own_bound():
-    """One pair of inputs for the whole run cannot follow what a law of 600 samples can: the law's own are the bound, and said to be."""
+    """One pair of inputs for the whole run cannot follow what a law of 600 samples can: the law's
+    own are the bound, and said to be.
+    """
     case = short("gouta2015", "ngpc")
     found = bound(case, limits={}, interval=60.0)
-    assert found.source == "closed loop" and found.gain_percent == 0.0 and found.interval == case.clock.dt
+    assert (
+        found.source == "closed loop"
+        and found.gain_percent == 0.0
+        and found.interval == case.clock.dt
+    )
     law = jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"]
-    assert found.cost == pytest.approx(float(law), rel=1e-9) and found.grids[-1]["cost"] > 2 * found.cost
+    assert (
+        found.cost == pytest.approx(float(law), rel=1e-9)
+        and found.grids[-1]["cost"] > 2 * found.cost
+    )
     assert "its own inputs are the bound" in str(found)
 
 
 def test_the_search_in_a_box_against_another_solver():
-    """Least squares in a box, 80 unknowns of which many end at a wall; SciPy's active set is the reference."""
+    """Least squares in a box, 80 unknowns of which many end at a wall; SciPy's active set is the
+    reference.
+    """
     rng = np.random.default_rng(3)
     matrix, aim = rng.standard_normal((100, 80)), 5 * rng.standard_normal(100)
 
@@ -157,7 +193,10 @@ def test_the_search_in_a_box_against_another_solver():
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        ({"objective": {"settling_time": 1.0}}, "bound of settling_time: .*can be made small: rms_error"),
+        (
+            {"objective": {"settling_time": 1.0}},
+            "bound of settling_time: .*can be made small: rms_error",
+        ),
         ({"objective": {"saturated_fraction": 1.0}}, "bound of saturated_fraction"),
         ({"limits": {"overshoot_percent": 5.0}}, "limit on overshoot_percent: .*max_level"),
         ({"interval": 0.25}, r"interval = 0.25 s: must be a whole number of samples of 0.1 s"),
@@ -187,14 +226,18 @@ FOUR_TANK = [  # plant, ramp [s], total RMS error [cm] (gouta2015 notes S10)
 @pytest.mark.slow
 @pytest.mark.parametrize("plant, ramp, best", FOUR_TANK)
 def test_bounds_of_the_four_tank(gouta, plant, ramp, best):
-    """Levels held to 1e-3 cm, against an independent search whose limit was soft (gouta2015 notes S10): 2 %, or half a unit of the last digit."""
+    """Levels held to 1e-3 cm, against an independent search whose limit was soft (gouta2015 notes
+    S10): 2 %, or half a unit of the last digit.
+    """
     found = bound(gouta(f"backstepping{plant}", {"reference.ramp": float(ramp)}))
     assert found.holds and max(c["value"] for c in found.constraints) <= 30.001
     digit = 0.5 * 10.0 ** -len(str(best).split(".")[1])
     assert found.cost <= best + max(0.02 * best, digit)
 
 
-MIRAKHORLI = [  # upper limit, start, J*, least ISE: multiple shooting with 1 s intervals, trapezoids (mirakhorli notes S10)
+# upper limit, start, J*, least ISE: multiple shooting with 1 s intervals, trapezoids (mirakhorli
+# notes S10)
+MIRAKHORLI = [
     (5.0, "", 4512.7, 3898.2),
     (6.0, "", 4179.5, 3203.3),
     (4.0, "", 5450.9, 5174.0),
@@ -205,7 +248,9 @@ MIRAKHORLI = [  # upper limit, start, J*, least ISE: multiple shooting with 1 s 
 @pytest.mark.slow
 @pytest.mark.parametrize("high, start, cost, least", MIRAKHORLI)
 def test_bounds_of_mirakhorli(high, start, cost, least):
-    """Sums of both tanks over 400 s. A left sum adds half a sample of the first error: 14.4 from empty tanks, 3.6 from 6 cm."""
+    """Sums of both tanks over 400 s. A left sum adds half a sample of the first error: 14.4 from
+    empty tanks, 3.6 from 6 cm.
+    """
     case = rig.set_values(presets.load("mirakhorli").cases[f"sfc{start}"], {"actuator.high": high})
     first = 0.05 * 2 * (36.0 if start else 144.0)
     found = bound(case, {"ise": 1.0, "input_deviation": 3.0}, {})

@@ -1,4 +1,6 @@
-"""What must hold of every case of every paper: it can be shown, written, read back, run and compared."""
+"""What must hold of every case of every paper: it can be shown, written, read back, run and
+compared.
+"""
 
 import jax
 import numpy as np
@@ -17,19 +19,28 @@ NAMES = presets.names()
 NEW = [name for name in NAMES if not name.startswith("gouta2015")]
 CONTRACT = {
     "gouta2015": "ngpc backstepping backstepping-ff ngpc-table1 backstepping-boxqp ngpc-slow",
-    "gouta2022": "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed chadpc-trapezoid",
-    "mirakhorli": "sfc smc hybrid smc-printed lqi sfc-warm smc-warm hybrid-warm smc-printed-warm lqi-warm",
+    "gouta2022": (
+        "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed"
+        " chadpc-trapezoid"
+    ),
+    "mirakhorli": (
+        "sfc smc hybrid smc-printed lqi sfc-warm smc-warm hybrid-warm smc-printed-warm lqi-warm"
+    ),
     "calofir": "backstepping backstepping-perturbed",
     "cascaded": "pi open-loop",
-    "khalid": "gpc gpc-nc2 gpc-nc30 laguerre gpc-mimo laguerre-mimo gpc-constrained gpc-nc2-constrained gpc-nc30-constrained "
-    "laguerre-constrained gpc-mimo-constrained laguerre-mimo-constrained",
+    "khalid": (
+        "gpc gpc-nc2 gpc-nc30 laguerre gpc-mimo laguerre-mimo gpc-constrained gpc-nc2-constrained"
+        " gpc-nc30-constrained laguerre-constrained gpc-mimo-constrained laguerre-mimo-constrained"
+    ),
 }
 NAMES_THAT_MUST_EXIST = {
     "gouta2022/chadpc": "controller.Tp observer.l plant.pump_gain actuator.dead_zone",
     "gouta2022/pid": "controller.Kc controller.Ti controller.Td",
     "gouta2022/fopi": "controller.order",
     "mirakhorli/sfc": "controller.K",
-    "mirakhorli/hybrid": "controller.K controller.surface controller.ks controller.phi controller.b controller.w",
+    "mirakhorli/hybrid": (
+        "controller.K controller.surface controller.ks controller.phi controller.b controller.w"
+    ),
     "mirakhorli/lqi": "controller.Q controller.R",
     "calofir/backstepping": "controller.K_phi controller.K_y",
     "khalid/laguerre": "controller.r_w controller.a controller.operating_point",
@@ -40,7 +51,9 @@ STATICS_THAT_MUST_EXIST = {
     "khalid/gpc": "controller.Nc controller.Np",
     "khalid/laguerre": "controller.N controller.Np",
 }
-NOT_ONE_FUNCTION = {  # a quadratic programme inside the loop: an inner loop of matrix factorisations (controllers/incremental.py)
+# a quadratic programme inside the loop: an inner loop of matrix factorisations
+# (controllers/incremental.py)
+NOT_ONE_FUNCTION = {
     name for name in NAMES if name.startswith("khalid") and name.endswith("-constrained")
 }
 
@@ -53,9 +66,14 @@ def test_every_case_of_the_contract_is_there():
 def test_names_of_the_contract():
     for name, leaves in NAMES_THAT_MUST_EXIST.items():
         for leaf in [*leaves.split(), "x0", "sensor.noise", "actuator.low", "actuator.high"]:
-            assert np.all(np.isfinite(np.asarray(get_value(presets.find(name).loop, leaf)))), (name, leaf)
+            assert np.all(np.isfinite(np.asarray(get_value(presets.find(name).loop, leaf)))), (
+                name,
+                leaf,
+            )
     for name, fields in STATICS_THAT_MUST_EXIST.items():
-        assert set(fields.split()) <= {n for n, _, _ in walk(presets.find(name).loop, kind="static")}
+        assert set(fields.split()) <= {
+            n for n, _, _ in walk(presets.find(name).loop, kind="static")
+        }
 
 
 @pytest.mark.parametrize("name", NEW)
@@ -92,7 +110,13 @@ def test_a_case_is_shown(name, capsys):
 @pytest.mark.parametrize("name", [n for n in NEW if n not in NOT_ONE_FUNCTION])
 def test_a_case_is_one_function(name):
     case = presets.find(name)
-    program = evaluate_compiled.lower(case.loop, case.clock, ("rms_error_total", "max_level"), None, False).compile().as_text()
+    program = (
+        evaluate_compiled.lower(
+            case.loop, case.clock, ("rms_error_total", "max_level"), None, False
+        )
+        .compile()
+        .as_text()
+    )
     assert is_one_function(program, case.clock.samples)
 
 
@@ -109,7 +133,14 @@ def test_a_paper_is_compared_and_every_difference_has_a_reason(paper):
     rows = measure(paper)["rows"]
     assert any(r["verdict"] == "reproduced" for r in rows) or paper in ("gouta2015", "cascaded")
     for r in rows:
-        assert r["verdict"] in ("quoted", "reproduced", "partly", "not reproduced", "differs", "not measured")
+        assert r["verdict"] in (
+            "quoted",
+            "reproduced",
+            "partly",
+            "not reproduced",
+            "differs",
+            "not measured",
+        )
         assert r["verdict"] in ("quoted", "reproduced") or r["reason"], r["quantity"]
 
 
@@ -117,7 +148,10 @@ def test_printed_units_follow_the_rig(capsys):
     assert main.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
     said = capsys.readouterr().out
     assert " m " in said and "m^3/s" in said and "cm" not in said
-    assert jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"] == "m^3/(s U0)"
+    assert (
+        jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"]
+        == "m^3/(s U0)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -135,7 +169,9 @@ def test_a_mistyped_case_is_answered_with_the_nearest(name, nearest):
         presets.find(name)
     paper, _, case = name.partition("/")
     if paper in presets.PAPERS:
-        with pytest.raises(InputError, match=rf"^unknown case {case!r}; nearest: {nearest.partition('/')[2]}(,|$)"):
+        with pytest.raises(
+            InputError, match=rf"^unknown case {case!r}; nearest: {nearest.partition('/')[2]}(,|$)"
+        ):
             presets.load(paper).cases[case]
 
 

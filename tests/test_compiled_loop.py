@@ -34,7 +34,10 @@ def loops_in(compiled):
 @pytest.mark.parametrize("name", ["ngpc", "backstepping", "backstepping-ff", "ngpc-boxqp"])
 def test_the_loop_compiles_to_one_function(gouta, name):
     case = gouta(name)
-    assert loops_in(evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile()) >= 1
+    assert (
+        loops_in(evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile())
+        >= 1
+    )
 
 
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
@@ -43,16 +46,34 @@ def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_functio
     from jaxtank.measures.catalogue import serves
 
     case = gouta(
-        "ngpc", {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0, "sensor.noise": 0.01, "sensor.bits": 12}
+        "ngpc",
+        {
+            "actuator.delay": 1.0,
+            "actuator.lag": 0.5,
+            "actuator.dead_zone": 1.0,
+            "sensor.noise": 0.01,
+            "sensor.bits": 12,
+        },
     )
     names = tuple(m for m in every if serves(m, case.loop))
-    assert loops_in(evaluate_compiled.lower(case.loop, case.clock, names, jax.random.key(0), False).compile()) >= 2
+    assert (
+        loops_in(
+            evaluate_compiled.lower(
+                case.loop, case.clock, names, jax.random.key(0), False
+            ).compile()
+        )
+        >= 2
+    )
 
 
 def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
     case = gouta("backstepping")
     assert (
-        loops_in(sensitivities_compiled.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None).compile())
+        loops_in(
+            sensitivities_compiled.lower(
+                case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None
+            ).compile()
+        )
         >= 1
     )
 
@@ -62,8 +83,14 @@ def test_other_gains_do_not_recompile(gouta):
     jaxtank.evaluate(case.loop, case.clock, MEASURES)
     before = evaluate_compiled._cache_size()
     for k in (0.01, 0.2, 3):
-        jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17}), case.clock, MEASURES)
-    jaxtank.evaluate(gouta("backstepping-table1", {"clock.duration": 20.0}).loop, case.clock, MEASURES)
+        jaxtank.evaluate(
+            jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17}),
+            case.clock,
+            MEASURES,
+        )
+    jaxtank.evaluate(
+        gouta("backstepping-table1", {"clock.duration": 20.0}).loop, case.clock, MEASURES
+    )
     assert evaluate_compiled._cache_size() == before
 
 
@@ -72,7 +99,11 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
     sizes = []
     for duration in (100.0, 1200.0):
         case = gouta("backstepping", {"clock.duration": duration})
-        stats = evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile().memory_analysis()
+        stats = (
+            evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False)
+            .compile()
+            .memory_analysis()
+        )
         sizes.append(stats.temp_size_in_bytes / case.clock.samples)
     assert max(sizes) < 8 * 8  # bytes per sample: at most eight float64 arrays of inputs
 
@@ -80,23 +111,27 @@ def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
 def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
     case = gouta("backstepping")
     stats = (
-        sensitivities_compiled.lower(case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None)
+        sensitivities_compiled.lower(
+            case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None
+        )
         .compile()
         .memory_analysis()
     )
     assert stats.temp_size_in_bytes < 10e6
     reverse = jax.jit(
         jax.grad(
-            lambda k1: evaluate_for_reverse(jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES)[
-                "rms_error_total"
-            ]
+            lambda k1: evaluate_for_reverse(
+                jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES
+            )["rms_error_total"]
         )
     )
     assert reverse.lower(0.088).compile().memory_analysis().temp_size_in_bytes < 10e6
 
 
 def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
-    """Coefficients are computed before the loop, once each; results and derivatives are those of jax.lax.scan."""
+    """Coefficients are computed before the loop, once each; results and derivatives are those of
+    jax.lax.scan.
+    """
 
     def run(scan, a, b):
         def body(carry, x):
@@ -118,14 +153,18 @@ def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
     np.testing.assert_allclose(lean[0], plain[0], rtol=1e-15)
     np.testing.assert_allclose(lean[1], plain[1], rtol=1e-15)
     for derivative in (jax.grad, jax.jacfwd):
-        a, b = (derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, hoist.scan))
+        a, b = (
+            derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, hoist.scan)
+        )
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 
 def test_vmap_equals_a_python_loop(gouta):
     case = gouta("ngpc", {"clock.dt": 0.1})
     horizons = np.array([4.0, 11.0, 30.0])
-    run = lambda Tp: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, MEASURES)
+    run = lambda Tp: jaxtank.evaluate(
+        jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, MEASURES
+    )
     batch = jax.vmap(run)(horizons)
     for i, Tp in enumerate(horizons):
         for name, value in run(Tp).items():
@@ -133,7 +172,10 @@ def test_vmap_equals_a_python_loop(gouta):
 
 
 def test_jit_equals_no_jit(gouta):
-    case = gouta("backstepping", {"clock.dt": 0.1, "clock.duration": 4.0, "reference.ramp": 2.0, "reference.targets": 9.0})
+    case = gouta(
+        "backstepping",
+        {"clock.dt": 0.1, "clock.duration": 4.0, "reference.ramp": 2.0, "reference.targets": 9.0},
+    )
     compiled = jaxtank.evaluate(case.loop, case.clock, MEASURES)
     outer = jax.jit(lambda loop: jaxtank.evaluate(loop, case.clock, MEASURES))(case.loop)
     with jax.disable_jit():
@@ -145,7 +187,9 @@ def test_jit_equals_no_jit(gouta):
 
 def test_a_run_repeats_bit_for_bit(gouta):
     case = gouta("ngpc", {"sensor.noise": 0.02, "clock.duration": 100.0})
-    one, two = (jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(5)) for _ in range(2))
+    one, two = (
+        jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(5)) for _ in range(2)
+    )
     other = jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(6))
     assert all(np.array_equal(one[m], two[m]) for m in MEASURES)
     assert one["rms_error_total"] != other["rms_error_total"]
@@ -153,15 +197,21 @@ def test_a_run_repeats_bit_for_bit(gouta):
 
 def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
     case = gouta("backstepping", {"clock.duration": 400.0})
-    values = jaxtank.evaluate(case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"])
+    values = jaxtank.evaluate(
+        case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"]
+    )
     run = jaxtank.simulate(case.loop, case.clock)
     e, u = np.asarray(run.e), np.asarray(run.u)
     np.testing.assert_allclose(values["rms_error"], np.sqrt((e**2).mean(axis=0)), rtol=1e-10)
     np.testing.assert_allclose(values["iae"], np.abs(e).sum(axis=0) * 0.01, rtol=1e-10)
     np.testing.assert_allclose(values["rms_input"], np.sqrt((u**2).mean(axis=0)), rtol=1e-10)
-    np.testing.assert_allclose(values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(
+        values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9
+    )
     np.testing.assert_allclose(values["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-12)
-    carried, _, _, broken = jaxtank.sensitivities(case.loop, case.clock, ["rms_error", "max_level"], GAINS)
+    carried, _, _, broken = jaxtank.sensitivities(
+        case.loop, case.clock, ["rms_error", "max_level"], GAINS
+    )
     assert not broken
     for m in ("rms_error", "max_level"):
         np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
@@ -182,9 +232,18 @@ def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
     [
         ("", f"--xla_backend_extra_options={_xla.OPTION}"),
         ("--xla_foo=1", f"--xla_foo=1 --xla_backend_extra_options={_xla.OPTION}"),
-        ("--xla_backend_extra_options=a=1 --b", f"--xla_backend_extra_options=a=1,{_xla.OPTION} --b"),
-        (f"--xla_backend_extra_options={_xla.KEY}=5", f"--xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED}"),
-        (f"--xla_backend_extra_options={_xla.OPTION}", f"--xla_backend_extra_options={_xla.OPTION}"),
+        (
+            "--xla_backend_extra_options=a=1 --b",
+            f"--xla_backend_extra_options=a=1,{_xla.OPTION} --b",
+        ),
+        (
+            f"--xla_backend_extra_options={_xla.KEY}=5",
+            f"--xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED}",
+        ),
+        (
+            f"--xla_backend_extra_options={_xla.OPTION}",
+            f"--xla_backend_extra_options={_xla.OPTION}",
+        ),
         (
             '--xla_dump_to="/a  b" --xla_backend_extra_options=a',
             f'--xla_dump_to="/a  b" --xla_backend_extra_options=a,{_xla.OPTION}',
@@ -199,7 +258,13 @@ def test_the_option_joins_what_the_user_set(flags, expected):
 def python(code, *words, **env):
     """Run code in a fresh process; (stdout, stderr)."""
     clean = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)}
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env={**clean, **env}, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        capture_output=True,
+        text=True,
+        env={**clean, **env},
+        check=True,
+    )
     return done.stdout.strip(), done.stderr
 
 
@@ -210,29 +275,37 @@ def test_the_option_is_set_on_import_and_can_be_switched_off():
 
 
 def test_a_late_import_warns_once():
-    late = "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop.run, tuning"
+    late = (
+        "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop.run,"
+        " tuning"
+    )
     assert python(late)[1].count("jax had started before jaxtank") == 1
     assert "jax had started" not in python("import jax; import jaxtank")[1]
 
 
 def test_the_option_off_gives_the_same_numbers():
     code = (
-        "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import presets, Clock\n"
-        "case = presets.find('gouta2015/ngpc')\n"
-        "print(float(jaxtank.evaluate(case.loop, Clock(dt=0.1, duration=300.0), 'rms_error_total')['rms_error_total']).hex())"
+        "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import"
+        " presets, Clock\ncase ="
+        " presets.find('gouta2015/ngpc')\nprint(float(jaxtank.evaluate(case.loop, Clock(dt=0.1,"
+        " duration=300.0), 'rms_error_total')['rms_error_total']).hex())"
     )
     on, off = (float.fromhex(python(code, JAXTANK_XLA_OPTION=v)[0]) for v in "10")
     np.testing.assert_allclose(on, off, rtol=1e-12)
 
 
 def test_float32_keeps_what_rounding_takes_and_says_what_is_lost():
-    """Levels, error and its slope of a run in float32 beside float64. Plain float32 sums are 5e-3 cm and 6e-5 off (methods 2.5)."""
+    """Levels, error and its slope of a run in float32 beside float64. Plain float32 sums are 5e-3
+    cm and 6e-5 off (methods 2.5).
+    """
     code = (
-        "import jax, jaxtank, sys; jax.config.update('jax_enable_x64', sys.argv[1] == '64'); from jaxtank import presets\n"
-        "case = presets.find('gouta2015/backstepping'); run = jaxtank.simulate(case.loop, case.clock, save_every=10_000)\n"
-        "loop = lambda k: jaxtank.with_values(case.loop, {'controller.k1': k})\n"
-        "error = lambda k: jaxtank.evaluate(loop(k), case.clock, 'rms_error_total')['rms_error_total']\n"
-        "print(run.x.dtype, *map(float, run.x.ravel()), float(error(0.088)), float(jax.jacfwd(error)(0.088)))"
+        "import jax, jaxtank, sys; jax.config.update('jax_enable_x64', sys.argv[1] == '64'); from"
+        " jaxtank import presets\ncase = presets.find('gouta2015/backstepping'); run ="
+        " jaxtank.simulate(case.loop, case.clock, save_every=10_000)\nloop = lambda k:"
+        " jaxtank.with_values(case.loop, {'controller.k1': k})\nerror = lambda k:"
+        " jaxtank.evaluate(loop(k), case.clock,"
+        " 'rms_error_total')['rms_error_total']\nprint(run.x.dtype, *map(float, run.x.ravel()),"
+        " float(error(0.088)), float(jax.jacfwd(error)(0.088)))"
     )
     (single, err), (double, quiet) = python(code, "32"), python(code, "64")
     assert single.split()[0] == "float32" and double.split()[0] == "float64"
@@ -246,20 +319,35 @@ def test_float32_keeps_what_rounding_takes_and_says_what_is_lost():
 
 
 def operations_in_lanes(program, lanes):
-    """Arithmetic on all lanes in the fused parts of a compiled program's largest loop body, and how many calls wall them off."""
+    """Arithmetic on all lanes in the fused parts of a compiled program's largest loop body, and how
+    many calls wall them off.
+    """
     text = program.as_text()
     parts = {piece.split()[0]: piece for piece in text.split("\n\n") if piece.startswith("%")}
     body = max((parts[name] for name in re.findall(r"body=(%[\w.-]+)", text)), key=len)
     fused = [parts[name] for name in re.findall(r"calls=(%[\w.-]+)", body)]
-    done = re.findall(rf"= f64\[{lanes}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused))
-    return len(done), sum(" call(" in line and 'inlineable="false"' in line for line in body.splitlines())
+    done = re.findall(
+        rf"= f64\[{lanes}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused)
+    )
+    return len(done), sum(
+        " call(" in line and 'inlineable="false"' in line for line in body.splitlines()
+    )
 
 
 def test_what_several_read_is_made_once(gouta):
-    """Without the walls the parts of this loop repeat most of the step: about 1000 operations on every lane instead of 550."""
+    """Without the walls the parts of this loop repeat most of the step: about 1000 operations on
+    every lane instead of 550.
+    """
     case = gouta("backstepping", {"clock.duration": 2.0})
-    gains = {"controller.k": np.full(64, 0.03), "plant.drain": np.tile(case.loop.plant.drain, (64, 1))}
-    run = jax.vmap(lambda v: evaluate_compiled(jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False))
+    gains = {
+        "controller.k": np.full(64, 0.03),
+        "plant.drain": np.tile(case.loop.plant.drain, (64, 1)),
+    }
+    run = jax.vmap(
+        lambda v: evaluate_compiled(
+            jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False
+        )
+    )
     count, walls = operations_in_lanes(jax.jit(run).lower(gains).compile(), 64)
     assert walls == 4  # the voltages, and the rates of three Runge-Kutta stages
     assert 250 < count < 650
@@ -283,7 +371,9 @@ def test_materialised_values_pass_every_transformation():
 
 
 def test_bench_says_why_a_loop_is_slow(gouta):
-    """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the fault."""
+    """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the
+    fault.
+    """
 
     def program(body):
         return (
@@ -293,20 +383,30 @@ def test_bench_says_why_a_loop_is_slow(gouta):
             .as_text()
         )
 
-    plain, solving = program(lambda c: 0.5 * c), program(lambda c: jnp.linalg.solve(c + 3.0 * jnp.eye(2), c))
+    plain, solving = (
+        program(lambda c: 0.5 * c),
+        program(lambda c: jnp.linalg.solve(c + 3.0 * jnp.eye(2), c)),
+    )
     assert bench.reasons(plain, 50, True, np.float64, 0) == []
     assert "custom-call" in bench.reasons(solving, 50, True, np.float64, 0)[0]
     assert "JAXTANK_XLA_OPTION" in bench.reasons(solving, 50, False, np.float64, 0)[0]
     assert "no faster" in bench.reasons(plain, 50, True, np.float32, 0)[0]
     assert "3 of 3" in bench.reasons(plain, 50, True, np.float64, 3)[0]
-    found = bench.measure_cases({"a": gouta("backstepping", {"clock.duration": 20.0})}, rounds=1)["a"]
+    found = bench.measure_cases({"a": gouta("backstepping", {"clock.duration": 20.0})}, rounds=1)[
+        "a"
+    ]
     assert found["one_function"] and found["reasons"] == []
 
 
 def test_compensated_sums_lose_nothing():
     """A million terms of 1e-4 on 10 in float32: the plain sum is lost by a percent."""
     term, count = jnp.float32(1e-4), 1_000_000
-    kept = jax.lax.fori_loop(0, count, lambda _, s: plus(s, term), nothing(jnp.float32(0.0))._replace(total=jnp.float32(10.0)))
+    kept = jax.lax.fori_loop(
+        0,
+        count,
+        lambda _, s: plus(s, term),
+        nothing(jnp.float32(0.0))._replace(total=jnp.float32(10.0)),
+    )
     plain = jax.lax.fori_loop(0, count, lambda _, s: s + term, jnp.float32(10.0))
     exact = 10.0 + count * float(term)
     assert abs(float(totals(kept)) - exact) < 1e-5
@@ -315,14 +415,20 @@ def test_compensated_sums_lose_nothing():
 
 
 def test_loops_over_lanes_stay_loops():
-    """LLVM would unroll sixteen lanes into sixteen single runs, 36 against 11 ns per step and lane: the program is longer, and says so."""
-    assert "xla_cpu_disable_loop_unrolling" in python("import jaxtank, os; print(os.environ['XLA_FLAGS'])")[0]
+    """LLVM would unroll sixteen lanes into sixteen single runs, 36 against 11 ns per step and lane:
+    the program is longer, and says so.
+    """
+    assert (
+        "xla_cpu_disable_loop_unrolling"
+        in python("import jaxtank, os; print(os.environ['XLA_FLAGS'])")[0]
+    )
     code = (
-        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank import presets, Clock\n"
-        "from jaxtank.loop import run as loop\n"
-        "case = presets.find('gouta2015/backstepping'); clock = Clock(duration=2.0)\n"
-        "run = jax.vmap(lambda k: loop.evaluate_and_flag(jaxtank.with_values(case.loop, {'controller.k1': k}), clock, ('ise',)))\n"
-        "print(len(jax.jit(run).lower(np.linspace(0.1, 0.2, 16)).compile().runtime_executable().serialize()))"
+        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank"
+        " import presets, Clock\nfrom jaxtank.loop import run as loop\ncase ="
+        " presets.find('gouta2015/backstepping'); clock = Clock(duration=2.0)\nrun ="
+        " jax.vmap(lambda k: loop.evaluate_and_flag(jaxtank.with_values(case.loop,"
+        " {'controller.k1': k}), clock, ('ise',)))\nprint(len(jax.jit(run).lower(np.linspace(0.1,"
+        " 0.2, 16)).compile().runtime_executable().serialize()))"
     )
     without = f"--xla_backend_extra_options={_xla.KEY}=100000000000"
     assert int(python(code)[0]) < int(python(code, XLA_FLAGS=without, JAXTANK_XLA_OPTION="0")[0])

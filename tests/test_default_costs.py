@@ -1,4 +1,6 @@
-"""What `tune` searches with: the slope of every case's own cost, over its own scenarios, by every parameter that its preset calls tunable."""
+"""What `tune` searches with: the slope of every case's own cost, over its own scenarios, by every
+parameter that its preset calls tunable.
+"""
 
 import numpy as np
 import pytest
@@ -7,14 +9,25 @@ from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, split_index
 from tuning.problem.problem import Problem
 
-QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")  # the others compile for long
+# the others compile for long
+QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")
 ROUGH = {
     # why the slope is only good to this share of the largest one
-    "mirakhorli/smc-printed": (np.inf, "the law switches at every sample: a staircase in the gains (mirakhorli notes S4.2)"),
-    "khalid/*-constrained": (1e-3, "rows of the programme come and go, and its interior point stops at 1e-6 (khalid notes S4.5)"),
+    "mirakhorli/smc-printed": (
+        np.inf,
+        "the law switches at every sample: a staircase in the gains (mirakhorli notes S4.2)",
+    ),
+    "khalid/*-constrained": (
+        1e-3,
+        (
+            "rows of the programme come and go, and its interior point stops at 1e-6 (khalid notes"
+            " S4.5)"
+        ),
+    ),
     "gouta2015/*-table1": (1e-3, "saturated for 98 % of the run (gouta2015 notes S9.1)"),
 }
-SHORT = {"clock.duration": 200.0}  # of 900 and 1200 s: saturated starts, both setpoints, the first pours left to their own tests
+# of 900 and 1200 s: saturated starts, both setpoints, the first pours left to their own tests
+SHORT = {"clock.duration": 200.0}
 
 
 def tolerance(name):
@@ -39,15 +52,29 @@ def test_slopes_of_the_default_cost(name):
     if name.startswith(("gouta2015", "gouta2022")):
         case = rig.set_values(case, SHORT)
     present = parameters(case.loop)
-    whole = {n: spec for n, spec in paper.tunable.items() if split_index(n)[0] in present and not split_index(n)[1]}
-    entries = {n: spec for n, spec in paper.tunable.items() if split_index(n)[1] and split_index(n)[0] in present}
-    free = {n: spec for n, spec in whole.items() if not any(split_index(e)[0] == n for e in entries)}
+    whole = {
+        n: spec
+        for n, spec in paper.tunable.items()
+        if split_index(n)[0] in present and not split_index(n)[1]
+    }
+    entries = {
+        n: spec
+        for n, spec in paper.tunable.items()
+        if split_index(n)[1] and split_index(n)[0] in present
+    }
+    free = {
+        n: spec for n, spec in whole.items() if not any(split_index(e)[0] == n for e in entries)
+    }
     for n, spec in entries.items():
         if split_index(n)[1][0] < np.size(present[split_index(n)[0]]):
             free[n] = spec
-    if name.startswith("khalid") and case.loop.plant.pumps == 2:  # the narrow ranges of its entries are for one pump
-        free = {n: v for n, v in free.items() if n not in entries} | {n: whole[n] for n in {split_index(e)[0] for e in entries}}
-    if name.endswith("-constrained"):  # apart from the programme's own limits, where those of the pump would be a kink
+    # the narrow ranges of its entries are for one pump
+    if name.startswith("khalid") and case.loop.plant.pumps == 2:
+        free = {n: v for n, v in free.items() if n not in entries} | {
+            n: whole[n] for n in {split_index(e)[0] for e in entries}
+        }
+    # apart from the programme's own limits, where those of the pump would be a kink
+    if name.endswith("-constrained"):
         case = rig.set_values(case, {"actuator.low": -0.5, "actuator.high": 3.5})
     problem = Problem(case, free=free, limits={})
     z = np.clip(problem.start(), 0.02, 0.98)

@@ -32,11 +32,17 @@ def test_a_single_draw_is_told_without_a_spread(case):
     page = repr(one)
     for tank in (0, 1):
         unit, mean, interval, sd, *others = row(page, f"max_level of tank {tank + 1}")
-        assert interval == sd == "-" and {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"} and unit == "V"
+        assert (
+            interval == sd == "-"
+            and {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
+            and unit == "V"
+        )
     assert "one run has no spread" in page
 
 
-@pytest.mark.parametrize("failed, words", [([True, False], "one run has no spread"), ([True, True], "no run is left")])
+@pytest.mark.parametrize(
+    "failed, words", [([True, False], "one run has no spread"), ([True, True], "no run is left")]
+)
 def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
     two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))
     page = repr(two)
@@ -46,8 +52,15 @@ def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
 
 
 def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
-    """Skew draws, whose mean and 1.96 standard errors reach past what the measure can be; the settling time alone may be negative."""
-    four = tuning.ensemble(case, samples=4, measures=("overflow_volume", "saturated_fraction", "settling_time", "iae"), **OPTIONS)
+    """Skew draws, whose mean and 1.96 standard errors reach past what the measure can be; the
+    settling time alone may be negative.
+    """
+    four = tuning.ensemble(
+        case,
+        samples=4,
+        measures=("overflow_volume", "saturated_fraction", "settling_time", "iae"),
+        **OPTIONS,
+    )
     skew, share = np.array([0.0, 0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0, 0.2])
     measures = {
         "overflow_volume": np.stack([skew, skew + 10], axis=1),

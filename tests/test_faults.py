@@ -1,4 +1,6 @@
-"""Kills, full disks, folders that cannot be written to, Ctrl-C, two runs in one folder: one line, the promised exit code, nothing lost."""
+"""Kills, full disks, folders that cannot be written to, Ctrl-C, two runs in one folder: one line,
+the promised exit code, nothing lost.
+"""
 
 import contextlib
 import json
@@ -26,7 +28,19 @@ from tuning.storage import batch_store, evaluation_log, folder_lock
 HERE = Path(__file__).parent
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
 SIMULATE = ["simulate", *SHORT, "--quiet"]
-SEARCH = ["tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0", "--iterations", "3", "--quiet"]
+SEARCH = [
+    "tune",
+    *SHORT,
+    "--starts",
+    "1",
+    "--screening",
+    "2",
+    "--validation",
+    "0",
+    "--iterations",
+    "3",
+    "--quiet",
+]
 SPREAD = ["uncertainty", *SHORT, "--samples", "20", "--quiet"]
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 WRITERS = {
@@ -115,9 +129,10 @@ def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
     again, made = evaluation_log.Log(tmp_path, {"p": 1}, resume=True), []
-    assert [again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3)) for i in range(20)] == [
-        (float(i), 1 / 3) for i in range(20)
-    ]
+    assert [
+        again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3))
+        for i in range(20)
+    ] == [(float(i), 1 / 3) for i in range(20)]
     assert made[0] > 5 and made == list(range(made[0], 20))
 
 
@@ -137,33 +152,53 @@ def old_result(folder, words, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow) for n in WRITERS]
+    "name",
+    [
+        n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow)
+        for n in WRITERS
+    ],
 )
 def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     before = old_result(folder, words, capsys)
-    room = 0.5 * max(map(len, before.values()))  # enough for a log, or a batch, not for the largest file of the result
+    # enough for a log, or a batch, not for the largest file of the result
+    room = 0.5 * max(map(len, before.values()))
     seed = ["--seed", "1"] if name in ("simulate", "tune", "uncertainty") else []
     with small_disk(int(room)):
         code, out, err = say([*words, *seed, "--out", folder], capsys)
     last = [line for line in err if line.startswith("jaxtank: ")]
     assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
     assert "Traceback" not in "".join(err)
-    after, drawn = contents(folder), {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))}
-    if after.get("result.json") == before.get("result.json"):  # there was no room for the new one: all of the old is there
+    after, drawn = (
+        contents(folder),
+        {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))},
+    )
+    # there was no room for the new one: all of the old is there
+    if after.get("result.json") == before.get("result.json"):
         assert {n: data for n, data in after.items() if n in before} == before
     else:  # the new one, with no picture of the old
-        assert not drawn & after.keys() and before.keys() - drawn <= after.keys() and json.loads(after["result.json"])
+        assert (
+            not drawn & after.keys()
+            and before.keys() - drawn <= after.keys()
+            and json.loads(after["result.json"])
+        )
     # the old result of identify here is its result.json alone
     left = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
-    assert all(n == evaluation_log.NAME or n == batch_store.MANIFEST or batch_store.NAME.fullmatch(n) for n in left), left
+    assert all(
+        n == evaluation_log.NAME or n == batch_store.MANIFEST or batch_store.NAME.fullmatch(n)
+        for n in left
+    ), left
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
         assert out.strip()  # the answer is told all the same
 
 
 # identify, sensitivity and compare: test_page.py
-DRAWERS = ["simulate", "show", *(pytest.param(n, marks=pytest.mark.slow) for n in ("tune", "uncertainty"))]
+DRAWERS = [
+    "simulate",
+    "show",
+    *(pytest.param(n, marks=pytest.mark.slow) for n in ("tune", "uncertainty")),
+]
 
 
 @pytest.mark.parametrize("name", DRAWERS)
@@ -188,7 +223,11 @@ def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, ca
         monkeypatch.setattr(plot, broken, fault)
         code, _, err = say([*words, "--out", folder], capsys)
         notes = [line for line in err if line.startswith("jaxtank: ")]
-        assert code in (0, 3) and len(notes) >= 1 and all("note: " in n and "could not be drawn" in n for n in notes), err
+        assert (
+            code in (0, 3)
+            and len(notes) >= 1
+            and all("note: " in n and "could not be drawn" in n for n in notes)
+        ), err
         left = contents(folder)
         missing = whole.keys() - left.keys()
         assert missing and all(n.endswith((".png", ".svg")) for n in missing)
@@ -211,15 +250,21 @@ seed = 1
     words = [WRITERS[name][0], "rig.toml", *(w for w in WRITERS[name][1:] if w not in SHORT)]
     old_result(tmp_path / "out", WRITERS[name], capsys)
     code, _, err = say([*words, "--out", "new"], capsys)
-    assert code in (0, 3) and not [line for line in err if "could not be drawn" in line or "internal error" in line], err
-    assert {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {"estimates.png"} <= contents(tmp_path / "new").keys()
+    assert code in (0, 3) and not [
+        line for line in err if "could not be drawn" in line or "internal error" in line
+    ], err
+    assert {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {
+        "estimates.png"
+    } <= contents(tmp_path / "new").keys()
 
 
 @pytest.mark.parametrize("name", WRITERS)
 def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen, capsys):
     for folder in (frozen, frozen / "in" / "it", frozen / "result.json" / "under"):
         code, out, err = say([*WRITERS[name], "--out", folder], capsys)
-        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), err
+        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), (
+            err
+        )
     assert contents(frozen) == {"result.json": b"old"}
 
 
@@ -227,13 +272,21 @@ def test_a_folder_that_cannot_be_is_refused_at_the_door(tmp_path, capsys):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for folder, why in ((tmp_path / "link", "nowhere"), ("a\0b", "NUL")):
         code, out, err = say([*WRITERS["simulate"], "--out", folder], capsys)
-        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out") and why in err[0], err
+        assert (
+            code == 2
+            and out == ""
+            and len(err) == 1
+            and err[0].startswith("jaxtank: --out")
+            and why in err[0]
+        ), err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link"]
 
 
 def test_output_that_cannot_be_written_is_one_line():
     with open("/dev/full", "w") as full:
-        done = subprocess.run([*JAXTANK, "completion", "bash"], stdout=full, stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            [*JAXTANK, "completion", "bash"], stdout=full, stderr=subprocess.PIPE, text=True
+        )
     assert (done.returncode, done.stderr) == (2, "jaxtank: output: No space left on device\n")
 
 
@@ -251,7 +304,9 @@ with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
 @contextlib.contextmanager
 def another(folder, kind="alone"):
     """A process that holds a folder."""
-    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert process.stdout.readline() == "held\n"
         yield process
@@ -299,13 +354,37 @@ def test_a_folder_made_for_nothing_is_removed(tmp_path):
 @pytest.mark.slow
 def test_two_at_once(tmp_path):
     """Both may be right one after the other; neither is wrong."""
-    command = [*JAXTANK, "uncertainty", *SHORT, "--samples", "3000", "--quiet", "--out", str(tmp_path / "out")]
-    alone = [*JAXTANK, "uncertainty", *SHORT, "--samples", "3000", "--quiet", "--out", str(tmp_path / "alone")]
+    command = [
+        *JAXTANK,
+        "uncertainty",
+        *SHORT,
+        "--samples",
+        "3000",
+        "--quiet",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    alone = [
+        *JAXTANK,
+        "uncertainty",
+        *SHORT,
+        "--samples",
+        "3000",
+        "--quiet",
+        "--out",
+        str(tmp_path / "alone"),
+    ]
     subprocess.run(alone, check=True, capture_output=True)
-    both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    both = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
     said = [(*p.communicate(), p.returncode) for p in both]
     assert sorted(code for *_, code in said) in ([0, 2], [0, 0])
-    assert all(err == "" if code == 0 else "another run" in err and err.count("\n") == 1 for _, err, code in said)
+    assert all(
+        err == "" if code == 0 else "another run" in err and err.count("\n") == 1
+        for _, err, code in said
+    )
     mine, theirs = contents(tmp_path / "out"), contents(tmp_path / "alone")
     assert mine.keys() == theirs.keys() and mine["draws.csv"] == theirs["draws.csv"]
 
@@ -314,18 +393,38 @@ def test_two_at_once(tmp_path):
 
 
 def interrupted(words, folder, lines, number=signal.SIGINT):
-    """(stderr, exit code) of a command that gets a signal once its log has so many lines; 0: as soon as the folder is there."""
-    process = subprocess.Popen([*JAXTANK, *words, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    """(stderr, exit code) of a command that gets a signal once its log has so many lines; 0: as
+    soon as the folder is there.
+    """
+    process = subprocess.Popen(
+        [*JAXTANK, *words, "--out", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     log, until = folder / evaluation_log.NAME, time.monotonic() + 120
     while process.poll() is None and time.monotonic() < until:
-        if (lines == 0 and folder.exists()) or (log.exists() and log.read_bytes().count(b"\n") >= lines > 0):
+        if (lines == 0 and folder.exists()) or (
+            log.exists() and log.read_bytes().count(b"\n") >= lines > 0
+        ):
             break
         time.sleep(0.005)
     process.send_signal(number)
     return process.communicate(timeout=120)[1], process.returncode
 
 
-LONG = ["tune", "cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400", "--screening", "64", "--validation", "0"]
+LONG = [
+    "tune",
+    "cascaded/pi",
+    "--set",
+    "clock.dt=1",
+    "--set",
+    "clock.duration=400",
+    "--screening",
+    "64",
+    "--validation",
+    "0",
+]
 
 
 @pytest.mark.parametrize("lines", [6, *(pytest.param(n, marks=pytest.mark.slow) for n in (11, 25))])
@@ -348,7 +447,9 @@ def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
         pytest.param(2, signal.SIGINT, "interrupted", marks=pytest.mark.slow),
     ],
 )
-def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folder(lines, number, word, tmp_path):
+def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folder(
+    lines, number, word, tmp_path
+):
     said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
     assert (said, code) == (f"jaxtank: {word}\n", 128 + number)
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
@@ -396,10 +497,10 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
 def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     """The first is answered while an evaluation is compiled that takes for ever."""
     code = (
-        "import os, signal, sys, time; from tuning.cli import interrupts; interrupts.listen(); search = interrupts.Interrupts()\n"
-        "search.check(); os.kill(os.getpid(), signal.SIGINT)\n"
-        "while not search.stop: time.sleep(0.01)\n"
-        "os.kill(os.getpid(), signal.SIGINT); time.sleep(60); print('went on')"
+        "import os, signal, sys, time; from tuning.cli import interrupts; interrupts.listen();"
+        " search = interrupts.Interrupts()\nsearch.check(); os.kill(os.getpid(),"
+        " signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\nos.kill(os.getpid(),"
+        " signal.SIGINT); time.sleep(60); print('went on')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     first, second = done.stderr.splitlines()
@@ -409,18 +510,20 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
 
 def test_importing_the_library_leaves_signals_alone():
     code = (
-        "import signal; before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\n"
-        "import jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts, tuning.search.tuner, tuning.cli.commands.tuning\n"
-        "tuning.cli.main.main(['list'])\n"
-        "assert before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\n"
-        "assert signal.set_wakeup_fd(-1) == -1"
+        "import signal; before = [signal.getsignal(n) for n in (signal.SIGINT,"
+        " signal.SIGTERM)]\nimport jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts,"
+        " tuning.search.tuner, tuning.cli.commands.tuning\ntuning.cli.main.main(['list'])\nassert"
+        " before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\nassert"
+        " signal.set_wakeup_fd(-1) == -1"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
 
 
 def test_signals_at_random_moments():
-    found = interrupt_drill.drill(4, seed=3, commands=("tune", "simulate"), takes={"tune": 4.0, "simulate": 2.0})
+    found = interrupt_drill.drill(
+        4, seed=3, commands=("tune", "simulate"), takes={"tune": 4.0, "simulate": 2.0}
+    )
     assert found["signals"] == 4 and not found["wrong"], found["wrong"]
 
 
@@ -431,10 +534,16 @@ def test_two_hundred_signals():
 
 
 def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
-    """Two of three searches are in the log: the third alone is run, and the answer has the same bits; another problem's log is refused."""
+    """Two of three searches are in the log: the third alone is run, and the answer has the same
+    bits; another problem's log is refused.
+    """
     case, k = presets.find("cascaded/pi"), np.arange(80.0)
     wave = 3 + np.sin(k / 9)
-    log = tuning.log(t=4 * k, u=wave[:, None], y=np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1))
+    log = tuning.log(
+        t=4 * k,
+        u=wave[:, None],
+        y=np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1),
+    )
     free = {"plant.pump_gain[0]": (0.02, 0.1), "plant.drain[1]": (0.02, 0.08)}
     options = {"start": "case", "starts": 3, "hold_back": 0, "noise": 0.05, "substeps": 2}
     seen = []
@@ -445,10 +554,16 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
             raise KeyboardInterrupt
 
     whole = tuning.identify(case, log, free, **options)
-    assert tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status == "interrupted"
+    assert (
+        tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status
+        == "interrupted"
+    )
     assert (tmp_path / evaluation_log.NAME).read_bytes().count(b"\n") == 3
-    again = tuning.identify(case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options)
-    assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]  # what is recalled has no slopes
+    again = tuning.identify(
+        case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options
+    )
+    # what is recalled has no slopes
+    assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
     told = [{k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)]
     assert json.dumps(told[0]) == json.dumps(told[1])
     with pytest.raises(InputError, match="of another problem; what differs: noise"):
@@ -459,7 +574,9 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
 
 
 def drill(*words):
-    done = subprocess.run([sys.executable, str(HERE / "fault_drill.py"), *words], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, str(HERE / "fault_drill.py"), *words], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
 

@@ -1,6 +1,8 @@
-"""Ten thousand broken rig files, command lines and logs: an answer in one line, no traceback, nothing left behind.
+"""Ten thousand broken rig files, command lines and logs: an answer in one line, no traceback,
+nothing left behind.
 
-The default run does a few hundred of each; `pytest -m slow tests/test_fuzz.py` does the rest and prints what was tried.
+The default run does a few hundred of each; `pytest -m slow tests/test_fuzz.py` does the rest and
+prints what was tried.
 """
 
 import importlib
@@ -29,7 +31,12 @@ PATIENCE = 5.0  # s
 def small_cases():
     return [
         rig.dump(presets.find(name))
-        for name in ("gouta2015/backstepping", "calofir/backstepping", "cascaded/pi", "mirakhorli/hybrid")
+        for name in (
+            "gouta2015/backstepping",
+            "calofir/backstepping",
+            "cascaded/pi",
+            "mirakhorli/hybrid",
+        )
     ]
 
 
@@ -52,22 +59,41 @@ def broken(text, rng):
         elif what == 3 and lines[i]:
             k = rng.randrange(len(lines[i]))
             lines[i] = (
-                lines[i][:k] + chr(rng.choice([0, 9, 34, 39, 91, 93, 61, 46, 48, 97, 233, 0x4E2D, 0x1F600])) + lines[i][k + 1 :]
+                lines[i][:k]
+                + chr(rng.choice([0, 9, 34, 39, 91, 93, 61, 46, 48, 97, 233, 0x4E2D, 0x1F600]))
+                + lines[i][k + 1 :]
             )
         elif what == 4:
-            lines.insert(i, f"{rng.choice(['tank', 'values', 'x', 'clock.dt', 'law', 'case'])} = {rng.choice(WORDS)}")
+            lines.insert(
+                i,
+                f"{rng.choice(['tank', 'values', 'x', 'clock.dt', 'law', 'case'])} ="
+                f" {rng.choice(WORDS)}",
+            )
         elif what == 5:
             lines.insert(
                 i,
                 rng.choice(
-                    ["[values]", "[[tank]]", "[law]", "[reference]", "[]", "[[", "[limits.max_level]", "[free]", "[[scenario]]"]
+                    [
+                        "[values]",
+                        "[[tank]]",
+                        "[law]",
+                        "[reference]",
+                        "[]",
+                        "[[",
+                        "[limits.max_level]",
+                        "[free]",
+                        "[[scenario]]",
+                    ]
                 ),
             )
         elif what == 6:
             k = rng.randrange(len(lines))
             lines[i], lines[k] = lines[k], lines[i]
         elif what == 7 and "=" in lines[i]:
-            lines[i] = lines[i].split("=")[0] + f"= {rng.choice(['-', ''])}{rng.random() * 10.0 ** rng.randint(-12, 12)!r}"
+            lines[i] = (
+                lines[i].split("=")[0]
+                + f"= {rng.choice(['-', ''])}{rng.random() * 10.0 ** rng.randint(-12, 12)!r}"
+            )
         elif what == 8:
             lines = lines[: rng.randrange(1, len(lines) + 1)]
         if not lines:
@@ -127,12 +153,23 @@ COMMANDS = [
     "",
     "fly",
 ]
-CASES = ["gouta2015/backstepping", "gouta2015", "gouta2051/ngpc", "nothing.toml", "/dev/null", "", "..", "cascaded/pi"]
+CASES = [
+    "gouta2015/backstepping",
+    "gouta2015",
+    "gouta2051/ngpc",
+    "nothing.toml",
+    "/dev/null",
+    "",
+    "..",
+    "cascaded/pi",
+]
 HARMLESS = {"list", "compare", "bench"}
 
 
 def told(words, capsys):
-    """(exit code, lines of stderr) of a command that is meant to be refused before it runs anything."""
+    """(exit code, lines of stderr) of a command that is meant to be refused before it runs
+    anything.
+    """
     began = time.perf_counter()
     try:
         code = main.main(words)
@@ -144,7 +181,9 @@ def told(words, capsys):
 
 
 def refused_lines(count, seed, folder, capsys, monkeypatch):
-    """How many of `count` command lines were refused. What would run is not let to: the work behind the door is replaced."""
+    """How many of `count` command lines were refused. What would run is not let to: the work behind
+    the door is replaced.
+    """
     rng, refused = random.Random(seed), 0
 
     def stop(*_, **__):
@@ -190,7 +229,8 @@ def test_broken_command_lines(tmp_path, capsys, monkeypatch):
 
 
 LOG = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]\n" + "".join(
-    f"{k},{3 + 0.1 * (k % 5):.1f},2.8,{10 + 0.01 * k:.2f},{9 - 0.01 * k:.2f},2.6,4.6\n" for k in range(60)
+    f"{k},{3 + 0.1 * (k % 5):.1f},2.8,{10 + 0.01 * k:.2f},{9 - 0.01 * k:.2f},2.6,4.6\n"
+    for k in range(60)
 )
 CELLS = [
     "",
@@ -267,10 +307,16 @@ def read_logs(count, seed, folder):
         try:
             log = read_log(path, loop, decimal=rng.choice([".", ".", ","]))
             read += 1
-            assert np.all(np.diff(log.t) > 0) and np.all(np.isfinite(log.u)) and not np.isinf(log.y).any()
+            assert (
+                np.all(np.diff(log.t) > 0)
+                and np.all(np.isfinite(log.u))
+                and not np.isinf(log.y).any()
+            )
         except InputError as error:
             refused += 1
-            assert "log.csv" in str(error) and "\n" not in str(error) and len(str(error)) < 1000, text
+            assert "log.csv" in str(error) and "\n" not in str(error) and len(str(error)) < 1000, (
+                text
+            )
     return read, refused
 
 
@@ -288,7 +334,8 @@ def test_ten_thousand(tmp_path, capsys, monkeypatch):
     logs = read_logs(4000, 1, tmp_path)
     with capsys.disabled():
         print(
-            f"\nrig files: {rigs[0]} read, {rigs[1]} refused; logs: {logs[0]} read, {logs[1]} refused; command lines refused: {lines} of 3000"
+            f"\nrig files: {rigs[0]} read, {rigs[1]} refused; logs: {logs[0]} read, {logs[1]}"
+            f" refused; command lines refused: {lines} of 3000"
         )
 
 

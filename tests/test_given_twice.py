@@ -1,4 +1,6 @@
-"""What is said twice on a command line, or beside what it contradicts: one line that names it, before anything is run."""
+"""What is said twice on a command line, or beside what it contradicts: one line that names it,
+before anything is run.
+"""
 
 import argparse
 
@@ -54,34 +56,52 @@ def test_names_of_an_identification(refused):
 
 
 def options():
-    """(command, option) of every option of every command that takes one value and is not made to be repeated."""
+    """(command, option) of every option of every command that takes one value and is not made to be
+    repeated.
+    """
     top = parser.parser()
     (commands,) = (a for a in top._actions if isinstance(a, argparse._SubParsersAction))
     for command, one in commands.choices.items():
         for action in one._actions:
-            if action.option_strings and action.nargs is None and not isinstance(action, argparse._AppendAction):
+            if (
+                action.option_strings
+                and action.nargs is None
+                and not isinstance(action, argparse._AppendAction)
+            ):
                 yield command, action.option_strings[0]
 
 
 def test_every_option_that_is_not_made_to_be_repeated(refused):
     seen = list(options())
-    assert {("simulate", "--dt"), ("identify", "--duration"), ("bench", "--rounds"), ("tune", "--seed")} <= set(seen)
+    assert {
+        ("simulate", "--dt"),
+        ("identify", "--duration"),
+        ("bench", "--rounds"),
+        ("tune", "--seed"),
+    } <= set(seen)
     for command, option in seen:
         line = refused(command, "x", f"{option}=3", option, "4")
         assert line == f"jaxtank: {option} is given twice, the second time as '4': give it once"
 
 
 def test_one_thing_by_two_names(refused):
-    assert refused("simulate", CASE, "--dt", "1", "--set", "clock.dt=2") == (
-        "jaxtank: --dt 1 beside --set clock.dt=2: give one of them"
+    assert (
+        refused("simulate", CASE, "--dt", "1", "--set", "clock.dt=2")
+        == "jaxtank: --dt 1 beside --set clock.dt=2: give one of them"
     )
 
 
 def test_a_plan_has_no_log(refused):
-    assert "leave it out to fit --data 'nope.csv'" in refused(*IDENTIFY, "--plan", "--data", "nope.csv")
+    assert "leave it out to fit --data 'nope.csv'" in refused(
+        *IDENTIFY, "--plan", "--data", "nope.csv"
+    )
     assert "--plan writes no files" in refused(*IDENTIFY, "--plan", "--out", "here")
 
 
-@pytest.mark.parametrize(("option", "value"), [("--duration", "300"), ("--voltage", "3,3"), ("--measure", "h1")])
+@pytest.mark.parametrize(
+    ("option", "value"), [("--duration", "300"), ("--voltage", "3,3"), ("--measure", "h1")]
+)
 def test_a_log_has_no_plan(refused, option, value):
-    assert f"{option} {value!r}: is of an experiment that is planned" in refused(*IDENTIFY, "--data", "nope.csv", option, value)
+    assert f"{option} {value!r}: is of an experiment that is planned" in refused(
+        *IDENTIFY, "--data", "nope.csv", option, value
+    )

@@ -1,7 +1,9 @@
-"""The acceptance values of the re-derived gouta2015: closed-loop tables, unit vectors, and tests that need no reference run.
+"""The acceptance values of the re-derived gouta2015: closed-loop tables, unit vectors, and tests
+that need no reference run.
 
-The tables were made by an independent prototype (numba RK4 at 0.01 s, checked with LSODA). Tolerances: 0.5 % on RMS values, 0.05 cm on
-peaks (0.1 cm for ramps of 30 s and less), 0.1 percentage points on saturation for plant B; 2 % on RMS for plant A, whose input is bang-bang.
+The tables were made by an independent prototype (numba RK4 at 0.01 s, checked with LSODA).
+Tolerances: 0.5 % on RMS values, 0.05 cm on peaks (0.1 cm for ramps of 30 s and less), 0.1
+percentage points on saturation for plant B; 2 % on RMS for plant A, whose input is bang-bang.
 """
 
 import dataclasses
@@ -40,17 +42,120 @@ MEASURES = (
 
 @functools.cache
 def measured(name, **values):
-    case = rig.set_values(load("gouta2015").cases[name], {k.replace("__", "."): v for k, v in values.items()})
+    case = rig.set_values(
+        load("gouta2015").cases[name], {k.replace("__", "."): v for k, v in values.items()}
+    )
     return {m: np.asarray(v) for m, v in jaxtank.evaluate(case.loop, case.clock, MEASURES).items()}
 
 
-# D, law, RMS1, RMS2, total, ISE1, ISE2, max|e|1, 2, RMS u1, u2, sat % 1, 2, max h3, h4, min h3, h4, travel 1, 2
+# D, law, RMS1, RMS2, total, ISE1, ISE2, max|e|1, 2, RMS u1, u2, sat % 1, 2, max h3, h4, min h3, h4,
+# travel 1, 2
 PLANT_B = [
-    (60, "ngpc", 0.0623, 0.0533, 0.0820, 4.66, 3.41, 0.37, 0.28, 4.029, 3.535, 0, 0, 33.24, 37.00, 0.216, 0.860, 41, 38),
-    (60, "backstepping", 0.3856, 0.3281, 0.5063, 178.4, 129.2, 1.48, 1.11, 3.990, 3.504, 0, 0, 31.40, 33.08, 0.470, 1.370, 20, 18),
-    (60, "backstepping-ff", 0.0889, 0.0742, 0.1158, 9.5, 6.6, 0.50, 0.37, 4.025, 3.531, 0, 0, 33.21, 36.96, 0.218, 0.866, 32, 29),
-    (30, "ngpc", 0.1636, 0.1389, 0.2146, 32.1, 23.1, 1.39, 0.80, 4.177, 3.671, 1.3, 1.5, 40.80, 47.17, 0.004, 0.159, 66, 58),
-    (30, "backstepping", 0.5367, 0.4560, 0.7043, 345.7, 249.5, 3.01, 2.24, 4.065, 3.566, 0, 0, 33.71, 38.51, 0.147, 0.750, 33, 29),
+    (
+        60,
+        "ngpc",
+        0.0623,
+        0.0533,
+        0.0820,
+        4.66,
+        3.41,
+        0.37,
+        0.28,
+        4.029,
+        3.535,
+        0,
+        0,
+        33.24,
+        37.00,
+        0.216,
+        0.860,
+        41,
+        38,
+    ),
+    (
+        60,
+        "backstepping",
+        0.3856,
+        0.3281,
+        0.5063,
+        178.4,
+        129.2,
+        1.48,
+        1.11,
+        3.990,
+        3.504,
+        0,
+        0,
+        31.40,
+        33.08,
+        0.470,
+        1.370,
+        20,
+        18,
+    ),
+    (
+        60,
+        "backstepping-ff",
+        0.0889,
+        0.0742,
+        0.1158,
+        9.5,
+        6.6,
+        0.50,
+        0.37,
+        4.025,
+        3.531,
+        0,
+        0,
+        33.21,
+        36.96,
+        0.218,
+        0.866,
+        32,
+        29,
+    ),
+    (
+        30,
+        "ngpc",
+        0.1636,
+        0.1389,
+        0.2146,
+        32.1,
+        23.1,
+        1.39,
+        0.80,
+        4.177,
+        3.671,
+        1.3,
+        1.5,
+        40.80,
+        47.17,
+        0.004,
+        0.159,
+        66,
+        58,
+    ),
+    (
+        30,
+        "backstepping",
+        0.5367,
+        0.4560,
+        0.7043,
+        345.7,
+        249.5,
+        3.01,
+        2.24,
+        4.065,
+        3.566,
+        0,
+        0,
+        33.71,
+        38.51,
+        0.147,
+        0.750,
+        33,
+        29,
+    ),
     (
         30,
         "backstepping-ff",
@@ -93,13 +198,53 @@ PLANT_B = [
         46,
         40,
     ),
-    (20, "backstepping-ff", 0.2186, 0.2744, 0.3508, 57.3, 90.4, 1.00, 1.51, 4.250, 3.711, 3.1, 3.9, 45.4, 50.3, 0.0, 0.001, 65, 52),
+    (
+        20,
+        "backstepping-ff",
+        0.2186,
+        0.2744,
+        0.3508,
+        57.3,
+        90.4,
+        1.00,
+        1.51,
+        4.250,
+        3.711,
+        3.1,
+        3.9,
+        45.4,
+        50.3,
+        0.0,
+        0.001,
+        65,
+        52,
+    ),
 ]
 
 
 @pytest.mark.parametrize("row", PLANT_B, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_plant_b_rows_of_the_acceptance_table(row):
-    ramp, name, rms1, rms2, total, ise1, ise2, e1, e2, u1, u2, sat1, sat2, h3, h4, low3, low4, tv1, tv2 = row
+    (
+        ramp,
+        name,
+        rms1,
+        rms2,
+        total,
+        ise1,
+        ise2,
+        e1,
+        e2,
+        u1,
+        u2,
+        sat1,
+        sat2,
+        h3,
+        h4,
+        low3,
+        low4,
+        tv1,
+        tv2,
+    ) = row
     got = measured(name, reference__ramp=float(ramp))
     np.testing.assert_allclose(got["rms_error"], (rms1, rms2), rtol=5e-3)
     np.testing.assert_allclose(got["rms_error_total"], total, rtol=5e-3)
@@ -112,10 +257,13 @@ def test_plant_b_rows_of_the_acceptance_table(row):
     peak = 0.05 if ramp == 60 else 0.1
     np.testing.assert_allclose(got["max_level"][2:], (h3, h4), atol=peak)
     np.testing.assert_allclose(got["min_level"][2:], (low3, low4), atol=5e-3)
-    np.testing.assert_allclose(got["input_travel"], (tv1, tv2), atol=0.8)  # printed without decimals
+    # printed without decimals
+    np.testing.assert_allclose(got["input_travel"], (tv1, tv2), atol=0.8)
 
 
-STEPS = [  # D, law, least and greatest overshoot %, least and greatest settling s, of the steps of both outputs
+# D, law, least and greatest overshoot %, least and greatest settling s, of the steps of both
+# outputs
+STEPS = [
     (60, "ngpc", (4.6, 4.7), (-3.1, -2.9)),
     (60, "backstepping", (1.4, 1.85), (8.3, 8.6)),
     (60, "backstepping-ff", (5.7, 6.3), (12.5, 15.0)),
@@ -126,15 +274,21 @@ STEPS = [  # D, law, least and greatest overshoot %, least and greatest settling
 
 @pytest.mark.parametrize("row", STEPS, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_overshoot_and_settling_of_the_steps(row):
-    """The measures are the worst of each output's steps, so they lie at the upper end of the tabulated span."""
+    """The measures are the worst of each output's steps, so they lie at the upper end of the
+    tabulated span.
+    """
     ramp, name, overshoot, settling = row
     got = measured(name, reference__ramp=float(ramp))
-    assert np.all((got["overshoot_percent"] >= overshoot[0]) & (got["overshoot_percent"] <= overshoot[1]))
+    assert np.all(
+        (got["overshoot_percent"] >= overshoot[0]) & (got["overshoot_percent"] <= overshoot[1])
+    )
     assert np.all((got["settling_time"] >= settling[0]) & (got["settling_time"] <= settling[1]))
 
 
 def test_ngpc_overshoots_of_the_30_s_ramps():
-    np.testing.assert_allclose(measured("ngpc", reference__ramp=30.0)["overshoot_percent"], (17.4, 13.4), atol=0.1)
+    np.testing.assert_allclose(
+        measured("ngpc", reference__ramp=30.0)["overshoot_percent"], (17.4, 13.4), atol=0.1
+    )
 
 
 VARIANTS = [  # case, overrides, RMS1, RMS2
@@ -145,7 +299,9 @@ VARIANTS = [  # case, overrides, RMS1, RMS2
 ]
 
 
-@pytest.mark.parametrize("name, values, rms1, rms2", VARIANTS, ids=lambda v: v if isinstance(v, str) else None)
+@pytest.mark.parametrize(
+    "name, values, rms1, rms2", VARIANTS, ids=lambda v: v if isinstance(v, str) else None
+)
 def test_variants_on_plant_b(name, values, rms1, rms2):
     np.testing.assert_allclose(measured(name, **values)["rms_error"], (rms1, rms2), rtol=5e-3)
 
@@ -153,11 +309,15 @@ def test_variants_on_plant_b(name, values, rms1, rms2):
 def test_box_qp_equals_clipping_where_nothing_saturates():
     clipped, allocated = measured("ngpc"), measured("ngpc-boxqp")
     np.testing.assert_allclose(allocated["rms_error"], clipped["rms_error"], rtol=1e-12)
-    np.testing.assert_allclose(measured("ngpc-boxqp", reference__ramp=30.0)["rms_error_total"], 0.192, rtol=5e-3)
+    np.testing.assert_allclose(
+        measured("ngpc-boxqp", reference__ramp=30.0)["rms_error_total"], 0.192, rtol=5e-3
+    )
 
 
 def test_slow_ramps_meet_the_rims_with_backstepping_only():
-    np.testing.assert_allclose(measured("backstepping-slow")["max_level"][2:], (26.3, 29.6), atol=0.05)
+    np.testing.assert_allclose(
+        measured("backstepping-slow")["max_level"][2:], (26.3, 29.6), atol=0.05
+    )
     np.testing.assert_allclose(measured("ngpc-slow")["max_level"][2:], (26.8, 30.8), atol=0.05)
 
 
@@ -176,7 +336,8 @@ def test_trajectory_samples_and_final_state(gouta, name):
     run = jaxtank.simulate(case.loop, case.clock, save_every=1000)
     for other, t, levels in SAMPLES:
         if other == name:
-            np.testing.assert_allclose(run.x[t // 10], levels, atol=1.5e-4)  # the prototype differs by 5e-4 relative on the error
+            # the prototype differs by 5e-4 relative on the error
+            np.testing.assert_allclose(run.x[t // 10], levels, atol=1.5e-4)
     np.testing.assert_allclose(run.x[-1], (12, 10, 15.16267, 6.02296), atol=2e-4)
     np.testing.assert_allclose(run.u[-1], (4.2382, 2.6712), atol=2e-4)
     assert run.t[-1] == 1200.0
@@ -188,7 +349,19 @@ PLANT_A = [
     ("backstepping-table1", {}, 4.754, 4.753, 6.723, 8.017, 6.843, 98.0, 94.4, 55.4, 40.6),
     ("backstepping-ff-table1", {}, 4.785, 4.780, 6.763, 8.020, 6.838, 98.2, 93.9, 55.4, 40.8),
     ("ngpc-table1", {"plant__overflow": True}, 2.512, 2.286, 3.397, 8.21, 6.87, 98, 86, 30.0, 30.0),
-    ("backstepping-table1", {"plant__overflow": True}, 2.529, 2.306, 3.422, 8.21, 6.87, 98, 86, 30.0, 30.0),
+    (
+        "backstepping-table1",
+        {"plant__overflow": True},
+        2.529,
+        2.306,
+        3.422,
+        8.21,
+        6.87,
+        98,
+        86,
+        30.0,
+        30.0,
+    ),
     ("ngpc-table1-boxqp", {}, 2.081, 3.282, 3.886, None, None, 98, 98, 26.7, 43.8),
     ("backstepping-table1-boxqp", {}, 2.041, 3.371, 3.941, None, None, 98, 98, 29.4, 43.9),
 ]
@@ -198,14 +371,19 @@ PLANT_A = [
 def test_plant_a_rows_of_the_acceptance_table(row):
     name, values, rms1, rms2, total, u1, u2, sat1, sat2, h3, h4 = row
     got = measured(name, **values)
-    np.testing.assert_allclose([*got["rms_error"], got["rms_error_total"]], (rms1, rms2, total), rtol=2e-2)
+    np.testing.assert_allclose(
+        [*got["rms_error"], got["rms_error_total"]], (rms1, rms2, total), rtol=2e-2
+    )
     if u1 is not None:
         np.testing.assert_allclose(got["rms_input"], (u1, u2), rtol=2e-2)
     np.testing.assert_allclose(100 * got["saturated_fraction"], (sat1, sat2), atol=0.6)
     np.testing.assert_allclose(got["max_level"][2:], (h3, h4), atol=0.15)
 
 
-@pytest.mark.parametrize("name, excess", [("ngpc-table1", 3417), ("backstepping-table1", 1293), ("backstepping-ff-table1", 1324)])
+@pytest.mark.parametrize(
+    "name, excess",
+    [("ngpc-table1", 3417), ("backstepping-table1", 1293), ("backstepping-ff-table1", 1324)],
+)
 def test_plant_a_mean_command_outside_the_limits(gouta, name, excess):
     case = gouta(name)
     command = np.asarray(jaxtank.simulate(case.loop, case.clock, save_every=1).command)
@@ -258,11 +436,15 @@ def test_unit_vectors_of_the_box_qp(kind, which):
 
 
 def test_latch_up_is_removed_by_the_box_qp():
-    """Both outputs too high: clipping still runs pump 2 at 12 V, the constrained minimiser stops both (plant A, notes S4.5)."""
+    """Both outputs too high: clipping still runs pump 2 at 12 V, the constrained minimiser stops
+    both (plant A, notes S4.5).
+    """
     controller, u = command("ngpc", PRINTED_AREA, SECOND)
     metric = controller.input_metric(Estimate(x=tuple(map(float, SECOND[0]))))
     np.testing.assert_array_equal(np.clip(u, 0, 12), (0, 12))
-    np.testing.assert_allclose(allocate(u, metric, np.zeros(2), np.full(2, 12.0)), (0, 0), atol=1e-9)
+    np.testing.assert_allclose(
+        allocate(u, metric, np.zeros(2), np.full(2, 12.0)), (0, 0), atol=1e-9
+    )
 
 
 def test_box_qp_against_a_grid():
@@ -273,8 +455,14 @@ def test_box_qp_against_a_grid():
         m = rng.normal(size=(2, 2))
         g = m.T @ m + 0.05 * np.eye(2)
         u = rng.uniform(-20, 30, 2)
-        got = np.array(allocate(tuple(u), (g[0, 0], g[0, 1], g[1, 1]), np.zeros(2), np.full(2, 12.0)))
-        cost = lambda a, b: g[0, 0] * (a - u[0]) ** 2 + 2 * g[0, 1] * (a - u[0]) * (b - u[1]) + g[1, 1] * (b - u[1]) ** 2  # noqa: B023
+        got = np.array(
+            allocate(tuple(u), (g[0, 0], g[0, 1], g[1, 1]), np.zeros(2), np.full(2, 12.0))
+        )
+        cost = lambda a, b, g=g, u=u: (
+            g[0, 0] * (a - u[0]) ** 2
+            + 2 * g[0, 1] * (a - u[0]) * (b - u[1])
+            + g[1, 1] * (b - u[1]) ** 2
+        )
         assert np.all((got >= 0) & (got <= 12))
         assert cost(*got) <= cost(x, y).min() + 1e-9
 
@@ -287,11 +475,14 @@ def test_time_scaling_maps_plant_a_to_plant_b(gouta):
     f = FAST_AREA / PRINTED_AREA
     slow, fast = gouta("ngpc-table1"), gouta("ngpc")
     slow = rig.set_values(slow, {"controller.Tp": 11.0 / f, "reference.ramp": 60.0 / f})
-    stretched = dataclasses.replace(slow.loop.reference, changes=tuple((t / f, i) for t, i in slow.loop.reference.changes))
+    stretched = dataclasses.replace(
+        slow.loop.reference, changes=tuple((t / f, i) for t, i in slow.loop.reference.changes)
+    )
     loop = dataclasses.replace(slow.loop, reference=stretched)
     a = jaxtank.simulate(loop, Clock(dt=0.05 / f, duration=1200.0 / f), save_every=100)
     b = jaxtank.simulate(fast.loop, Clock(dt=0.05, duration=1200.0), save_every=100)
-    np.testing.assert_allclose(a.x, b.x, atol=1e-11)  # the prototype reached 4e-14; roots near the film amplify round-off
+    # the prototype reached 4e-14; roots near the film amplify round-off
+    np.testing.assert_allclose(a.x, b.x, atol=1e-11)
     np.testing.assert_allclose(a.command, b.command, atol=1e-10)
 
 
@@ -300,20 +491,28 @@ def test_ise_of_ngpc_in_closed_form(ramp):
     """ISE = 0.12 Tp^3 sum Delta_j^2 of the rates, where nothing saturates."""
     got = measured("ngpc", reference__ramp=float(ramp))["ise"]
     for ise, steps in zip(got, ((5, 8, -4), (5, 6, -4))):
-        np.testing.assert_allclose(ise, 0.12 * 11**3 * sum((d / ramp) ** 2 for d in steps), rtol=3e-3)
+        np.testing.assert_allclose(
+            ise, 0.12 * 11**3 * sum((d / ramp) ** 2 for d in steps), rtol=3e-3
+        )
 
 
 def test_error_of_ngpc_follows_its_second_order_equation(gouta):
     case = gouta("ngpc")
     x0, _ = equilibrium(case.loop.plant, (8.0, 8.0))
-    loop = dataclasses.replace(case.loop, x0=x0 + np.array([0.1, 0, 0, 0]), reference=Constant(level=np.array([8.0, 8.0])))
+    loop = dataclasses.replace(
+        case.loop, x0=x0 + np.array([0.1, 0, 0, 0]), reference=Constant(level=np.array([8.0, 8.0]))
+    )
     run = jaxtank.simulate(loop, Clock(dt=0.01, duration=30.0), save_every=100)
-    np.testing.assert_allclose(np.asarray(run.e)[[5, 10, 20, 30], 0], (0.05913, 0.02302, -0.00508, -0.00352), atol=3e-5)
+    np.testing.assert_allclose(
+        np.asarray(run.e)[[5, 10, 20, 30], 0], (0.05913, 0.02302, -0.00508, -0.00352), atol=3e-5
+    )
     assert np.max(np.abs(run.e[:, 1])) < 4e-7
 
 
 def plateau_error(kind, nominal, true, r):
-    """The steady error under mismatch, by the fixed point of notes S7.4 (c of the law, c' of the plant)."""
+    """The steady error under mismatch, by the fixed point of notes S7.4 (c of the law, c' of the
+    plant).
+    """
     c, p = (np.array([float(v) for v in coefficients(m)]) for m in (nominal, true))
     b = np.array([[c[1], c[2]], [c[4], c[5]]])
     b_true = np.array([[p[1], p[2]], [p[4], p[5]]])
@@ -341,13 +540,17 @@ def plateau_error(kind, nominal, true, r):
     ],
 )
 def test_plateau_error_under_mismatch(gouta, kind, change, expected):
-    """The plant's c1 10 % up, or its c7 10 % down; the law believes the nominal plant. Neither law has integral action."""
+    """The plant's c1 10 % up, or its c7 10 % down; the law believes the nominal plant. Neither law
+    has integral action.
+    """
     case = gouta(kind)
     plant = case.loop.plant
     if change == "c1":
         plant = dataclasses.replace(plant, drain=plant.drain * 1.1)
     else:  # c7' = 0.9 c7 with c8 kept: larger upper tanks and stronger pumps
-        plant = dataclasses.replace(plant, area=plant.area / np.array([1, 1, 0.9, 0.9]), pump_gain=plant.pump_gain / 0.9)
+        plant = dataclasses.replace(
+            plant, area=plant.area / np.array([1, 1, 0.9, 0.9]), pump_gain=plant.pump_gain / 0.9
+        )
     r = (16.0, 14.0)
     x0, _ = equilibrium(plant, r)
     loop = dataclasses.replace(case.loop, plant=plant, x0=x0, reference=Constant(level=np.array(r)))
@@ -361,14 +564,23 @@ def test_lyapunov_function_of_backstepping_never_grows(gouta):
     case = gouta("backstepping")
     c, k1, r = coefficients(case.loop.plant), 0.088, np.array([8.0, 8.0])
     x0, _ = equilibrium(case.loop.plant, r)
-    loop = dataclasses.replace(case.loop, x0=x0 + np.array([1.0, -0.5, 1.0, 0.5]), reference=Constant(level=r))
+    loop = dataclasses.replace(
+        case.loop, x0=x0 + np.array([1.0, -0.5, 1.0, 0.5]), reference=Constant(level=r)
+    )
     run = jaxtank.simulate(loop, Clock(dt=0.01, duration=120.0), save_every=10)
     assert np.all((run.command >= 0) & (run.command <= 12))
     h, s = np.asarray(run.x), np.asarray(run.x)[:, :2] - r
     c1, q = float(c.c1), np.sqrt(h[:, 2:])
-    z2 = np.column_stack([float(c.c2) * q[:, 0] + float(c.c3) * q[:, 1], float(c.c5) * q[:, 0] + float(c.c6) * q[:, 1]])
+    z2 = np.column_stack(
+        [
+            float(c.c2) * q[:, 0] + float(c.c3) * q[:, 1],
+            float(c.c5) * q[:, 0] + float(c.c6) * q[:, 1],
+        ]
+    )
     residual = z2 - c1 * np.sqrt(r) + k1 * s
-    f = np.sum(k1 * c1 * (2 / 3 * ((r + s) ** 1.5 - r**1.5) - np.sqrt(r) * s) + 0.5 * k1**2 * s**2, axis=1)
+    f = np.sum(
+        k1 * c1 * (2 / 3 * ((r + s) ** 1.5 - r**1.5) - np.sqrt(r) * s) + 0.5 * k1**2 * s**2, axis=1
+    )
     w = f + 0.5 * np.sum(residual**2, axis=1)
     assert np.all(np.diff(w) <= 1e-9 * w[0])
     assert w[-1] < 1e-3 * w[0]
@@ -408,7 +620,9 @@ def test_an_equilibrium_stays(gouta, kind):
 
 @pytest.mark.parametrize("name", ["ngpc", "backstepping"])
 def test_the_dead_zone_of_remark_4_kills_the_run(name):
-    """Pumps never start: the steady voltage 1.81 V is below 3 V, the upper tanks empty, and u ~ sqrt(h) stays at 0."""
+    """Pumps never start: the steady voltage 1.81 V is below 3 V, the upper tanks empty, and u ~
+    sqrt(h) stays at 0.
+    """
     got = measured(name, actuator__dead_zone=3.0)
     np.testing.assert_allclose(got["rms_error"], (12.1, 11.3), atol=0.06)
     assert np.all(got["rms_input"] == 0)
@@ -417,11 +631,15 @@ def test_the_dead_zone_of_remark_4_kills_the_run(name):
 def test_pulses_in_place_of_the_dead_zone_restore_the_run():
     pulsed = {"actuator__dead_zone": 3.0, "actuator__dead_zone_kind": "pulse"}
     np.testing.assert_allclose(measured("ngpc", **pulsed)["rms_error"], (0.062, 0.056), atol=0.004)
-    np.testing.assert_allclose(measured("backstepping", **pulsed)["rms_error"], (0.387, 0.330), atol=0.003)
+    np.testing.assert_allclose(
+        measured("backstepping", **pulsed)["rms_error"], (0.387, 0.330), atol=0.003
+    )
 
 
 def test_hysteresis_and_lag_stall_channel_1():
-    got = measured("ngpc", actuator__dead_zone=3.0, actuator__dead_zone_kind="hysteresis", actuator__lag=1.0)
+    got = measured(
+        "ngpc", actuator__dead_zone=3.0, actuator__dead_zone_kind="hysteresis", actuator__lag=1.0
+    )
     np.testing.assert_allclose(got["rms_error"], (10.5, 7.5), atol=0.06)
 
 
@@ -429,11 +647,15 @@ def test_sampling_period_changes_little():
     """Notes S2.4: dt = 0.05 changes the RMS by at most 0.2 %, 0.1 by 0.4 %, 0.2 by 0.7 %."""
     fine = measured("ngpc")["rms_error_total"]
     for dt, share in ((0.05, 2e-3), (0.1, 4e-3), (0.2, 7e-3)):
-        np.testing.assert_allclose(measured("ngpc", clock__dt=dt)["rms_error_total"], fine, rtol=share)
+        np.testing.assert_allclose(
+            measured("ngpc", clock__dt=dt)["rms_error_total"], fine, rtol=share
+        )
 
 
 def test_continuous_control_by_lsoda_agrees(gouta):
-    """The published backstepping gains, D = 60 s, against scipy's LSODA with the law evaluated continuously."""
+    """The published backstepping gains, D = 60 s, against scipy's LSODA with the law evaluated
+    continuously.
+    """
     from scipy.integrate import solve_ivp
 
     c = [float(v) for v in coefficients(gouta("backstepping").loop.plant)]
@@ -449,15 +671,22 @@ def test_continuous_control_by_lsoda_agrees(gouta):
         v2 = -(k + k1) * (-c4 * np.sqrt(r2) + c5 * s3 + c6 * s4 + k1 * (x[1] - r2))
         u1 = np.clip((s3 * (c6 * v1 - c3 * v2) / alpha + c7 * s3) / c8, 0, 12)
         u2 = np.clip((s4 * (c2 * v2 - c5 * v1) / alpha + c9 * s4) / c10, 0, 12)
-        flow = [c2 * s3 + c3 * s4 - c1 * s1, c5 * s3 + c6 * s4 - c4 * s2, c8 * u1 - c7 * s3, c10 * u2 - c9 * s4]
+        flow = [
+            c2 * s3 + c3 * s4 - c1 * s1,
+            c5 * s3 + c6 * s4 - c4 * s2,
+            c8 * u1 - c7 * s3,
+            c10 * u2 - c9 * s4,
+        ]
         return [*flow, (x[0] - r1) ** 2, (x[1] - r2) ** 2]
 
     x = [3, 3, 2.75332, 2.75332, 0, 0]
     breaks = sorted({0, 1200, *times[0], *times[1]})
-    for begin, end in zip(breaks, breaks[1:]):  # the solver does not step over a corner of the reference
+    # the solver does not step over a corner of the reference
+    for begin, end in zip(breaks, breaks[1:]):
         x = solve_ivp(rates, (begin, end), x, method="LSODA", rtol=1e-9, atol=1e-10).y[:, -1]
     np.testing.assert_allclose(x[4:], (178.32, 129.16), rtol=1e-4)
-    np.testing.assert_allclose(measured("backstepping")["ise"], x[4:], rtol=1e-3)  # the sampled law holds its voltage for 0.01 s
+    # the sampled law holds its voltage for 0.01 s
+    np.testing.assert_allclose(measured("backstepping")["ise"], x[4:], rtol=1e-3)
 
 
 def test_published_numbers_of_the_preset_are_those_of_its_cases(gouta):

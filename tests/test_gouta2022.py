@@ -17,7 +17,9 @@ from jaxtank.presets import gouta2022 as paper
 
 CASES = paper.preset().cases
 NO_DEAD_ZONE = {"actuator.dead_zone": 0.0}
-PRINTED = {f"{owner}.pump_gain": 3.4717 for owner in ("plant", "controller.model", "observer.model")}
+PRINTED = {
+    f"{owner}.pump_gain": 3.4717 for owner in ("plant", "controller.model", "observer.model")
+}
 STEADY = {"controller.Tp": 1.7, "observer.l": 0.1, "actuator.delay": 0.2}
 
 
@@ -31,7 +33,9 @@ def run(name, values=None, loop=None, **clock):
     if loop is None:
         return known(name, tuple((values or {}).items()), tuple(clock.items()))
     case = rig.set_values(CASES[name], values or {})
-    found = jaxtank.simulate(loop(case.loop), dataclasses.replace(case.clock, **clock), key=jax.random.key(1))
+    found = jaxtank.simulate(
+        loop(case.loop), dataclasses.replace(case.clock, **clock), key=jax.random.key(1)
+    )
     return type(found)(*(np.asarray(a) for a in found))
 
 
@@ -41,10 +45,13 @@ def constant_inflow(loop):
 
     loss = Constant(level=225.0 * np.array([-0.4249, -0.6673]))
     plant = dataclasses.replace(loop.plant, bottom=True)
-    return dataclasses.replace(loop, plant=plant, disturbance=Sum(first=loop.disturbance, second=loss))
+    return dataclasses.replace(
+        loop, plant=plant, disturbance=Sum(first=loop.disturbance, second=loss)
+    )
 
 
-# Notes S7.1: RMS u, RMS e, ts, tr, mean d^. Tolerances as stated there: e 1e-3 cm, u 0.01 V, times 0.03 s.
+# Notes S7.1: RMS u, RMS e, ts, tr, mean d^. Tolerances as stated there: e 1e-3 cm, u 0.01 V, times
+# 0.03 s.
 ROWS = {
     "V0 E": ("enmpc", {**PRINTED, **NO_DEAD_ZONE}, None, (11.93315, 12.0), (9.280399, 8.546027), None, None, (-0.0001, 0.0001)),
     "d=0 E": ("enmpc", NO_DEAD_ZONE, None, (4.00985, 3.55466), (0.254478, 0.456462), (2.52, 7.45), (1.75, 2.56), (0, 0)),
@@ -81,7 +88,10 @@ def test_acceptance_table(name):
         np.testing.assert_allclose(found["recovery"], tr, atol=0.03)
 
 
-@pytest.mark.parametrize(("name", "u", "e"), [("enmpc", (7.01, 7.72), (0.298, 0.671)), ("chadpc", (7.21, 7.54), (0.309, 0.673))])
+@pytest.mark.parametrize(
+    ("name", "u", "e"),
+    [("enmpc", (7.01, 7.72), (0.298, 0.671)), ("chadpc", (7.21, 7.54), (0.309, 0.673))],
+)
 def test_limit_cycles_of_a_short_delay(name, u, e):
     """Bounded, within the 2 % of notes S7.2."""
     found = paper.figures(run(name, {"actuator.delay": 0.2}))
@@ -91,7 +101,12 @@ def test_limit_cycles_of_a_short_delay(name, u, e):
 
 def test_spot_levels():
     s = run("chadpc")
-    for t, h in ((5, (1.35152, 4.46854)), (12, (5.06744, 7.62911)), (501, (10.00154, 11.38305)), (701, (14.52322, 10.0))):
+    for t, h in (
+        (5, (1.35152, 4.46854)),
+        (12, (5.06744, 7.62911)),
+        (501, (10.00154, 11.38305)),
+        (701, (14.52322, 10.0)),
+    ):
         np.testing.assert_allclose(s.x[100 * t], h, atol=5e-3)
     ideal = run("chadpc", NO_DEAD_ZONE)
     np.testing.assert_allclose(ideal.x[500], (1.66169, 7.17737), atol=5e-3)
@@ -131,9 +146,16 @@ def test_offsets_of_a_plant_that_is_not_the_model(values, offset):
 
 def test_steady_voltages():
     """Notes S2.2: and (14, 8) cm has no steady state."""
-    for h, u in (((8, 10), (1.185, 4.819)), ((10, 10), (3.169, 3.169)), ((12, 10), (5.121, 1.519)), ((14, 14), (3.749, 3.749))):
+    for h, u in (
+        ((8, 10), (1.185, 4.819)),
+        ((10, 10), (3.169, 3.169)),
+        ((12, 10), (5.121, 1.519)),
+        ((14, 14), (3.749, 3.749)),
+    ):
         np.testing.assert_allclose(equilibrium(paper.rig(), h)[1], u, atol=5e-4)
-        np.testing.assert_allclose(equilibrium(paper.rig(paper.PRINTED_GAIN), h)[1], 10 * np.array(u), atol=5e-3)
+        np.testing.assert_allclose(
+            equilibrium(paper.rig(paper.PRINTED_GAIN), h)[1], 10 * np.array(u), atol=5e-3
+        )
     with pytest.raises(EquilibriumError, match="pump 2"):
         equilibrium(paper.rig(), (14.0, 8.0))
     k1, k12, k2 = 0.154617227, 0.179993036, 0.154297778
@@ -141,7 +163,8 @@ def test_steady_voltages():
     np.testing.assert_allclose(A, [[-0.1133, 0.09], [0.09, -0.1144]], atol=6e-5)
     np.testing.assert_allclose(np.diag(B), k2, rtol=1e-8)
     a, b = k1 / 2 / np.sqrt([11.0, 10.0]), k12 / 2
-    np.testing.assert_allclose(A, [[-a[0] - b, b], [b, -a[1] - b]], rtol=1e-4)  # the pipe's root is smooth: 0.75 (knee/x)^2
+    # the pipe's root is smooth: 0.75 (knee/x)^2
+    np.testing.assert_allclose(A, [[-a[0] - b, b], [b, -a[1] - b]], rtol=1e-4)
 
 
 def test_the_reference_is_that_of_the_text():
@@ -168,10 +191,14 @@ def test_trapezoid_with_a_plateau_that_has_no_steady_state():
 
 
 def test_pump_fault():
-    """Pump 1 at 60 % from 300 to 400 s: mean e1 -0.149 (E) and -0.085 cm (S), mean d^1 -0.82 cm/s (notes S3.4)."""
+    """Pump 1 at 60 % from 300 to 400 s: mean e1 -0.149 (E) and -0.085 cm (S), mean d^1 -0.82 cm/s
+    (notes S3.4).
+    """
     from jaxtank.plants.faults import faults
 
-    broken = lambda loop: dataclasses.replace(loop, faults=faults(loop.plant, [("pump_gain[0]", 300, 400, 0.6, 0.0)]))
+    broken = lambda loop: dataclasses.replace(
+        loop, faults=faults(loop.plant, [("pump_gain[0]", 300, 400, 0.6, 0.0)])
+    )
     e, s = run("enmpc", {}, broken), run("chadpc", {}, broken)
     inside = (s.t >= 310) & (s.t < 400)
     np.testing.assert_allclose(e.e[inside, 0].mean(), -0.149, atol=2e-3)
@@ -193,7 +220,9 @@ def held_at(level):
 
 
 def test_chadpc_is_a_pi_on_the_linearised_plant():
-    """d^ = l e + k l dt sum e + const, so c2 u + f = r' - (k + l) e - k l int e (notes S4.4), to 1e-10 while no pump is at its limit."""
+    """d^ = l e + k l dt sum e + const, so c2 u + f = r' - (k + l) e - k l int e (notes S4.4), to
+    1e-10 while no pump is at its limit.
+    """
     r = run("chadpc", NO_DEAD_ZONE, held_at((12.0, 10.0)), duration=20.0)
     assert np.array_equal(r.command, r.applied)
     k, l, dt = 1.5 / 0.13, 10.0, 0.01
@@ -213,7 +242,9 @@ def paper_drift(x):
 
 
 def test_literal_double_compensation_is_a_single_one_with_twice_the_gain():
-    """To 1e-14 cm, everywhere; the estimate reads half (notes S4.3; the prototype measured 7e-15 cm, and 2e-13 cm/s between 60 and 499 s)."""
+    """To 1e-14 cm, everywhere; the estimate reads half (notes S4.3; the prototype measured 7e-15
+    cm, and 2e-13 cm/s between 60 and 499 s).
+    """
     double = {"controller.compensation": "double", "observer.before_compensation": True}
     b, s = run("chadpc", double), run("chadpc", {"observer.l": 20.0})
     np.testing.assert_allclose(b.x, s.x, rtol=0, atol=1e-14)
@@ -222,7 +253,9 @@ def test_literal_double_compensation_is_a_single_one_with_twice_the_gain():
 
 
 def test_k_and_l_are_interchangeable_in_the_loop():
-    """The response to a disturbance is the same with k and l exchanged (notes S4.4), by a run and its mirror."""
+    """The response to a disturbance is the same with k and l exchanged (notes S4.4), by a run and
+    its mirror.
+    """
     one = run("chadpc", {**NO_DEAD_ZONE, "controller.Tp": 1.5, "observer.l": 4.0}, quietly)
     two = run("chadpc", {**NO_DEAD_ZONE, "controller.Tp": 1.5 / 4.0, "observer.l": 1.0}, quietly)
     np.testing.assert_allclose(one.e, two.e, atol=1e-12)
@@ -245,7 +278,11 @@ def test_an_observer_fed_the_unlimited_command_winds_up():
     """Notes S4.2: S overshoots to 15.79 cm in tank 2, B to 15.83 and tank 1 to 12.11 cm."""
     s = run("chadpc", {"observer.fed": "command"}, duration=400.0)
     np.testing.assert_allclose(s.x[:, 1].max(), 15.79, atol=0.02)
-    double = {"controller.compensation": "double", "observer.before_compensation": True, "observer.fed": "command"}
+    double = {
+        "controller.compensation": "double",
+        "observer.before_compensation": True,
+        "observer.fed": "command",
+    }
     b = run("chadpc", double, duration=49.0)
     np.testing.assert_allclose((b.x[:, 1].max(), b.x[:, 0].max()), (15.83, 12.11), atol=0.02)
 
@@ -259,8 +296,12 @@ def test_printed_sign_leaves_its_offset():
 
 @pytest.mark.parametrize(("tau", "limit"), [(0.13, 0.05), (1.3, 0.12)])
 def test_delay_margin(tau, limit):
-    """The largest stable delay of S at l = 10 (notes S7.2): a kick dies out at it and does not two samples later."""
-    quiet = lambda loop: dataclasses.replace(quietly(loop), x0=np.array([12.0 + 1e-3, 10.0]), disturbance=None)
+    """The largest stable delay of S at l = 10 (notes S7.2): a kick dies out at it and does not two
+    samples later.
+    """
+    quiet = lambda loop: dataclasses.replace(
+        quietly(loop), x0=np.array([12.0 + 1e-3, 10.0]), disturbance=None
+    )
     for delay, stable in ((limit, True), (limit + 0.02, False)):
         values = {
             **NO_DEAD_ZONE,
@@ -285,13 +326,18 @@ TABLE6 = {  # notes S7.3, delay 0.5 s: RMS u, RMS e, ts, tr as printed there
 @pytest.mark.parametrize("name", TABLE6)
 def test_baselines(name):
     found = paper.figures(run(name, {"actuator.delay": 0.5}))
-    for key, expected, tolerance in zip(("voltage", "error", "settling", "recovery"), TABLE6[name], (0.01, 1e-3, 0.06, 0.06)):
+    for key, expected, tolerance in zip(
+        ("voltage", "error", "settling", "recovery"), TABLE6[name], (0.01, 1e-3, 0.06, 0.06)
+    ):
         np.testing.assert_allclose(found[key], expected, atol=tolerance)
 
 
 def test_predictive_laws_beside_the_baselines():
     """Notes S7.3: limit cycles of the printed gains at 0.5 s (2 %), and S tuned for it."""
-    for name, u, e in (("enmpc", (7.19, 7.52), (0.364, 0.711)), ("chadpc", (7.30, 7.51), (0.398, 0.721))):
+    for name, u, e in (
+        ("enmpc", (7.19, 7.52), (0.364, 0.711)),
+        ("chadpc", (7.30, 7.51), (0.398, 0.721)),
+    ):
         found = paper.figures(run(name, {"actuator.delay": 0.5}))
         np.testing.assert_allclose(found["voltage"], u, rtol=0.02)
         np.testing.assert_allclose(found["error"], e, rtol=0.02)
@@ -300,23 +346,31 @@ def test_predictive_laws_beside_the_baselines():
     np.testing.assert_allclose(found["settling"], (4.9, 16.3), atol=0.06)
 
 
-J_OF_NOISE = [  # notes S7.3: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
+# notes S7.3: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
+J_OF_NOISE = [
     ("pi", {}, 0.6830, 1e-3), ("pi-ff", {}, 0.6635, 1e-3), ("pid", {}, 0.8057, 1e-3), ("pid-ff", {}, 0.7861, 1e-3),
     ("fopi", {}, 0.6568, 1e-3), ("chadpc", STEADY, 0.5791, 1e-3),
-    ("enmpc", {}, 0.7417, 0.02), ("chadpc", {}, 0.8128, 0.02),  # limit cycles: the 2 % of notes S7.3
+    # limit cycles: the 2 % of notes S7.3
+    ("enmpc", {}, 0.7417, 0.02), ("chadpc", {}, 0.8128, 0.02),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "values", "cost", "share"), J_OF_NOISE)
 def test_cost_with_noise(name, values, cost, share):
-    """One draw of 90,000 samples for another: the spread of the noise's mean square is 0.3 % of a part that is 2 to 25 % of J."""
+    """One draw of 90,000 samples for another: the spread of the noise's mean square is 0.3 % of a
+    part that is 2 to 25 % of J.
+    """
     r = run(name, {**values, "actuator.delay": 0.5, "sensor.noise": 0.02})
-    found = (r.e**2).sum(axis=1).mean() + 0.04 * (np.diff(r.applied, axis=0) ** 2).sum(axis=1).mean()
+    found = (r.e**2).sum(axis=1).mean() + 0.04 * (np.diff(r.applied, axis=0) ** 2).sum(
+        axis=1
+    ).mean()
     np.testing.assert_allclose(found, cost, rtol=share)
 
 
 def test_oustaloup_filter():
-    """s^g within 0.007 dB and 1.1 degrees on 0.01 .. 10 rad/s for lambda = 0.8 (notes S4.5); a fractional PI of order 1 is a PI."""
+    """s^g within 0.007 dB and 1.1 degrees on 0.01 .. 10 rad/s for lambda = 0.8 (notes S4.5); a
+    fractional PI of order 1 is a PI.
+    """
     gain, poles, residues = (np.asarray(v) for v in oustaloup(0.2))
     w = np.geomspace(0.01, 10, 200)
     ratio = (gain + (residues / (1j * w[:, None] + poles)).sum(axis=1)) / (1j * w) ** 0.2
@@ -328,7 +382,9 @@ def test_oustaloup_filter():
 
 def test_measures_tell_what_the_figures_tell():
     found = jaxtank.evaluate(
-        CASES["chadpc"].loop, CASES["chadpc"].clock, ["settling_time", "recovery_time", "rms_input", "rms_error"]
+        CASES["chadpc"].loop,
+        CASES["chadpc"].clock,
+        ["settling_time", "recovery_time", "rms_input", "rms_error"],
     )
     figures = paper.figures(run("chadpc"))
     np.testing.assert_allclose(found["settling_time"], figures["settling"], atol=1e-9)
@@ -338,7 +394,9 @@ def test_measures_tell_what_the_figures_tell():
 
 
 def test_gain_of_noise_to_voltage():
-    """(k + l)/c2 for S, k/c2 for E: 139.6 and 74.8 V/cm; measured 0.729 and 0.383 V at 0.005 cm (notes S4.4)."""
+    """(k + l)/c2 for S, k/c2 for E: 139.6 and 74.8 V/cm; measured 0.729 and 0.383 V at 0.005 cm
+    (notes S4.4).
+    """
     for name, expected in (("enmpc", 0.383), ("chadpc", 0.729)):
         r = run(name, {**NO_DEAD_ZONE, "sensor.noise": 0.005}, quietly, duration=200.0)
         np.testing.assert_allclose(
@@ -353,40 +411,55 @@ def test_permuted_tanks_give_permuted_answers():
         x0=np.array([9.0, 12.5]),
         disturbance=None,
     )
-    straight = lambda loop: dataclasses.replace(quietly(loop), x0=np.array([12.5, 9.0]), disturbance=None)
+    straight = lambda loop: dataclasses.replace(
+        quietly(loop), x0=np.array([12.5, 9.0]), disturbance=None
+    )
     values = {"actuator.dead_zone": 2.0}
     for name in ("chadpc", "pid-ff"):
         a, b = (run(name, values, how, duration=30.0) for how in (straight, swap))
         np.testing.assert_allclose(a.x, b.x[:, ::-1], rtol=1e-12)
 
 
-SLOW = {"enmpc-printed", "chadpc-printed", "pi", "pid", "fopi"}  # the same laws without feed-forward, or with another sign
+# the same laws without feed-forward, or with another sign
+SLOW = {"enmpc-printed", "chadpc-printed", "pi", "pid", "fopi"}
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in CASES if n != "chadpc-trapezoid"]
+    "name",
+    [
+        pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW))
+        for n in CASES
+        if n != "chadpc-trapezoid"
+    ],
 )
 def test_gradient_of_the_default_cost(name):
     case = rig.set_values(CASES[name], {"clock.duration": 120.0})
     held = jaxtank.parameters(case.loop)
-    free = {n: np.asarray(held[n]) for n in paper.TUNABLE if n in held}  # every tunable leaf of the case, freed by default or not
+    # every tunable leaf of the case, freed by default or not
+    free = {n: np.asarray(held[n]) for n in paper.TUNABLE if n in held}
     assert set(case.free) <= set(free)
 
     def cost(values):
-        found = jaxtank.evaluate(jaxtank.with_values(case.loop, values), case.clock, tuple(case.objective))
-        return sum(weight * jax.numpy.sum(found[measure]) for measure, weight in case.objective.items())
+        found = jaxtank.evaluate(
+            jaxtank.with_values(case.loop, values), case.clock, tuple(case.objective)
+        )
+        return sum(
+            weight * jax.numpy.sum(found[measure]) for measure, weight in case.objective.items()
+        )
 
     slopes = jax.jit(jax.jacfwd(cost))(free)
     for n, value in free.items():
         for index in np.ndindex(value.shape):
             entry = n + (f"[{','.join(map(str, index))}]" if index else "")
-            # a wide step crosses samples at which a limit begins to hold, a narrow one loses digits: the best of three steps
+            # a wide step crosses samples at which a limit begins to hold, a narrow one loses
+            # digits: the best of three steps
             found = []
             for h in (1e-5, 1e-6, 1e-7):
                 up, down = (cost({**free, entry: value[index] * (1 + s * h)}) for s in (1, -1))
                 found.append(float((up - down) / (2 * h * value[index])))
             error = min(abs(f - float(slopes[n][index])) for f in found)
-            flat = 1e-4 * float(cost(free)) / float(value[index])  # a direction that is hardly felt, against the cost itself
+            # a direction that is hardly felt, against the cost itself
+            flat = 1e-4 * float(cost(free)) / float(value[index])
             assert error < 1e-5 * max(abs(found[1]), flat), (entry, slopes[n][index], found)
 
 
@@ -428,7 +501,10 @@ def test_the_rig_in_metres_runs_as_in_centimetres(name):
         x0=np.array([0.11, 0.09]),
     )
     clock = Clock(dt=0.01, duration=20.0)
-    a, b = (jaxtank.simulate(one, clock) for one in (metres, dataclasses.replace(level, x0=np.array([11.0, 9.0]))))
+    a, b = (
+        jaxtank.simulate(one, clock)
+        for one in (metres, dataclasses.replace(level, x0=np.array([11.0, 9.0])))
+    )
     np.testing.assert_allclose(100 * np.asarray(a.x), b.x, rtol=1e-9)
     np.testing.assert_allclose(a.command, b.command, rtol=1e-7, atol=1e-8)
 
@@ -458,26 +534,41 @@ def test_verdicts_follow_the_numbers():
         return known_run(swap[name], values)
 
     found = paper.measured(mended)
-    for claim in ("pump constant as printed", "a delay makes d^ negative", "the observer spares the pumps"):
+    for claim in (
+        "pump constant as printed",
+        "a delay makes d^ negative",
+        "the observer spares the pumps",
+    ):
         assert found[claim].verdict == "reproduced", found[claim]
     # without a dead zone ENMPC with the derived sign has no offset
-    assert found["eq. (12) tracks without offset"].verdict == "reproduced", found["eq. (12) tracks without offset"]
+    assert found["eq. (12) tracks without offset"].verdict == "reproduced", found[
+        "eq. (12) tracks without offset"
+    ]
 
 
 def test_the_rig_that_was_fitted_to_the_paper():
-    """Notes S8, means over nine draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9, 34.2 s (E), tolerances as in S7.1 with
-    what so many draws leave open. The dead zone comes before the lag: rectified after it, noise costs another 0.4 V."""
+    """Notes S8, means over nine draws of noise: u 7.97, 8.70 V; e 0.622, 1.171 cm; settling 24.9,
+    34.2 s (E), tolerances as in S7.1 with what so many draws leave open. The dead zone comes before
+    the lag: rectified after it, noise costs another 0.4 V.
+    """
     case = rig.set_values(CASES["enmpc"], paper.PAPER_LIKE)
     found = [
         paper.figures(type(t)(*(np.asarray(v) for v in t)))
-        for t in (jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(9))
+        for t in (
+            jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(9)
+        )
     ]
     mean = lambda name: np.mean([f[name] for f in found], axis=0)
     np.testing.assert_allclose(mean("voltage"), (7.97, 8.70), atol=0.03)
     np.testing.assert_allclose(mean("error"), (0.622, 1.171), atol=0.01)
-    # the noise throws the second level out of its band once more, much later, in three of these draws: the median
-    np.testing.assert_allclose(np.median([f["settling"] for f in found], axis=0), (24.9, 34.2), atol=0.6)
+    # the noise throws the second level out of its band once more, much later, in three of these
+    # draws: the median
+    np.testing.assert_allclose(
+        np.median([f["settling"] for f in found], axis=0), (24.9, 34.2), atol=0.6
+    )
 
 
 def test_the_citation_names_the_authors():
-    assert presets.load("gouta2022").citation.startswith("H. Gouta, W. H. Al-Ashek, B. Saad, Automatika 63(3), 2022")
+    assert presets.load("gouta2022").citation.startswith(
+        "H. Gouta, W. H. Al-Ashek, B. Saad, Automatika 63(3), 2022"
+    )

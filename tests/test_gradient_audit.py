@@ -1,7 +1,9 @@
-"""The audit of gradients (gradient_audit.py) as tests, and the points on a kink, where no central difference is a derivative.
+"""The audit of gradients (gradient_audit.py) as tests, and the points on a kink, where no central
+difference is a derivative.
 
-The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow -s tests/test_gradient_audit.py` audits
-everything, every case of `jaxtank list` too, and prints the count and the worst error; that takes half an hour of a processor, so in pieces:
+The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow
+-s tests/test_gradient_audit.py` audits everything, every case of `jaxtank list` too, and prints the
+count and the worst error; that takes half an hour of a processor, so in pieces:
 -k law, -k case, -k sensitivities, ... (2 GB at a time).
 """
 
@@ -35,12 +37,16 @@ def rows():
 ALL = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in audit_subjects.QUICK else pytest.mark.slow) for n in ALL])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=() if n in audit_subjects.QUICK else pytest.mark.slow) for n in ALL],
+)
 def test_forward_and_reverse_are_the_differences(name, rows):
     subject = ALL[name]()
     rows.append(audit(subject))
     if name not in audit_subjects.QUICK:
-        jax.clear_caches()  # a program of its own for each: together they would take tens of gigabytes
+        # a program of its own for each: together they would take tens of gigabytes
+        jax.clear_caches()
     assert rows[-1].good, told(rows[-1:])
 
 
@@ -54,9 +60,16 @@ def test_the_audit_is_of_a_thousand_points(rows):
 
 def test_every_public_function_of_numerics_is_audited():
     public = {
-        n for n, f in vars(numerics).items() if callable(f) and getattr(f, "__module__", "") == numerics.__name__ and n[0] != "_"
+        n
+        for n, f in vars(numerics).items()
+        if callable(f) and getattr(f, "__module__", "") == numerics.__name__ and n[0] != "_"
     }
-    audited = {word for name in audit_subjects.SUBJECTS if name.startswith("numerics.") for word in name[9:].split()}
+    audited = {
+        word
+        for name in audit_subjects.SUBJECTS
+        if name.startswith("numerics.")
+        for word in name[9:].split()
+    }
     assert public - audited == {"quantise"}  # a staircase: its slope is tested below
 
 
@@ -77,8 +90,10 @@ def test_the_audit_finds_a_wrong_slope():
 
 
 def test_on_several_kinks_the_slopes_beside_them_are_judged():
-    """A pump at rest at its limit (clip: slope 1) that moves by nothing (travel: slope 0): together -1, where the left has 0 and the right 1.
-    Where the subject says that a point is so it passes, but not with a slope that is wrong beside it, nor where the subject says nothing."""
+    """A pump at rest at its limit (clip: slope 1) that moves by nothing (travel: slope 0): together
+    -1, where the left has 0 and the right 1. Where the subject says that a point is so it passes,
+    but not with a slope that is wrong beside it, nor where the subject says nothing.
+    """
 
     def rest(x):
         u = numerics.clip(x, 0.0, 10.0)
@@ -89,7 +104,8 @@ def test_on_several_kinks_the_slopes_beside_them_are_judged():
     row = audit(here)
     assert row.good and row.piled == 1 and row.between == 0
     assert not audit(here._replace(piled=())).good
-    wrong = lambda x: rest(x) + 0.001 * (x - jax.lax.stop_gradient(x))  # a slope of 1e-3 that is none
+    # a slope of 1e-3 that is none
+    wrong = lambda x: rest(x) + 0.001 * (x - jax.lax.stop_gradient(x))
     assert not audit(here._replace(function=wrong)).good
 
 
@@ -102,7 +118,8 @@ def test_differences_of_a_known_function():
     assert step[0, 0, 1] < 3e-5
 
 
-# On a kink: the slope of numerics.py lies between the one-sided ones, and is the one its docstring names
+# On a kink: the slope of numerics.py lies between the one-sided ones, and is the one its docstring
+# names
 
 
 def one_sided(f, at, h=1e-6):
@@ -113,7 +130,15 @@ def one_sided(f, at, h=1e-6):
 
 
 def rimmed(h, **more):
-    return network(area=[20.0], drain=[0.2], pump_gain=[5.0], feeds=((0, None),), rim=[10.0], overflow=True, **more).spill((h,))
+    return network(
+        area=[20.0],
+        drain=[0.2],
+        pump_gain=[5.0],
+        feeds=((0, None),),
+        rim=[10.0],
+        overflow=True,
+        **more,
+    ).spill((h,))
 
 
 def limited(one, other):
@@ -135,9 +160,19 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
     ("clip by its high end", lambda b: numerics.clip(3.0, 2.0, b), 3.0, 0.0),
     ("portion at its low end", lambda x: numerics.portion(x, 2.0, 3.0), 2.0, 0.5),
     ("portion at its high end", lambda x: numerics.portion(x, 2.0, 3.0), 3.0, 0.5),
-    ("pieces that meet at a knot", lambda x: 3.0 * numerics.portion(x, 1.0, 2.0) + 5.0 * numerics.portion(x, 2.0, 3.0), 2.0, 4.0),
+    (
+        "pieces that meet at a knot",
+        lambda x: 3.0 * numerics.portion(x, 1.0, 2.0) + 5.0 * numerics.portion(x, 2.0, 3.0),
+        2.0,
+        4.0,
+    ),
     ("magnitude of nothing", numerics.magnitude, 0.0, 0.0),
-    ("travel of a pump at rest at its limit", lambda v: numerics.magnitude(2.0 - numerics.clip(v, 2.0, 3.0)), 2.0, 0.0),
+    (
+        "travel of a pump at rest at its limit",
+        lambda v: numerics.magnitude(2.0 - numerics.clip(v, 2.0, 3.0)),
+        2.0,
+        0.0,
+    ),
     ("floored root at its floor", lambda h: numerics.floored_root(h, 0.04), 0.04, 2.5),
     ("floored root by its floor", lambda f: numerics.floored_root(0.04, f), 0.04, 0.0),
     ("root of a mean of nothing", lambda e: numerics.root_of_mean(e * e), 0.0, 0.0),
@@ -155,8 +190,18 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
     ("a level at its rim", lambda h: rimmed(h)[0][0], 10.0, 1.0),
     ("the volume lost at a rim", lambda h: rimmed(h)[1][0], 10.0, 0.0),
     ("a level at the bottom", lambda h: rimmed(h, bottom=True)[0][0], 0.0, 1.0),
-    ("a command at the edge of the box", lambda a: sum(actuators.allocate((a, 4.0), *BOX)), 10.0, None),
-    ("a command at the corner of the box", lambda a: sum(actuators.allocate((10.0 + a, 10.0 + a), *BOX)), 0.0, None),
+    (
+        "a command at the edge of the box",
+        lambda a: sum(actuators.allocate((a, 4.0), *BOX)),
+        10.0,
+        None,
+    ),
+    (
+        "a command at the corner of the box",
+        lambda a: sum(actuators.allocate((10.0 + a, 10.0 + a), *BOX)),
+        0.0,
+        None,
+    ),
     ("an offset dead zone at its edge", lambda v: PUMP.driving((v,))[0], 3.0, 1.0),
 ]
 
@@ -166,7 +211,8 @@ def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
     left, right = one_sided(f, jnp.float64(at))
     found = [float(derivative(f)(jnp.float64(at))) for derivative in (jax.grad, jax.jacfwd)]
     assert found[0] == pytest.approx(found[1], rel=1e-12, abs=1e-15)
-    # one-sided differences of 1e-6, extrapolated: 1e-9 of round-off, and where a root bends at its knee 1e-5
+    # one-sided differences of 1e-6, extrapolated: 1e-9 of round-off, and where a root bends at its
+    # knee 1e-5
     slack = 1e-5 * max(1.0, abs(left), abs(right))
     assert min(left, right) - slack <= found[0] <= max(left, right) + slack
     assert slope is None or found[0] == pytest.approx(slope, rel=1e-12)
@@ -174,35 +220,52 @@ def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
 
 @pytest.mark.parametrize("way", [jax.jacfwd, jax.jacrev])
 def test_empty_tanks_at_their_setpoint_are_a_kink_of_the_travel(way):
-    """gouta2022/enmpc, both tanks and the first setpoint at 0 cm: the first command is 0 V, the limit of pump 1. With more water it
-    stays off, with less it runs: on the one side its travel has slope 0, on the other one as steep as the law."""
+    """gouta2022/enmpc, both tanks and the first setpoint at 0 cm: the first command is 0 V, the
+    limit of pump 1. With more water it
+    stays off, with less it runs: on the one side its travel has slope 0, on the other one as steep
+        as the law.
+    """
     case = presets.find("gouta2022/enmpc")
     clock = Clock(dt=0.05, duration=0.2)
-    f = lambda x0: evaluate_and_flag(dataclasses.replace(case.loop, x0=x0), clock, ("input_travel",))[0]["input_travel"]
+    f = lambda x0: evaluate_and_flag(
+        dataclasses.replace(case.loop, x0=x0), clock, ("input_travel",)
+    )[0]["input_travel"]
     at_rest = jnp.zeros(2)
     found = np.asarray(way(f)(at_rest))
     for i, axis in enumerate(np.eye(2)):
         left, right = one_sided(lambda h, axis=axis: f(at_rest + h * axis), 0.0)
         assert left[0] < -5.0 and right[0] == 0.0
-        assert np.all(np.minimum(left, right) <= found[:, i]) and np.all(found[:, i] <= np.maximum(left, right))
+        assert np.all(np.minimum(left, right) <= found[:, i]) and np.all(
+            found[:, i] <= np.maximum(left, right)
+        )
 
 
 def test_a_staircase_has_the_slope_of_the_line_through_it():
-    """ADC: over whole steps the mean slope is 1, and that is the gradient, at an edge too; outside the range it is 0."""
+    """ADC: over whole steps the mean slope is 1, and that is the gradient, at an edge too; outside
+    the range it is 0.
+    """
     for x in (0.0, 0.013, 0.05, 0.75):
-        assert (numerics.quantise(x + 0.1, 0.1) - numerics.quantise(x - 0.1, 0.1)) / 0.2 == pytest.approx(1.0, rel=1e-12)
+        assert (
+            numerics.quantise(x + 0.1, 0.1) - numerics.quantise(x - 0.1, 0.1)
+        ) / 0.2 == pytest.approx(1.0, rel=1e-12)
         assert jax.grad(numerics.quantise)(x, 0.1) == jax.jacfwd(numerics.quantise)(x, 0.1) == 1.0
-    sensor = sensors.LevelSensor(gain=np.array([5.0]), noise=np.zeros(1), full_scale=np.array(5.0), bits=8)
+    sensor = sensors.LevelSensor(
+        gain=np.array([5.0]), noise=np.zeros(1), full_scale=np.array(5.0), bits=8
+    )
     read = lambda h: sensor.read((h,), None)[0]
     step = 5.0 * 5.0 / 2**8
     for h in (3.0, 12.3):
-        assert (read(h + 7 * step) - read(h - 7 * step)) / (14 * step) == pytest.approx(1.0, rel=1e-9)
+        assert (read(h + 7 * step) - read(h - 7 * step)) / (14 * step) == pytest.approx(
+            1.0, rel=1e-9
+        )
         assert jax.grad(read)(h) == jax.jacfwd(read)(h) == 1.0
     assert jax.grad(read)(26.0) == jax.grad(read)(-1.0) == 0.0
 
 
 def test_pulses_have_the_slope_of_the_mean_flow():
-    """A voltage below the dead zone is paid in pulses: its mean over many samples has slope 1, as the gradient has it."""
+    """A voltage below the dead zone is paid in pulses: its mean over many samples has slope 1, as
+    the gradient has it.
+    """
     pumps = actuators.PumpBank(
         low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1), pulse=np.full(1, 4.0), lag=None,
         initial=np.zeros(1), dead_zone_kind="pulse",
@@ -210,7 +273,10 @@ def test_pulses_have_the_slope_of_the_mean_flow():
 
     @jax.jit
     def mean(v):
-        start = jax.tree.map(lambda a: jnp.asarray(a, dtype=jnp.result_type(a)), pumps.init(Clock(dt=0.1, duration=1.0)))
+        start = jax.tree.map(
+            lambda a: jnp.asarray(a, dtype=jnp.result_type(a)),
+            pumps.init(Clock(dt=0.1, duration=1.0)),
+        )
 
         def sample(state, _):
             (u,), state = pumps.deliver(state, (v,), 0.1)

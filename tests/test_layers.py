@@ -118,12 +118,19 @@ def test_no_module_shares_its_name_with_a_public_function(trees):
 
 def test_jaxtank_never_imports_tuning(trees):
     graph = imports(trees)
-    up = {(m, t) for m, ts in graph.items() for t in ts if (m + ".").startswith("jaxtank.") and (t + ".").startswith("tuning.")}
+    up = {
+        (m, t)
+        for m, ts in graph.items()
+        for t in ts
+        if (m + ".").startswith("jaxtank.") and (t + ".").startswith("tuning.")
+    }
     assert up == {("jaxtank.__main__", "tuning.cli.main")}
 
 
 def test_a_folder_holds_at_most_sixteen_modules():
-    folders = {path.parent for p in (jaxtank, tuning) for path in Path(p.__file__).parent.rglob("*.py")}
+    folders = {
+        path.parent for p in (jaxtank, tuning) for path in Path(p.__file__).parent.rglob("*.py")
+    }
     assert max(len(list(folder.glob("*.py"))) for folder in folders) <= 16
 
 
@@ -132,7 +139,11 @@ def test_only_pictures_import_matplotlib(trees):
     found = set()
     for module, tree in trees.items():
         for node in ast.walk(tree):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else [getattr(node, "module", None) or ""]
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else [getattr(node, "module", None) or ""]
+            )
             if any(n.startswith("matplotlib") for n in names):
                 found.add(folder(module))
     assert found <= DRAWING
@@ -145,4 +156,6 @@ def test_no_pickle_eval_or_network(trees):
                 assert node.func.id not in ("eval", "exec"), module
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 names = [a.name for a in node.names] + [getattr(node, "module", "") or ""]
-                assert not {"pickle", "marshal", "urllib", "socket", "requests"} & {n.split(".")[0] for n in names}, module
+                assert not {"pickle", "marshal", "urllib", "socket", "requests"} & {
+                    n.split(".")[0] for n in names
+                }, module

@@ -1,4 +1,6 @@
-"""Text that a rig file may hold, before it is parsed: long keys are told, and nothing else is taken for one."""
+"""Text that a rig file may hold, before it is parsed: long keys are told, and nothing else is taken
+for one.
+"""
 
 import tomllib
 
@@ -33,7 +35,10 @@ AT_MOST = ".".join("a" * MOST)
 )
 def test_a_key_of_more_parts_than_any_name_is_told(text):
     assert tomllib.loads(text)  # TOML it is
-    with pytest.raises(InputError, match=rf"^rig file: line \d+: a key of \d+ parts joined by dots: must be at most {MOST}$"):
+    with pytest.raises(
+        InputError,
+        match=rf"^rig file: line \d+: a key of \d+ parts joined by dots: must be at most {MOST}$",
+    ):
         rig.loads(HEAD + text)
 
 
@@ -62,7 +67,9 @@ def test_more_words_than_any_rig_has_are_told():
         "[[tank]]\n" * MOST_WORDS,
         "x = [" + "[]," * MOST_WORDS + "]",
     ):
-        with pytest.raises(InputError, match=f"^rig file: has more than {MOST_WORDS} keys and values$"):
+        with pytest.raises(
+            InputError, match=f"^rig file: has more than {MOST_WORDS} keys and values$"
+        ):
             rig.loads(text)
 
 
@@ -88,4 +95,8 @@ def test_what_is_toml_with_short_keys_passes(text):
 def test_more_of_a_kind_than_a_loop_can_hold_are_refused(kind):
     tanks = "[[tank]]\narea = 1.0\nrim = 9.0\n" * 2
     with pytest.raises(InputError, match=rf"\[\[{kind}\]\]: 101 {kind}s: must be at most 100"):
-        rig.loads(tanks + ("[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n" if kind != "pump" else "") + f"[[{kind}]]\n" * 101)
+        rig.loads(
+            tanks
+            + ("[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n" if kind != "pump" else "")
+            + f"[[{kind}]]\n" * 101
+        )

@@ -1,4 +1,6 @@
-"""`show`: the manual of a case. Its equations are those that are integrated, and everything of the case is on the page."""
+"""`show`: the manual of a case. Its equations are those that are integrated, and everything of the
+case is on the page.
+"""
 
 import dataclasses
 import re
@@ -17,7 +19,12 @@ from tuning.report import case as manual
 
 NAMES = list(
     {
-        (n.split("/")[0], type(presets.find(n).loop.controller), presets.find(n).loop.faults is None): n for n in presets.names()
+        (
+            n.split("/")[0],
+            type(presets.find(n).loop.controller),
+            presets.find(n).loop.faults is None,
+        ): n
+        for n in presets.names()
     }.values()
 )
 
@@ -25,9 +32,9 @@ NAMES = list(
 def rate(line, h, u):
     """The right-hand side of an equation "in numbers", read as a person would."""
     right = line.partition(" = ")[2].partition(" + d")[0]
-    right = re.sub(r"sqrt\|(h\d - h\d)\|", r"np.sqrt(abs(\1))", re.sub(r"(?<![.\w])sqrt\(", "np.sqrt(", right)).replace(
-        "sgn(", "np.sign("
-    )
+    right = re.sub(
+        r"sqrt\|(h\d - h\d)\|", r"np.sqrt(abs(\1))", re.sub(r"(?<![.\w])sqrt\(", "np.sqrt(", right)
+    ).replace("sgn(", "np.sign(")
     right = re.sub(r"(\d|\)) (?=[nuh]|np)", r"\1 * ", right)
     names = {f"h{i + 1}": v for i, v in enumerate(h)} | {f"u{i + 1}": v for i, v in enumerate(u)}
     return eval(right, {"np": np, **names})
@@ -43,7 +50,8 @@ def test_the_equations_in_numbers_are_those_of_the_plant(paper):
         lines = equations(plant)[-plant.tanks :]
         told = [rate(line, h, u) for line in lines]
         actual = np.array(plant.derivative(0.0, tuple(h), tuple(u), None))
-        # four digits are printed of each coefficient, and the terms are at most some times their sum
+        # four digits are printed of each coefficient, and the terms are at most some times their
+        # sum
         np.testing.assert_allclose(told, actual, atol=2e-3 * np.abs(actual).max())
 
 
@@ -53,7 +61,9 @@ def test_the_letters_follow_the_topology():
     assert lines[3] == "A4 h4' = (1 - gamma1) k1 u1 - s42 q(h4)"
     lines = equations(presets.find("gouta2022/pi").loop.plant, disturbed=True)
     assert lines[1] == "A2 h2' = k2 u2 - p12 w(h2 - h1) - a2 q(h2) + d2"
-    assert "m^3/s" in " ".join(equations(presets.find("calofir/backstepping").loop.plant, disturbed=True))
+    assert "m^3/s" in " ".join(
+        equations(presets.find("calofir/backstepping").loop.plant, disturbed=True)
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,18 +72,36 @@ def test_everything_of_a_case_is_on_its_page(name):
     preset = presets.load(name.split("/")[0])
     assert max(map(len, page.splitlines())) <= 100
     squeeze = lambda text: re.sub(r"\s+", "", text)
-    flat, every = squeeze(page), squeeze(page.partition("Every parameter\n")[2].partition("What is measured\n")[0])
+    flat, every = (
+        squeeze(page),
+        squeeze(page.partition("Every parameter\n")[2].partition("What is measured\n")[0]),
+    )
     for kind in ("leaf", "static"):
         for leaf, value, _ in walk(case.loop, kind=kind):
-            if not (isinstance(value, tuple) or np.size(value) == 0 or leaf.startswith(manual.BELIEFS)):
-                assert squeeze(leaf)[:20] in every, leaf  # a longer name may be broken where its column ends
-    for what in (*preset.departures, preset.citation, *(p.where for p in preset.published.values() if len(p.where) < 15)):
+            if not (
+                isinstance(value, tuple) or np.size(value) == 0 or leaf.startswith(manual.BELIEFS)
+            ):
+                # a longer name may be broken where its column ends
+                assert squeeze(leaf)[:20] in every, leaf
+    for what in (
+        *preset.departures,
+        preset.citation,
+        *(p.where for p in preset.published.values() if len(p.where) < 15),
+    ):
         assert squeeze(what) in flat, what
     for parameter, (_, why) in preset.uncertain.items():
         assert squeeze(parameter) in flat and squeeze(why) in flat
     doc = (type(case.loop.controller).__doc__ or "").split("\n\n")[0]
     assert squeeze(doc) in flat
-    for heading in ("The rig:", "The loop", "The law:", "The observer:", "What is tuned", "Every parameter", "What is measured"):
+    for heading in (
+        "The rig:",
+        "The loop",
+        "The law:",
+        "The observer:",
+        "What is tuned",
+        "Every parameter",
+        "What is measured",
+    ):
         assert f"\n{heading}" in page
 
 
@@ -97,22 +125,38 @@ def test_what_is_set_is_what_is_said():
     ):
         assert words in page, words
     faulty = " ".join(manual.text(presets.find("calofir/backstepping-perturbed")).split())
-    assert "plant.drain[1] times 0.75 from 300 to 450 s" in faulty and "Rims at 0.6, 0.6 m are physics" in faulty
+    assert (
+        "plant.drain[1] times 0.75 from 300 to 450 s" in faulty
+        and "Rims at 0.6, 0.6 m are physics" in faulty
+    )
     loop = dataclasses.replace(case.loop, disturbance=None)
     assert "No disturbance." in manual.text(case.replace(loop=loop))
     assert (
-        "recovery_time" not in manual.text(case.replace(loop=loop)).partition("What is measured")[2].partition("What the paper")[0]
+        "recovery_time"
+        not in manual.text(case.replace(loop=loop))
+        .partition("What is measured")[2]
+        .partition("What the paper")[0]
     )
 
 
 def test_a_rig_of_ones_own_is_shown(capsys):
     assert main.main(["show", str(Path(__file__).parent / "rigs" / "two_tanks.toml")]) == 0
     page = capsys.readouterr().out
-    assert "A2 h2' = s12 q(h1) - a2 q(h2)" in page and "The law: PID" in page and "departures" not in page
+    assert (
+        "A2 h2' = s12 q(h1) - a2 q(h2)" in page
+        and "The law: PID" in page
+        and "departures" not in page
+    )
 
 
 def test_python_m_jaxtank_is_the_command():
-    """The path of the notes is left out: with -m, Python takes the package of the folder it is started in."""
-    done = subprocess.run([sys.executable, "-m", "jaxtank", "show", "cascaded/pi"], capture_output=True, text=True)
+    """The path of the notes is left out: with -m, Python takes the package of the folder it is
+    started in.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxtank", "show", "cascaded/pi"], capture_output=True, text=True
+    )
     kept = lambda text: [line for line in text.splitlines() if not line.startswith("notes: ")]
-    assert done.returncode == 0 and kept(done.stdout) == kept(manual.text(presets.find("cascaded/pi")))
+    assert done.returncode == 0 and kept(done.stdout) == kept(
+        manual.text(presets.find("cascaded/pi"))
+    )

@@ -1,4 +1,6 @@
-"""What is known of a measure stands in its entry of the catalogue: reports, limits and studies read it there."""
+"""What is known of a measure stands in its entry of the catalogue: reports, limits and studies read
+it there.
+"""
 
 import dataclasses
 
@@ -63,7 +65,11 @@ def test_an_ensemble_takes_the_worse_side_of_a_measure_added_from_outside(with_m
     case = presets.find("cascaded/pi")
     clock = dataclasses.replace(case.clock, duration=20.0 * case.clock.dt)
     found = tuning.ensemble(
-        dataclasses.replace(case, clock=clock), samples=4, measures=[with_mine, "min_level"], limits={}, fan=False
+        dataclasses.replace(case, clock=clock),
+        samples=4,
+        measures=[with_mine, "min_level"],
+        limits={},
+        fan=False,
     )
     summary = found.summary()
     np.testing.assert_array_equal(summary[with_mine]["cvar95"], summary["min_level"]["cvar95"])

@@ -1,4 +1,6 @@
-"""The notes of the papers: there is one for each, its labels are unique, and whatever refers to a label or a test names one that exists."""
+"""The notes of the papers: there is one for each, its labels are unique, and whatever refers to a
+label or a test names one that exists.
+"""
 
 import ast
 import re
@@ -14,9 +16,12 @@ from jaxtank import presets
 NOTES = resources.files("jaxtank.presets") / "notes"
 TESTS = next(p for p in Path(__file__).parents if p.name == "tests")
 HEADING = re.compile(r"^###? (S\d+(?:\.\d+)?) ", re.M)  # a section
-ENTRY = re.compile(r"(?:^\| |\*\*)([AEH]\d+)(?: \||\*\*)", re.M)  # an erratum's row; an assumption or a hazard in bold
+# an erratum's row; an assumption or a hazard in bold
+ENTRY = re.compile(r"(?:^\| |\*\*)([AEH]\d+)(?: \||\*\*)", re.M)
 LABEL = r"[SAEH]\d+(?:\.\d+)?"
-REFERENCE = re.compile(rf"(?:\b({'|'.join(presets.PAPERS)}) )?\b[Nn]otes\s+({LABEL}(?:(?:, | and | to |-){LABEL})*)")
+REFERENCE = re.compile(
+    rf"(?:\b({'|'.join(presets.PAPERS)}) )?\b[Nn]otes\s+({LABEL}(?:(?:, | and | to |-){LABEL})*)"
+)
 
 
 def note(paper):
@@ -55,7 +60,11 @@ def dangling(path, text):
 def test_every_paper_has_a_note_with_its_sections(paper):
     found = labels(paper)
     assert len(found) == len(set(found))
-    assert {"S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9"} <= set(found) and "A1" in found and "H1" in found
+    assert (
+        {"S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9"} <= set(found)
+        and "A1" in found
+        and "H1" in found
+    )
 
 
 def test_references_to_notes_name_a_section_that_exists():
@@ -65,15 +74,24 @@ def test_references_to_notes_name_a_section_that_exists():
 
 def test_a_wrong_reference_is_found():
     here = Path("test_gouta2015.py")
-    assert dangling(here, "as in notes S4.3") == [] and dangling(here, "khalid notes S4.5 and H4") == []
+    assert (
+        dangling(here, "as in notes S4.3") == []
+        and dangling(here, "khalid notes S4.5 and H4") == []
+    )
     assert dangling(here, "notes S4.9, E1") == [("gouta2015", "S4.9")]
-    assert dangling(Path("qp.py"), "notes S4.5") == [(None, "S4.5")]  # outside a paper's own files the paper is named
+    # outside a paper's own files the paper is named
+    assert dangling(Path("qp.py"), "notes S4.5") == [(None, "S4.5")]
 
 
 @pytest.mark.parametrize("paper", presets.PAPERS)
 def test_tests_that_a_note_names_exist(paper):
     modules = {p.name: ast.parse(p.read_text()) for p in TESTS.rglob("test_*.py")}
-    functions = {f"{m}::{n.name}" for m, tree in modules.items() for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}
+    functions = {
+        f"{m}::{n.name}"
+        for m, tree in modules.items()
+        for n in ast.walk(tree)
+        if isinstance(n, ast.FunctionDef)
+    }
     named = set(re.findall(r"test_\w+\.py::test_\w+", note(paper)))
     assert named and named <= functions
     assert set(re.findall(r"`(test_\w+\.py)`", note(paper))) <= set(modules)

@@ -1,6 +1,8 @@
-"""The same numbers whatever runs them: another process, two devices, the XLA option off; and where float32 is refused, with the reason.
+"""The same numbers whatever runs them: another process, two devices, the XLA option off; and where
+float32 is refused, with the reason.
 
-Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices, processes and shards of an ensemble).
+Beside test_compiled_loop.py (jit, vmap, sums in float32) and test_ensemble.py (devices, processes
+and shards of an ensemble).
 """
 
 import dataclasses
@@ -38,10 +40,20 @@ print(json.dumps([{f"{k} {n}": [x.hex() for x in np.ravel(v).tolist()] for k, t 
 
 def told(devices, option):
     """({quantity: (n,)}, where it was) of a fresh process."""
-    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", flags.SWITCH)} | {flags.SWITCH: option}
-    done = subprocess.run([sys.executable, "-c", RUNS, str(devices)], capture_output=True, text=True, check=True, env=env)
+    env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", flags.SWITCH)} | {
+        flags.SWITCH: option
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", RUNS, str(devices)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=env,
+    )
     found, places = json.loads(done.stdout)
-    return {name: np.array([float.fromhex(v) for v in values]) for name, values in found.items()}, places
+    return {
+        name: np.array([float.fromhex(v) for v in values]) for name, values in found.items()
+    }, places
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +69,14 @@ def test_another_process_and_the_second_of_two_devices_give_the_same_bits(plain)
 
 
 def test_the_option_off_gives_the_same_noisy_runs_lanes_and_slopes(plain):
-    """To 1e-12 (methods 2.1: the last bits of a step; what adds up over 2,000 of them). A slope is a sum of terms of either sign."""
+    """To 1e-12 (methods 2.1: the last bits of a step; what adds up over 2,000 of them). A slope is
+    a sum of terms of either sign.
+    """
     off, _ = told(1, "0")
     for name, values in plain.items():
-        np.testing.assert_allclose(off[name], values, rtol=1e-10 if "slope" in name else 1e-12, err_msg=name)
+        np.testing.assert_allclose(
+            off[name], values, rtol=1e-10 if "slope" in name else 1e-12, err_msg=name
+        )
 
 
 def test_a_lane_is_the_run_alone(plain):
@@ -84,7 +100,9 @@ for run in (lambda: tuning.tune(case), lambda: tuning.identify(case, None), lamb
 
 
 def test_a_run_has_the_precision_of_its_most_precise_leaf():
-    """x0 of 32 bits in a loop of 64, and one gain of 64 bits in a loop of 32: jax's scan would not have a state change its type."""
+    """x0 of 32 bits in a loop of 64, and one gain of 64 bits in a loop of 32: jax's scan would not
+    have a state change its type.
+    """
     case = presets.find("gouta2015/backstepping")
     run = lambda loop: np.asarray(evaluate(loop, Clock(dt=0.1, duration=120.0), ("iae",))["iae"])
     short = lambda tree: jax.tree.map(lambda a: np.asarray(a, np.float32), tree)
@@ -93,7 +111,10 @@ def test_a_run_has_the_precision_of_its_most_precise_leaf():
     assert run(there).dtype == np.float64 and np.array_equal(run(there), run(back))
     single = short(case.loop)
     one = dataclasses.replace(
-        single, actuator=dataclasses.replace(single.actuator, high=np.asarray(single.actuator.high, np.float64))
+        single,
+        actuator=dataclasses.replace(
+            single.actuator, high=np.asarray(single.actuator.high, np.float64)
+        ),
     )
     assert run(one).dtype == np.float64 and np.allclose(run(one), run(case.loop), rtol=1e-4)
     listed = dataclasses.replace(case.loop, x0=case.loop.x0.tolist())
@@ -117,8 +138,12 @@ SHAPES = {
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_leaf_of_another_shape_is_no_other_rig(name):
-    """An index past the end is that of the last entry inside jax: such runs gave plausible numbers of another rig."""
-    case = presets.find("gouta2022/chadpc" if name.startswith("observer") else "gouta2015/backstepping")
+    """An index past the end is that of the last entry inside jax: such runs gave plausible numbers
+    of another rig.
+    """
+    case = presets.find(
+        "gouta2022/chadpc" if name.startswith("observer") else "gouta2015/backstepping"
+    )
 
     def other(tree, path):
         if not path:
@@ -126,8 +151,13 @@ def test_a_leaf_of_another_shape_is_no_other_rig(name):
         return dataclasses.replace(tree, **{path[0]: other(getattr(tree, path[0]), path[1:])})
 
     loop = other(case.loop, name.split("."))
-    for run in (lambda: evaluate(loop, case.clock, ("iae",)), lambda: jax.jit(lambda b: evaluate(b, case.clock, ("iae",)))(loop)):
-        with pytest.raises(InputError, match=f"{name} has shape" if name != "plant.rim" else "has shape"):
+    for run in (
+        lambda: evaluate(loop, case.clock, ("iae",)),
+        lambda: jax.jit(lambda b: evaluate(b, case.clock, ("iae",)))(loop),
+    ):
+        with pytest.raises(
+            InputError, match=f"{name} has shape" if name != "plant.rim" else "has shape"
+        ):
             run()
 
 
@@ -140,26 +170,43 @@ def test_leaves_of_a_batch_have_its_axis_in_front():
 
 
 def test_noise_that_no_key_draws_is_no_answer():
-    """Outside a trace it is refused at the door; inside one the noise is not known there, and a run without it looked like an answer."""
+    """Outside a trace it is refused at the door; inside one the noise is not known there, and a run
+    without it looked like an answer.
+    """
     case, clock = presets.find("gouta2015/backstepping"), Clock(dt=0.5, duration=50.0)
 
     def travel(noise, key=None):
-        return evaluate(with_values(case.loop, {"sensor.noise": noise}), clock, ("input_travel",), key)["input_travel"].sum()
+        return evaluate(
+            with_values(case.loop, {"sensor.noise": noise}), clock, ("input_travel",), key
+        )["input_travel"].sum()
 
     def slope(noise, key=None):
         loop = with_values(case.loop, {"sensor.noise": noise})
-        return sensitivities(loop, clock, ("input_travel",), {"controller.k": 1.0}, key)[1]["input_travel"]
+        return sensitivities(loop, clock, ("input_travel",), {"controller.k": 1.0}, key)[1][
+            "input_travel"
+        ]
 
     key = jax.random.key(0)
     for run in (travel, jax.grad(travel)):
         with pytest.raises(InputError, match="give a key"):
             run(0.1)
-    assert np.isnan(jax.jit(travel)(0.1)) and np.isnan(jax.jit(jax.grad(travel))(0.1)) and np.isnan(jax.jit(slope)(0.1)).all()
+    assert (
+        np.isnan(jax.jit(travel)(0.1))
+        and np.isnan(jax.jit(jax.grad(travel))(0.1))
+        and np.isnan(jax.jit(slope)(0.1)).all()
+    )
     assert np.isfinite(jax.jit(travel)(0.0)) and np.isfinite(jax.jit(slope)(0.0)).all()
-    assert jax.jit(travel)(0.1, key) == pytest.approx(float(travel(0.1, key)), rel=1e-12) and jax.grad(travel)(0.1, key) > 1.0
+    assert (
+        jax.jit(travel)(0.1, key) == pytest.approx(float(travel(0.1, key)), rel=1e-12)
+        and jax.grad(travel)(0.1, key) > 1.0
+    )
 
 
 def test_float32_is_refused_where_it_would_be_wrong():
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", FLOAT32], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FLOAT32], capture_output=True, text=True, check=True
+    )
     lines = done.stdout.splitlines()
-    assert len(lines) == 3 and all("float64" in line and "jax_enable_x64" in line for line in lines), lines
+    assert len(lines) == 3 and all(
+        "float64" in line and "jax_enable_x64" in line for line in lines
+    ), lines

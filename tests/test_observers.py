@@ -1,4 +1,6 @@
-"""Kalman filters against plain numpy, scipy's Riccati solver, and the noise they are there to remove."""
+"""Kalman filters against plain numpy, scipy's Riccati solver, and the noise they are there to
+remove.
+"""
 
 import dataclasses
 
@@ -28,24 +30,41 @@ A, B = np.asarray(A), np.asarray(B)
 
 @component
 class Linear(Plant):
-    """x' = A x + B u of the rig's linearisation: a model on which an extended filter is an ordinary one."""
+    """x' = A x + B u of the rig's linearisation: a model on which an extended filter is an ordinary
+    one.
+    """
 
     tanks: int = static(default=4)
     pumps: int = static(default=2)
 
     def derivative(self, t, x, u, d):
-        return tuple(sum(A[i, j] * x[j] for j in range(4)) + sum(B[i, j] * u[j] for j in range(2)) for i in range(4))
+        return tuple(
+            sum(A[i, j] * x[j] for j in range(4)) + sum(B[i, j] * u[j] for j in range(2))
+            for i in range(4)
+        )
 
     def spill(self, x):
         return x, (0.0,) * 4
 
 
 def kalman(**changes):
-    return Kalman(**{**dict(model=PLANT, levels=LEVELS, inputs=INPUTS, process=Q, measurement=R, measured=(0, 1)), **changes})
+    return Kalman(
+        **{
+            **dict(
+                model=PLANT, levels=LEVELS, inputs=INPUTS, process=Q, measurement=R, measured=(0, 1)
+            ),
+            **changes,
+        }
+    )
 
 
 def extended(**changes):
-    return ExtendedKalman(**{**dict(model=PLANT, process=Q, measurement=R, spread=np.full(4, 1.0), measured=(0, 1)), **changes})
+    return ExtendedKalman(
+        **{
+            **dict(model=PLANT, process=Q, measurement=R, spread=np.full(4, 1.0), measured=(0, 1)),
+            **changes,
+        }
+    )
 
 
 def filtered(observer, ys, us, x0, dt):
@@ -60,10 +79,14 @@ def filtered(observer, ys, us, x0, dt):
 
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])
 def test_on_a_linear_model_the_extended_filter_is_the_ordinary_one(measured):
-    """Joint correction and matrix inverse in numpy; the step's matrix is Taylor's series to h^4, which is what RK4 makes of A."""
+    """Joint correction and matrix inverse in numpy; the step's matrix is Taylor's series to h^4,
+    which is what RK4 makes of A.
+    """
     rng, dt = np.random.default_rng(0), 0.5
     ys, us = rng.normal(5.0, 1.0, (20, 4)), rng.normal(3.0, 1.0, (20, 2))
-    found, state = filtered(extended(model=Linear(), measured=measured), ys, us, np.full(4, 5.0), dt)
+    found, state = filtered(
+        extended(model=Linear(), measured=measured), ys, us, np.full(4, 5.0), dt
+    )
     H = A * dt
     F = np.eye(4) + H @ (np.eye(4) + H / 2 @ (np.eye(4) + H / 3 @ (np.eye(4) + H / 4)))
     G = dt * (np.eye(4) + H / 2 @ (np.eye(4) + H / 3 @ (np.eye(4) + H / 4))) @ B
@@ -87,7 +110,9 @@ def test_the_steady_gain_is_scipys(measured):
 
 
 def test_near_rest_both_filters_agree_once_settled():
-    """Small moves about the operating point: what differs is the curvature of the roots and RK4, both of second order."""
+    """Small moves about the operating point: what differs is the curvature of the roots and RK4,
+    both of second order.
+    """
     rng, dt = np.random.default_rng(1), 0.5
     ys, us = LEVELS + 1e-4 * rng.normal(size=(400, 4)), np.tile(INPUTS, (400, 1))
     one, _ = filtered_in_jax(kalman(), ys, us, dt)
@@ -108,14 +133,22 @@ def filtered_in_jax(observer, ys, us, dt):
 
 def noisy(gouta, observer):
     """The benchmark with 0.5 cm of noise on every level, sampled every 0.5 s."""
-    case = gouta("backstepping", {"sensor.noise": 0.5, "clock.dt": 0.5, "clock.duration": 300.0, "clock.substeps": 2})
+    case = gouta(
+        "backstepping",
+        {"sensor.noise": 0.5, "clock.dt": 0.5, "clock.duration": 300.0, "clock.substeps": 2},
+    )
     return dataclasses.replace(case.loop, observer=observer), case.clock
 
 
 def test_the_extended_filter_beats_noise_and_open_loop_prediction(gouta):
     start = number([6.0, 1.0, 2.0, 6.0])
     noise = number(np.full(4, 0.25))
-    belief = dict(process=number(np.full(4, 1e-3)), measurement=noise, spread=number(np.full(4, 9.0)), start=start)
+    belief = dict(
+        process=number(np.full(4, 1e-3)),
+        measurement=noise,
+        spread=number(np.full(4, 9.0)),
+        start=start,
+    )
     key = jax.random.key(3)
 
     def rms(observer):
@@ -124,8 +157,13 @@ def test_the_extended_filter_beats_noise_and_open_loop_prediction(gouta):
 
     model = with_values(PLANT, {"pump_gain": 1.05 * PLANT.pump_gain})  # the model is 5 % wrong
     ekf = rms(extended(model=model, **belief))
-    blind = rms(extended(model=model, **{**belief, "process": number(np.zeros(4)), "spread": number(np.zeros(4))}))
-    assert np.all(ekf[:2] < 0.7 * 0.5)  # of the noise on the measured tanks; 0.64 of it is what was found
+    blind = rms(
+        extended(
+            model=model, **{**belief, "process": number(np.zeros(4)), "spread": number(np.zeros(4))}
+        )
+    )
+    # of the noise on the measured tanks; 0.64 of it is what was found
+    assert np.all(ekf[:2] < 0.7 * 0.5)
     assert np.sum(ekf**2) < 0.5 * np.sum(blind**2)
 
 
@@ -133,8 +171,14 @@ def test_the_extended_filter_beats_noise_and_open_loop_prediction(gouta):
 def test_gradients_by_the_variances(gouta, make):
     loop, clock = noisy(gouta, make())
     names = [f"observer.{n}[{i}]" for n in ("process", "measurement") for i in (0, 1)]
-    names += ["observer.levels[0]", "observer.inputs[1]"] if make is kalman else ["observer.spread[2]", "observer.model.drain[0]"]
-    run = lambda z: jaxtank.evaluate(with_values(loop, dict(zip(names, jnp.exp(z)))), clock, "estimation_rms", jax.random.key(0))
+    names += (
+        ["observer.levels[0]", "observer.inputs[1]"]
+        if make is kalman
+        else ["observer.spread[2]", "observer.model.drain[0]"]
+    )
+    run = lambda z: jaxtank.evaluate(
+        with_values(loop, dict(zip(names, jnp.exp(z)))), clock, "estimation_rms", jax.random.key(0)
+    )
     f = jax.jit(lambda z: jnp.sum(run(z)["estimation_rms"]))
     z = np.log([float(get_value(loop, n)) for n in names])
     differences = [(f(z + d) - f(z - d)) / 2e-5 for d in 1e-5 * np.eye(len(z))]
@@ -148,7 +192,14 @@ def test_the_loop_still_compiles_to_one_function(gouta, make):
     loop, clock = noisy(gouta, make())
     quiet = with_values(loop, {"sensor.noise": 0.0})
     clock = Clock(dt=0.5, duration=300.0, substeps=1)
-    assert loops_in(evaluate_compiled.lower(quiet, clock, ("rms_error_total", "estimation_rms"), None, False).compile()) >= 1
+    assert (
+        loops_in(
+            evaluate_compiled.lower(
+                quiet, clock, ("rms_error_total", "estimation_rms"), None, False
+            ).compile()
+        )
+        >= 1
+    )
 
 
 @pytest.mark.parametrize(

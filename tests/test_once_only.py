@@ -32,7 +32,9 @@ def calls(tree):
         if isinstance(node, ast.ImportFrom):
             found.update(a.name for a in node.names)
         elif isinstance(node, ast.Call):
-            of_super = isinstance(node.func, ast.Attribute) and isinstance(node.func.value, ast.Call)
+            of_super = isinstance(node.func, ast.Attribute) and isinstance(
+                node.func.value, ast.Call
+            )
             if not of_super:  # a method of a plant may call that of its base class
                 found.add(getattr(node.func, "attr", getattr(node.func, "id", "")))
     return found
@@ -45,7 +47,11 @@ def callers(name, texts):
 @pytest.fixture(scope="module")
 def texts():
     """{path: text} of every module of both packages."""
-    return {path.relative_to(root.parent).as_posix(): path.read_text() for root in ROOTS for path in root.rglob("*.py")}
+    return {
+        path.relative_to(root.parent).as_posix(): path.read_text()
+        for root in ROOTS
+        for path in root.rglob("*.py")
+    }
 
 
 @pytest.mark.parametrize("name", ONLY)
@@ -71,7 +77,9 @@ def test_a_rolled_sample_is_the_unrolled_one(integrator):
     x, u = tuple(0.1 * np.ones(4)), (30.0, 25.0)
     one = jax.jit(lambda x: advance(PLANT, integrator, 0.0, x, u, None, 2.0, 8))(x)
     two = jax.jit(lambda x: advance(PLANT, integrator, 0.0, x, u, None, 2.0, 8, rolled=True))(x)
-    three = jax.jit(lambda x, n: advance(PLANT, integrator, 0.0, x, u, None, 2.0, n, rolled=True))(x, 8)
+    three = jax.jit(lambda x, n: advance(PLANT, integrator, 0.0, x, u, None, 2.0, n, rolled=True))(
+        x, 8
+    )
     assert np.sum(one.spilled) > 0.0
     for other in (two, three):
         for a, b in zip(one, other):

@@ -1,4 +1,6 @@
-"""What reaches a terminal: one line that is not too long, of characters that the terminal prints and does not obey."""
+"""What reaches a terminal: one line that is not too long, of characters that the terminal prints
+and does not obey.
+"""
 
 import pytest
 
@@ -10,7 +12,15 @@ from tuning.cli import main
 RED = "a\033[31m.csv"
 ESCAPED = r"a\x1b[31m.csv"
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
-IDENTIFY = ("identify", "mirakhorli/sfc", "--free", "plant.pump_gain=5:60", "--starts", "1", "--data")
+IDENTIFY = (
+    "identify",
+    "mirakhorli/sfc",
+    "--free",
+    "plant.pump_gain=5:60",
+    "--starts",
+    "1",
+    "--data",
+)
 SHORT = ("--set", "clock.dt=1", "--set", "clock.duration=100")
 
 
@@ -29,12 +39,17 @@ def say(tmp_path, monkeypatch, capsys):
 def test_characters_that_a_terminal_obeys_are_escaped():
     assert printable(RED) == ESCAPED and printable("Füllstand 水位.csv") == "Füllstand 水位.csv"
     assert printable("a\nb\tc\x7f\x9b\u202e") == r"a\nb\tc\x7f\x9b\u202e"
-    assert printable(b"\xff.csv".decode("utf-8", "surrogateescape")) == r"\udcff.csv"  # a file name that is not UTF-8
+    # a file name that is not UTF-8
+    assert printable(b"\xff.csv".decode("utf-8", "surrogateescape")) == r"\udcff.csv"
 
 
 def test_a_long_line_keeps_both_its_ends():
     line = one_line("file.csv, line 3: " + 10_000 * "x" + " is no unit; nearest: cm")
-    assert len(line) == MOST and line.startswith("file.csv, line 3: xx") and line.endswith("xx is no unit; nearest: cm")
+    assert (
+        len(line) == MOST
+        and line.startswith("file.csv, line 3: xx")
+        and line.endswith("xx is no unit; nearest: cm")
+    )
     assert one_line("a\n  b ") == "a b" and one_line("x" * MOST) == "x" * MOST
 
 
@@ -50,18 +65,35 @@ def test_a_long_line_keeps_both_its_ends():
 def test_an_error_of_a_long_word_is_a_short_line(say, words, end):
     code, out, err = say("simulate", "cascaded/pi", *words)
     (line,) = err.splitlines()
-    assert code == 2 and out == "" and len(line) <= MOST + len("jaxtank: ") and line.endswith(end or "")
+    assert (
+        code == 2
+        and out == ""
+        and len(line) <= MOST + len("jaxtank: ")
+        and line.endswith(end or "")
+    )
 
 
 def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
     (tmp_path / "wide.csv").write_text(",".join(f"column {i}" for i in range(100_000)) + "\n")
     code, out, err = say(*IDENTIFY, "wide.csv")
     assert code == 5 and out == "" and err.count("\n") == 1
-    assert "no column for t (time) among 'column 0', 'column 1'" in err and "and 99980 more; name it with --column" in err
+    assert (
+        "no column for t (time) among 'column 0', 'column 1'" in err
+        and "and 99980 more; name it with --column" in err
+    )
 
 
 @pytest.mark.parametrize(
-    "content", [None, "", "x\n", HEADER + "\n", HEADER + "\n0,3,2,1,1,1,x\n", HEADER + "\n0,3,2,1,1,1,1\n", b"\xff"]
+    "content",
+    [
+        None,
+        "",
+        "x\n",
+        HEADER + "\n",
+        HEADER + "\n0,3,2,1,1,1,x\n",
+        HEADER + "\n0,3,2,1,1,1,1\n",
+        b"\xff",
+    ],
 )
 def test_names_of_logs_are_told_escaped(say, tmp_path, content):
     if content is not None:
@@ -71,7 +103,10 @@ def test_names_of_logs_are_told_escaped(say, tmp_path, content):
 
 
 def test_names_of_logs_in_what_is_found(say, tmp_path):
-    rows = [f"{k},3,2.8,{2 + 0.1 * k:.2f},{2 + 0.12 * k:.2f},{1 + 0.02 * k:.2f},{1 + 0.03 * k:.2f}" for k in range(12)]
+    rows = [
+        f"{k},3,2.8,{2 + 0.1 * k:.2f},{2 + 0.12 * k:.2f},{1 + 0.02 * k:.2f},{1 + 0.03 * k:.2f}"
+        for k in range(12)
+    ]
     (tmp_path / RED).write_text("\n".join([HEADER, *rows]) + "\n")
     _, out, err = say(*IDENTIFY, RED, "--iterations", "2")
     assert f"{ESCAPED}: 12 samples" in err and ESCAPED in out and "\033" not in out + err
@@ -80,12 +115,21 @@ def test_names_of_logs_in_what_is_found(say, tmp_path):
 def test_names_of_rigs_and_folders(say, tmp_path):
     """A note about a rig file, and where the result went."""
     _, text, _ = say("init", "cascaded/pi", "--short")
-    (tmp_path / "b\033[31m.toml").write_text(text.replace("[values]\n", "[values]\nx0 = [11.0, 11.0]\n", 1))
+    (tmp_path / "b\033[31m.toml").write_text(
+        text.replace("[values]\n", "[values]\nx0 = [11.0, 11.0]\n", 1)
+    )
     code, _, err = say("simulate", "b\033[31m.toml", *SHORT, "--out", "c\033[31m")
-    assert code == 0 and r"jaxtank: b\x1b[31m.toml: note:" in err and r"written to c\x1b[31m:" in err and "\033" not in err
+    assert (
+        code == 0
+        and r"jaxtank: b\x1b[31m.toml: note:" in err
+        and r"written to c\x1b[31m:" in err
+        and "\033" not in err
+    )
 
 
-@pytest.mark.parametrize("value, words", [("1e308", "must be within"), ("inf", "must be a finite number")])
+@pytest.mark.parametrize(
+    "value, words", [("1e308", "must be within"), ("inf", "must be a finite number")]
+)
 def test_a_number_that_is_finite_is_not_called_infinite(value, words):
     text = rig.dump(rig.open_case("cascaded/pi"), tankwise=True)
     line = next(line for line in text.splitlines() if line.startswith("area = "))

@@ -1,4 +1,6 @@
-"""How few evaluations the tuner's own local searches need, and what makes them few: tests/benchmarks/optimisers.py has the rivals."""
+"""How few evaluations the tuner's own local searches need, and what makes them few:
+tests/benchmarks/optimisers.py has the rivals.
+"""
 
 import dataclasses
 
@@ -35,12 +37,14 @@ def searched(problem, method, iterations=60):
 
 @pytest.mark.slow  # two compilations of derivatives of seven runs
 def test_few_evaluations(eight):
-    target = 1.001 * searched(eight, "slsqp")[0].best.cost  # another algorithm, which uses no squares
+    # another algorithm, which uses no squares
+    target = 1.001 * searched(eight, "slsqp")[0].best.cost
     arrived = lambda search: 1 + next(i for i, row in enumerate(search.history) if row[1] <= target)
     plain, none = searched(eight, "trf")
     refined, rough = searched(eight, "coarse-trf")
     assert none == 0
-    # measured 6 to 16 passes from eight starts; the best derivative-free search needs 176 evaluations at least
+    # measured 6 to 16 passes from eight starts; the best derivative-free search needs 176
+    # evaluations at least
     assert arrived(plain) <= 20
     # measured 1 to 4 of all samples, 7 to 17 of a tenth of them
     assert arrived(refined) <= 6 and rough <= 30
@@ -73,14 +77,17 @@ def test_rough_search_starts_the_true_one(gouta):
     both, rough = searched(problem, "coarse-trf")
     alone, _ = searched(problem, "trf")
     assert rough > 0
-    assert both.best.cost == pytest.approx(alone.best.cost, rel=1e-6)  # both end at 1e-10; the valley of k is flat
+    # both end at 1e-10; the valley of k is flat
+    assert both.best.cost == pytest.approx(alone.best.cost, rel=1e-6)
     # what the rough runs found stands in no history: every row there is a cost at the true step
     costs, _ = problem.screen(np.array([row[3] for row in both.history]))
     np.testing.assert_allclose(costs, [row[1] for row in both.history], rtol=1e-9)
 
 
 def test_gauss_newton_of_many_parameters(gouta):
-    """Above OUTER parameters the matrix grows by a product; compared with J'J of differences of the whole error."""
+    """Above OUTER parameters the matrix grows by a product; compared with J'J of differences of the
+    whole error.
+    """
     case = schedule(quick(gouta), {"controller.k1": "r1"}, np.linspace(3.0, 8.0, OUTER + 2))
     names = [f"controller.values[0,{j}]" for j in range(OUTER + 2)]
     at = {name: 0.2 + 0.01 * j for j, name in enumerate(names)}
@@ -91,7 +98,9 @@ def test_gauss_newton_of_many_parameters(gouta):
         return np.ravel(run.simulate(with_values(case.loop, {**at, **changes}), case.clock).e)
 
     step = 1e-5
-    jacobian = np.array([(error({n: at[n] + step}) - error({n: at[n] - step})) / (2 * step) for n in names])
+    jacobian = np.array(
+        [(error({n: at[n] + step}) - error({n: at[n] - step})) / (2 * step) for n in names]
+    )
     expected = 2.0 * jacobian @ jacobian.T / case.clock.samples
     # rounding of the levels over the step is 1e-10, the step's own error 1e-9
     np.testing.assert_allclose(matrix, expected, atol=1e-7 * np.abs(expected).max())

@@ -1,4 +1,6 @@
-"""A plant and a law that somebody else wrote, with no more than their base classes ask: notebook 10's cone."""
+"""A plant and a law that somebody else wrote, with no more than their base classes ask: notebook
+10's cone.
+"""
 
 import dataclasses
 import json
@@ -32,7 +34,9 @@ class Cone(Plant):
 
     def derivative(self, t, x, u, d):
         width = self.slope * (x[0] + 0.5)
-        flow = self.pump_gain * u[0] - self.drain * jnp.sqrt(2.0 * 981.0) * numerics.root(x[0], 0.01)
+        flow = self.pump_gain * u[0] - self.drain * jnp.sqrt(2.0 * 981.0) * numerics.root(
+            x[0], 0.01
+        )
         return (flow / (jnp.pi * width * width),)
 
 
@@ -50,12 +54,20 @@ class Proportional(Controller):
 @pytest.fixture(scope="module")
 def case():
     loop = jaxtank.ClosedLoop(
-        plant=Cone(pump_gain=number(30.0), drain=number(1.2), slope=number(0.5), rim=number([30.0])),
-        sensor=jaxtank.instruments.LevelSensor(gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)),
+        plant=Cone(
+            pump_gain=number(30.0), drain=number(1.2), slope=number(0.5), rim=number([30.0])
+        ),
+        sensor=jaxtank.instruments.LevelSensor(
+            gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)
+        ),
         observer=jaxtank.observers.Direct(),
         controller=Proportional(Kc=number(1.0), bias=number(5.0)),
         actuator=jaxtank.instruments.PumpBank(
-            low=number([0.0]), high=number([12.0]), stop=number([0.0]), pulse=number([12.0]), initial=number([0.0])
+            low=number([0.0]),
+            high=number([12.0]),
+            stop=number([0.0]),
+            pulse=number([12.0]),
+            initial=number([0.0]),
         ),
         reference=jaxtank.signals.ramps([5.0], [(5.0, 0, 12.0)], ramp=0.0),
         x0=number([5.0]),
@@ -77,9 +89,12 @@ def test_its_levels_are_those_of_another_integrator(case):
     assert np.ptp(np.asarray(run.u)) > 5.0  # it moves, and into its upper limit
     level = [5.0]
     for volts in np.asarray(run.u)[:-1, 0]:
-        rate = lambda _, h, volts=volts: (30.0 * volts - 1.2 * np.sqrt(1962.0 * h)) / (np.pi * 0.25 * (h + 0.5) ** 2)
+        rate = lambda _, h, volts=volts: (
+            (30.0 * volts - 1.2 * np.sqrt(1962.0 * h)) / (np.pi * 0.25 * (h + 0.5) ** 2)
+        )
         level.append(solve_ivp(rate, (0.0, 0.1), [level[-1]], rtol=1e-9, atol=1e-11).y[0, -1])
-    np.testing.assert_allclose(np.asarray(run.x)[:, 0], level, atol=2e-6)  # the smooth root: 1e-6 of it at 5 cm
+    # the smooth root: 1e-6 of it at 5 cm
+    np.testing.assert_allclose(np.asarray(run.x)[:, 0], level, atol=2e-6)
 
 
 def test_slopes_by_law_and_plant_are_those_of_differences(case):
@@ -93,14 +108,19 @@ def test_slopes_by_law_and_plant_are_those_of_differences(case):
 
     exact = jax.jacfwd(error)(point)
     for i, step in enumerate(1e-6 * np.diag(point)):
-        assert exact[i] == pytest.approx(float(error(point + step) - error(point - step)) / (2.0 * step[i]), rel=1e-6)
+        assert exact[i] == pytest.approx(
+            float(error(point + step) - error(point - step)) / (2.0 * step[i]), rel=1e-6
+        )
 
 
 def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
     result = tuning.tune(case, starts=1, screening=4, validation=4)
     assert result.success and result.objective["after"] < 0.9 * result.objective["before"]
     found = tuning.ensemble(result.tuned, samples=8, fan=False)
-    assert found.measures["rms_error_total"].shape == (8,) and np.ptp(found.measures["rms_error_total"]) > 0
+    assert (
+        found.measures["rms_error_total"].shape == (8,)
+        and np.ptp(found.measures["rms_error_total"]) > 0
+    )
     assert all(v["count"] == 0 for v in found.violations())
     with pytest.raises(jaxtank.InputError, match=r"plant\.drain"):
         jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
@@ -111,12 +131,16 @@ def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
     result = tuning.tune(case, starts=1, screening=4, validation=4)
     (tmp_path / "rig.toml").write_text("of an earlier result")
     (tmp_path / "result.json").write_text("{}")
-    with pytest.warns(UserWarning, match=r"rig\.toml is not written .*no name in a rig file.*controller\.Kc = "):
+    with pytest.warns(
+        UserWarning, match=r"rig\.toml is not written .*no name in a rig file.*controller\.Kc = "
+    ):
         names = {path.name for path in result.save(tmp_path)}
     assert {"result.json", "trajectory.csv", "before.csv", "report.html", "responses.png"} <= names
     assert names == {path.name for path in tmp_path.iterdir()} and "rig.toml" not in names
     saved = json.loads((tmp_path / "result.json").read_text())
-    assert saved["parameters"]["controller.Kc"]["after"] == result.parameters["controller.Kc"]["after"]
+    assert (
+        saved["parameters"]["controller.Kc"]["after"] == result.parameters["controller.Kc"]["after"]
+    )
     assert "rig.toml is not written" in saved["message"]
     assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
 
@@ -131,7 +155,14 @@ class Several(Controller):
         return (5.0 * tick.r[0],) * self.count if self.count else 5.0 * tick.r[0], state
 
 
-KINDS = {"vectors": True, "columns": True, "texts": True, "complex": True, "array": False, "switch": False}
+KINDS = {
+    "vectors": True,
+    "columns": True,
+    "texts": True,
+    "complex": True,
+    "array": False,
+    "switch": False,
+}
 """What Odd returns: whether it is wrong."""
 
 
@@ -156,7 +187,9 @@ class Odd(Controller):
 
 @pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
 def test_a_controller_returns_one_input_for_each_pump(count, words):
-    case = jaxtank.rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0})
+    case = jaxtank.rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0}
+    )
     case = case.replace(loop=dataclasses.replace(case.loop, controller=Several(count=count)))
     wrong = f"controller Several: its step returns {words} for 2 pumps"
     for run in (
@@ -173,10 +206,17 @@ def test_a_controller_returns_one_input_for_each_pump(count, words):
 
 @pytest.mark.parametrize(("kind", "wrong"), KINDS.items())
 def test_an_input_of_a_controller_is_one_real_number(kind, wrong):
-    case = jaxtank.rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0})
+    case = jaxtank.rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0}
+    )
     loop = dataclasses.replace(case.loop, controller=Odd(kind=kind))
     if not wrong:
-        assert np.isfinite(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"])
+        assert np.isfinite(
+            jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]
+        )
         return
-    with pytest.raises(jaxtank.InputError, match="controller Odd: its step returns an input that is no single real number"):
+    with pytest.raises(
+        jaxtank.InputError,
+        match="controller Odd: its step returns an input that is no single real number",
+    ):
         jaxtank.evaluate(loop, case.clock, ["rms_error"])

@@ -24,27 +24,39 @@ from jaxtank.signals.setpoints import ramps
 @pytest.mark.parametrize("dt", [0.01, 0.7])
 def test_a_ramp_against_its_definition(shape, dt):
     clock = Clock(dt=dt, duration=200.0)
-    r, dr, ddr = (np.asarray(v[0]) for v in ramps([3.0], [(20.0, 0, 8.0), (90.0, 0, 5.0)], 60.0, shape).sample(clock))
+    r, dr, ddr = (
+        np.asarray(v[0])
+        for v in ramps([3.0], [(20.0, 0, 8.0), (90.0, 0, 5.0)], 60.0, shape).sample(clock)
+    )
     t = np.arange(clock.samples) * dt
     x1, x2 = np.clip((t - 20) / 60, 0, 1), np.clip((t - 90) / 60, 0, 1)
     s = (lambda x: x) if shape == "linear" else lambda x: 10 * x**3 - 15 * x**4 + 6 * x**5
     np.testing.assert_allclose(r, 3 + 5 * s(x1) - 3 * s(x2), atol=1e-12)
     if shape == "linear":
         np.testing.assert_allclose(
-            dr, 5 / 60 * ((t >= 20 - 1e-9) & (t < 80 - 1e-9)) - 3 / 60 * ((t >= 90 - 1e-9) & (t < 150 - 1e-9)), atol=1e-15
+            dr,
+            5 / 60 * ((t >= 20 - 1e-9) & (t < 80 - 1e-9))
+            - 3 / 60 * ((t >= 90 - 1e-9) & (t < 150 - 1e-9)),
+            atol=1e-15,
         )
         assert not ddr.any()
     else:
-        ds, dds = lambda x: 30 * x**2 * (1 - x) ** 2 / 60, lambda x: 60 * x * (1 - x) * (1 - 2 * x) / 3600
+        ds, dds = (
+            lambda x: 30 * x**2 * (1 - x) ** 2 / 60,
+            lambda x: 60 * x * (1 - x) * (1 - 2 * x) / 3600,
+        )
         np.testing.assert_allclose(dr, 5 * ds(x1) - 3 * ds(x2), atol=1e-13)
         np.testing.assert_allclose(ddr, 5 * dds(x1) - 3 * dds(x2), atol=1e-14)
 
 
 def test_an_s_curve_integrates_its_own_rates():
     clock = Clock(dt=0.01, duration=100.0)
-    r, dr, ddr = (np.asarray(v[0]) for v in ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic").sample(clock))
+    r, dr, ddr = (
+        np.asarray(v[0]) for v in ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic").sample(clock)
+    )
     np.testing.assert_allclose(np.gradient(r, 0.01)[1:-1], dr[1:-1], atol=1e-6)
-    np.testing.assert_allclose(np.gradient(dr, 0.01)[1:-1], ddr[1:-1], atol=5e-6)  # at its ends the third derivative jumps
+    # at its ends the third derivative jumps
+    np.testing.assert_allclose(np.gradient(dr, 0.01)[1:-1], ddr[1:-1], atol=5e-6)
 
 
 def test_steps_and_overlapping_ramps():
@@ -59,7 +71,9 @@ def test_steps_and_overlapping_ramps():
 def test_plateaus_and_windows():
     reference = ramps([3.0, 3.0], [(20.0, 0, 8.0), (20.0, 1, 8.0), (40.0, 1, 14.0)], 5.0)
     np.testing.assert_array_equal(reference.plateaus(), [[3, 3], [8, 8], [8, 14]])
-    target, step, since, band = (np.asarray(v) for v in reference.windows(Clock(dt=1.0, duration=60.0))[1])
+    target, step, since, band = (
+        np.asarray(v) for v in reference.windows(Clock(dt=1.0, duration=60.0))[1]
+    )
     assert (target[10], step[10]) == (3.0, 0.0)
     assert (target[30], step[30], since[30]) == (8.0, 5.0, 5.0)
     assert (target[50], step[50], since[50]) == (14.0, 6.0, 5.0)
@@ -69,7 +83,9 @@ def test_plateaus_and_windows():
 def test_gradient_of_a_reference_by_its_targets():
     clock = Clock(dt=1.0, duration=100.0)
     reference = ramps([3.0], [(20.0, 0, 8.0)], 60.0)
-    slope = jax.jacfwd(lambda v: jaxtank.with_values(reference, {"targets[0]": v}).sample(clock)[0][0])(8.0)
+    slope = jax.jacfwd(
+        lambda v: jaxtank.with_values(reference, {"targets[0]": v}).sample(clock)[0][0]
+    )(8.0)
     np.testing.assert_allclose(slope, np.clip((np.arange(101) - 20) / 60, 0, 1), atol=1e-12)
 
 
@@ -89,7 +105,8 @@ def test_a_change_at_a_bad_time_or_channel_is_refused(change):
 
 
 @pytest.mark.parametrize(
-    "x, value, slope", [(-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (5.0, 5.0, 1.0), (12.0, 12.0, 1.0), (13.0, 12.0, 0.0)]
+    "x, value, slope",
+    [(-1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (5.0, 5.0, 1.0), (12.0, 12.0, 1.0), (13.0, 12.0, 0.0)],
 )
 def test_clip(x, value, slope):
     f = lambda x: clip(x, 0.0, 12.0)
@@ -126,7 +143,8 @@ def test_noise_has_its_standard_deviation_and_its_own_stream_per_tank():
     xi = np.array(s.draw(jax.random.key(0), 20_000))
     y = np.array(s.read((np.full(20_000, 4.0), np.full(20_000, 4.0)), tuple(xi)))
     np.testing.assert_allclose(y.mean(axis=1), 4.0, atol=5 * 0.5 / np.sqrt(20_000))
-    np.testing.assert_allclose(y.std(axis=1), (0.1, 0.5), rtol=0.03)  # 1/sqrt(2 n) = 0.5 %, six of them
+    # 1/sqrt(2 n) = 0.5 %, six of them
+    np.testing.assert_allclose(y.std(axis=1), (0.1, 0.5), rtol=0.03)
     assert abs(np.corrcoef(xi)[0, 1]) < 0.03
 
 
@@ -146,7 +164,9 @@ def test_noise_without_a_key_is_refused(gouta):
 
 def test_noise_without_a_key_is_refused_inside_jit_and_by_sensitivities(gouta):
     case = gouta("ngpc", {"sensor.noise": 0.1})
-    run = lambda Tp: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, "rms_error")
+    run = lambda Tp: jaxtank.evaluate(
+        jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, "rms_error"
+    )
     with pytest.raises(InputError, match=r"sensor\.noise"):
         jax.jit(run)(11.0)
     with pytest.raises(InputError, match=r"sensor\.noise"):
@@ -168,11 +188,15 @@ def test_pumps_that_make_no_sense_are_refused(gouta, values, words):
 
 
 def test_noise_makes_the_voltage_travel_as_the_notes_say(gouta):
-    """5 mV on each sensor: travel of pump 1 is about 19,400 V with NGPC and 11,100 V with backstepping (gouta2015 notes S8.1)."""
+    """5 mV on each sensor: travel of pump 1 is about 19,400 V with NGPC and 11,100 V with
+    backstepping (gouta2015 notes S8.1).
+    """
     noise = [0.005 * a for a in (9.4458, 8.7106, 8.5106, 9.3458)]
     for name, travel in (("ngpc", 19_400), ("backstepping", 11_100)):
         case = gouta(name, {"sensor.noise": noise})
-        values = jaxtank.evaluate(case.loop, case.clock, ["input_travel", "rms_error_total"], key=jax.random.key(1))
+        values = jaxtank.evaluate(
+            case.loop, case.clock, ["input_travel", "rms_error_total"], key=jax.random.key(1)
+        )
         np.testing.assert_allclose(values["input_travel"][0], travel, rtol=0.03)
 
 
@@ -187,7 +211,9 @@ def pumps(**more):
         "pulse": number([3.3, 3.3]),
         "initial": number([2, 4]),
     }
-    return PumpBank(**{**plain, **{k: number(v) if isinstance(v, list) else v for k, v in more.items()}})
+    return PumpBank(
+        **{**plain, **{k: number(v) if isinstance(v, list) else v for k, v in more.items()}}
+    )
 
 
 def drive(bank, commands, dt=0.1):
@@ -203,11 +229,16 @@ def test_saturation_alone():
 
 
 def test_dead_zone():
-    np.testing.assert_array_equal(drive(pumps(dead_zone=[3, 3]), [(3.0, 3.01), (0, 12)]), [[0, 3.01], [0, 12]])
+    np.testing.assert_array_equal(
+        drive(pumps(dead_zone=[3, 3]), [(3.0, 3.01), (0, 12)]), [[0, 3.01], [0, 12]]
+    )
 
 
 def test_hysteresis():
-    got = drive(pumps(dead_zone=[3, 3], dead_zone_kind="hysteresis"), [(2, 2), (1.4, 2), (2, 2), (3.1, 1.4), (1.6, 2.9)])
+    got = drive(
+        pumps(dead_zone=[3, 3], dead_zone_kind="hysteresis"),
+        [(2, 2), (1.4, 2), (2, 2), (3.1, 1.4), (1.6, 2.9)],
+    )
     np.testing.assert_array_equal(got, [[2, 2], [0, 2], [0, 2], [3.1, 0], [1.6, 0]])
 
 
@@ -227,18 +258,30 @@ def test_lag_is_exact_over_a_sample():
 
 @pytest.mark.parametrize("dt", [0.2, 1.0, 4.0])
 def test_a_lag_delivers_its_volume_whatever_the_sampling_period(dt):
-    """Pumps of 0.8 s whose command changes every 4 s: the volume is that of lag v' = u - v by scipy, sampled fast or slowly."""
+    """Pumps of 0.8 s whose command changes every 4 s: the volume is that of lag v' = u - v by
+    scipy, sampled fast or slowly.
+    """
     lag, commands = 0.8, (5.0, 1.0, 8.0)
-    got = drive(pumps(lag=[lag, lag]), [(u, u) for u in commands for _ in range(round(4.0 / dt))], dt=dt)
+    got = drive(
+        pumps(lag=[lag, lag]), [(u, u) for u in commands for _ in range(round(4.0 / dt))], dt=dt
+    )
     v, volume = 2.0, 0.0
     for u in commands:
-        run = solve_ivp(lambda t, y, u=u: [(u - y[0]) / lag, y[0]], (0.0, 4.0), [v, volume], rtol=1e-11, atol=1e-12)
+        run = solve_ivp(
+            lambda t, y, u=u: [(u - y[0]) / lag, y[0]],
+            (0.0, 4.0),
+            [v, volume],
+            rtol=1e-11,
+            atol=1e-12,
+        )
         v, volume = run.y[:, -1]
     assert got[:, 0].sum() * dt == pytest.approx(volume, rel=1e-9)
 
 
 def test_the_slope_by_a_lag_that_follows_at_once():
-    """From 2 V to 6 V: the mean over a sample of 0.1 s is short by 4 V lag / 0.1 s, of a lag of 0 s too."""
+    """From 2 V to 6 V: the mean over a sample of 0.1 s is short by 4 V lag / 0.1 s, of a lag of 0 s
+    too.
+    """
     start = pumps(lag=[1.0, 1.0]).init(Clock(dt=0.1, duration=1.0))
     at = lambda lag: pumps(lag=jnp.stack([lag, lag])).deliver(start, (6.0, 6.0), 0.1)[0][0]
     assert float(at(0.0)) == 6.0 and float(at(1e-3)) == pytest.approx(6.0 - 0.04, rel=1e-12)
@@ -255,7 +298,17 @@ def test_delay_is_whole_samples_and_starts_from_the_initial_voltage():
 
 
 def fake_run(error, dt=1.0):
-    return ms.Run(tanks=1, outputs=1, pumps=1, samples=len(error), dt=dt, low=(0.0,), high=(12.0,), rim=(10.0,), zero=jnp.zeros(()))
+    return ms.Run(
+        tanks=1,
+        outputs=1,
+        pumps=1,
+        samples=len(error),
+        dt=dt,
+        low=(0.0,),
+        high=(12.0,),
+        rim=(10.0,),
+        zero=jnp.zeros(()),
+    )
 
 
 def folded(names, levels, target, step, since, u=None, command=None, r=None):
@@ -280,7 +333,14 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
             u=(jnp.float64(uk),),
             spilled=(0.0,),
         )
-        window = ((jnp.float64(target[k]), jnp.float64(step[k]), jnp.float64(since[k]), jnp.float64(0.05 * abs(step[k]))),)
+        window = (
+            (
+                jnp.float64(target[k]),
+                jnp.float64(step[k]),
+                jnp.float64(since[k]),
+                jnp.float64(0.05 * abs(step[k])),
+            ),
+        )
         states = ms.update(run, states, sample, window)
     return {m: np.asarray(v) for m, v in ms.read(run, states, names).items()}
 
@@ -288,11 +348,16 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
 def test_overshoot_rise_and_settling_of_a_hand_made_step():
     levels = [0, 0, 2, 5, 8, 11, 10.6, 9.3, 10.2, 10]
     got = folded(
-        ("overshoot_percent", "rise_time", "settling_time"), levels, [0] * 2 + [10] * 8, [0] * 2 + [10] * 8, [0, 0, *range(8)]
+        ("overshoot_percent", "rise_time", "settling_time"),
+        levels,
+        [0] * 2 + [10] * 8,
+        [0] * 2 + [10] * 8,
+        [0, 0, *range(8)],
     )
     np.testing.assert_allclose(got["overshoot_percent"], 10.0)
     np.testing.assert_allclose(got["rise_time"], 3.0)  # from t = 2 (past 10 %) to t = 5 (past 90 %)
-    np.testing.assert_allclose(got["settling_time"], 5.0)  # 9.3 at t = 7, five seconds after the change, is the last outside
+    # 9.3 at t = 7, five seconds after the change, is the last outside
+    np.testing.assert_allclose(got["settling_time"], 5.0)
 
 
 def test_what_never_settles_is_not_given_a_time():
@@ -306,13 +371,25 @@ def test_what_never_settles_is_not_given_a_time():
 
 
 def test_a_downward_step_has_its_overshoot_below():
-    got = folded(("overshoot_percent",), [10, 10, 4, 1, 2], [10, 10, 2, 2, 2], [0, 0, -8, -8, -8], [0, 0, 0, 1, 2])
+    got = folded(
+        ("overshoot_percent",),
+        [10, 10, 4, 1, 2],
+        [10, 10, 2, 2, 2],
+        [0, 0, -8, -8, -8],
+        [0, 0, 0, 1, 2],
+    )
     np.testing.assert_allclose(got["overshoot_percent"], 12.5)
 
 
 def test_saturation_is_of_the_command_and_its_excess_is_bounded():
     got = folded(
-        ("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4, u=[0, 5, 12, 12], command=[-12, 5, 12, 24]
+        ("saturated_fraction", "saturation_excess"),
+        [1] * 4,
+        [1] * 4,
+        [0] * 4,
+        [0] * 4,
+        u=[0, 5, 12, 12],
+        command=[-12, 5, 12, 24],
     )
     np.testing.assert_allclose(got["saturated_fraction"], 0.5)
     np.testing.assert_allclose(got["saturation_excess"], 0.25)  # (1/2 + 0 + 0 + 1/2) / 4
@@ -340,5 +417,7 @@ def test_an_unknown_measure_is_answered_with_the_nearest(gouta):
 
 def test_estimation_rms_is_the_noise_where_levels_are_taken_as_measured(gouta):
     case = gouta("backstepping", {"sensor.noise": [0.1, 0.2, 0.0, 0.05], "clock.duration": 100.0})
-    got = jaxtank.evaluate(case.loop, case.clock, "estimation_rms", key=jax.random.key(0))["estimation_rms"]
+    got = jaxtank.evaluate(case.loop, case.clock, "estimation_rms", key=jax.random.key(0))[
+        "estimation_rms"
+    ]
     np.testing.assert_allclose(got, (0.1, 0.2, 0.0, 0.05), rtol=0.04)

@@ -24,7 +24,9 @@ QUIET = settings(deadline=None, max_examples=8, derandomize=True)
 
 
 def one_tank(area=20.0, drain=0.2, rim=30.0, **more):
-    return network(area=[area], drain=[drain], pump_gain=[5.0], feeds=((0, None),), rim=[rim], **more)
+    return network(
+        area=[area], drain=[drain], pump_gain=[5.0], feeds=((0, None),), rim=[rim], **more
+    )
 
 
 def held(plant, x, u, dt, steps, integrator="rk4"):
@@ -48,13 +50,17 @@ def test_root_meets_its_docstring():
     assert root(jnp.float64(-0.5)) < 0.0  # draws a level back to zero
 
 
-@pytest.mark.parametrize("h, slope", [(-1.0, 15.0), (0.0, 15.0), (ROOT_KNEE / 2, 10.0), (ROOT_KNEE, 5.0), (4.0, 0.25)])
+@pytest.mark.parametrize(
+    "h, slope", [(-1.0, 15.0), (0.0, 15.0), (ROOT_KNEE / 2, 10.0), (ROOT_KNEE, 5.0), (4.0, 0.25)]
+)
 def test_root_has_the_right_slope_everywhere(h, slope):
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(derivative(root)(h), slope, rtol=1e-12)
 
 
-@pytest.mark.parametrize("h, slope", [(-1.0, 0.0), (0.0, 0.0), (0.0099, 0.0), (0.01, 5.0), (4.0, 0.25)])
+@pytest.mark.parametrize(
+    "h, slope", [(-1.0, 0.0), (0.0, 0.0), (0.0099, 0.0), (0.01, 5.0), (4.0, 0.25)]
+)
 def test_floored_root_has_the_right_slope_everywhere(h, slope):
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(derivative(floored_root)(h, 0.01), slope, rtol=1e-12)
@@ -63,7 +69,9 @@ def test_floored_root_has_the_right_slope_everywhere(h, slope):
 def test_second_derivatives_of_the_roots_are_finite_below_zero():
     for f in (root, lambda h: floored_root(h, 0.01)):
         for h in (-1.0, -1e-9, 0.0, 0.005, 0.01, 1.0):
-            assert np.isfinite(jax.jacfwd(jax.grad(f))(h)) and np.isfinite(jax.grad(jax.jacfwd(f))(h))
+            assert np.isfinite(jax.jacfwd(jax.grad(f))(h)) and np.isfinite(
+                jax.grad(jax.jacfwd(f))(h)
+            )
 
 
 def test_a_draining_tank_follows_its_closed_form():
@@ -71,7 +79,9 @@ def test_a_draining_tank_follows_its_closed_form():
     plant = one_tank()
     c = float(plant.drain[0]) * np.sqrt(2 * 981.0) / 20.0
     for t in (1.0, 5.0, 10.0):
-        np.testing.assert_allclose(held(plant, (16.0,), (0.0,), 0.01, round(100 * t))[0], (4 - c * t / 2) ** 2, rtol=1e-11)
+        np.testing.assert_allclose(
+            held(plant, (16.0,), (0.0,), 0.01, round(100 * t))[0], (4 - c * t / 2) ** 2, rtol=1e-11
+        )
 
 
 def test_a_tank_runs_dry_and_stays():
@@ -84,7 +94,14 @@ def test_a_tank_runs_dry_and_stays():
 @pytest.mark.parametrize("integrator, order", [("rk4", 4), ("midpoint", 2)])
 def test_order_of_convergence(integrator, order):
     plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
-    exact = solve_ivp(lambda t, x: plant.derivative(t, x, u, None), (0, 8), x, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    exact = solve_ivp(
+        lambda t, x: plant.derivative(t, x, u, None),
+        (0, 8),
+        x,
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+    ).y[:, -1]
     steps = np.array([4, 8, 16])
     errors = [np.abs(held(plant, x, u, 8 / n, n, integrator) - exact).max() for n in steps]
     slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
@@ -93,16 +110,27 @@ def test_order_of_convergence(integrator, order):
 
 def test_a_run_agrees_with_lsoda():
     plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
-    exact = solve_ivp(lambda t, x: plant.derivative(t, x, u, None), (0, 30), x, method="LSODA", rtol=1e-12, atol=1e-12).y[:, -1]
+    exact = solve_ivp(
+        lambda t, x: plant.derivative(t, x, u, None),
+        (0, 30),
+        x,
+        method="LSODA",
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[:, -1]
     np.testing.assert_allclose(held(plant, x, u, 0.01, 3000), exact, atol=1e-9)
 
 
 @pytest.mark.parametrize("ramp, lowest, moved", [(60.0, 0.2, 1e-12), (30.0, 0.003, 3e-3)])
 def test_smooth_root_moves_the_benchmark_by_less_than_its_promise(gouta, ramp, lowest, moved):
-    """Against a knee a thousand times smaller: nothing above the knee, 3e-3 cm where tank 3 comes down to 0.004 cm."""
+    """Against a knee a thousand times smaller: nothing above the knee, 3e-3 cm where tank 3 comes
+    down to 0.004 cm.
+    """
     case = gouta("ngpc", {"reference.ramp": ramp})
     plant = dataclasses.replace(case.loop.plant, knee=1e-5)
-    sharp = jaxtank.simulate(dataclasses.replace(case.loop, plant=plant), case.clock, save_every=100)
+    sharp = jaxtank.simulate(
+        dataclasses.replace(case.loop, plant=plant), case.clock, save_every=100
+    )
     smooth = jaxtank.simulate(case.loop, case.clock, save_every=100)
     assert lowest < np.asarray(smooth.x).min() < 2 * lowest
     difference = np.abs(np.asarray(sharp.x) - np.asarray(smooth.x)).max()
@@ -144,7 +172,9 @@ def test_equilibria_exist_between_the_ratios_of_the_notes():
 
 
 def caught_below(seed, inflow):
-    """A stiff network of 2 to 5 tanks with `bottom`, and a basin: everything that leaves a tank arrives in another one."""
+    """A stiff network of 2 to 5 tanks with `bottom`, and a basin: everything that leaves a tank
+    arrives in another one.
+    """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 6))
     links = tuple((i, j) for i in range(n) for j in range(n) if i != j and rng.random() < 0.3)
@@ -162,7 +192,9 @@ def caught_below(seed, inflow):
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 @pytest.mark.parametrize("seed", range(6))
 def test_volume_is_kept_in_steps_in_which_tanks_run_empty(seed, integrator):
-    """What is stored is what was there, has been pumped and drawn, and could not be drawn; to rounding, rings and pipes included."""
+    """What is stored is what was there, has been pumped and drawn, and could not be drawn; to
+    rounding, rings and pipes included.
+    """
     plant, x, d = caught_below(seed, -1.0)
     area, pumped, missing = np.asarray(plant.area), 0.0, 0.0
     before, moved = area @ x, area @ x
@@ -193,19 +225,26 @@ def test_without_a_negative_inflow_no_step_takes_a_level_below_zero(seed):
 def test_the_lower_clip_changes_no_bit_of_tanks_that_are_not_empty():
     plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
     for integrator in ("rk4", "midpoint"):
-        free, limited = (held(p, x, u, 0.5, 40, integrator) for p in (plant, dataclasses.replace(plant, bottom=True)))
+        free, limited = (
+            held(p, x, u, 0.5, 40, integrator)
+            for p in (plant, dataclasses.replace(plant, bottom=True))
+        )
         np.testing.assert_array_equal(free, limited)
 
 
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 def test_halved_steps_converge_for_a_tank_that_runs_empty(integrator):
-    """Of second order through the emptying, with a negative inflow after it: the level of the tank below."""
+    """Of second order through the emptying, with a negative inflow after it: the level of the tank
+    below.
+    """
     plant = network(
         area=[3.0, 4.0], drain=[0.0, 0.02], links=((0, 1),), orifice=[0.3], pump_gain=1.0, feeds=((0, None),), rim=10.0,
         gravity=0.5, bottom=True,
     )  # fmt: skip
 
-    step = jax.jit(lambda x, h: plant.spill(integrate(plant, integrator, 0.0, x, (0.0,), (-0.05, 0.0), h))[0])
+    step = jax.jit(
+        lambda x, h: plant.spill(integrate(plant, integrator, 0.0, x, (0.0,), (-0.05, 0.0), h))[0]
+    )
 
     def below(steps):
         x = (5.0, 3.0)
@@ -242,7 +281,9 @@ def random_network(seed):
 @QUIET
 @given(st.integers(0, 10_000), st.booleans())
 def test_mass_balance_with_the_liquid_lost_at_the_rim(seed, overflow):
-    """Stored volume = inflow - outflow - spilled, to round-off, by carrying the net inflow through the same Runge-Kutta step."""
+    """Stored volume = inflow - outflow - spilled, to round-off, by carrying the net inflow through
+    the same Runge-Kutta step.
+    """
     plant, rng = random_network(seed)
     plant = dataclasses.replace(plant, overflow=overflow)
     x, u = tuple(rng.uniform(0, 20, plant.tanks)), tuple(rng.uniform(0, 12, plant.pumps))
@@ -257,11 +298,19 @@ def test_mass_balance_with_the_liquid_lost_at_the_rim(seed, overflow):
         x3 = tuple(a + h / 2 * b for a, b in zip(x, k2))
         k3 = plant.derivative(0, x3, u, d)
         x4 = tuple(a + h * b for a, b in zip(x, k3))
-        net += h / 6 * sum(w * float(plant.net_inflow(p, u, d)) for w, p in ((1, x), (2, x2), (2, x3), (1, x4)))
+        net += (
+            h
+            / 6
+            * sum(
+                w * float(plant.net_inflow(p, u, d)) for w, p in ((1, x), (2, x2), (2, x3), (1, x4))
+            )
+        )
         x, spilled = plant.spill(integrate(plant, "rk4", 0.0, x, u, d, h))
         lost += float(sum(spilled))
     stored = float(np.dot(plant.area, np.array(x)))
-    np.testing.assert_allclose(stored - before, net - lost, atol=1e-10 * max(1.0, before, stored, abs(net)))
+    np.testing.assert_allclose(
+        stored - before, net - lost, atol=1e-10 * max(1.0, before, stored, abs(net))
+    )
     assert (lost > 0) <= overflow
     if overflow:
         assert np.all(np.array(x) <= 20.0)
@@ -275,7 +324,10 @@ def test_levels_never_pass_below_zero_and_more_voltage_never_lowers_one(seed):
     more = u + rng.uniform(0, 6, plant.pumps)
     low, high = x, x
     for _ in range(30):
-        low, high = (integrate(plant, "rk4", 0.0, a, tuple(v), None, 0.05) for a, v in ((low, u), (high, more)))
+        low, high = (
+            integrate(plant, "rk4", 0.0, a, tuple(v), None, 0.05)
+            for a, v in ((low, u), (high, more))
+        )
         assert np.all(np.array(low) > -1e-6)
         assert np.all(np.array(high) >= np.array(low) - 1e-12)
 
@@ -289,8 +341,21 @@ def test_swapped_channels_give_swapped_answers():
 
 def in_metres(cm):
     """The same rig with lengths in m and flows in m^3/s."""
-    powers = {"area": 2, "drain": 2, "orifice": 2, "pipe": 2, "pump_gain": 3, "gravity": 1, "rim": 1, "knee": 1}
-    return dataclasses.replace(cm, **{name: getattr(cm, name) * 1e-2**power for name, power in powers.items()}, units=("m", "V"))
+    powers = {
+        "area": 2,
+        "drain": 2,
+        "orifice": 2,
+        "pipe": 2,
+        "pump_gain": 3,
+        "gravity": 1,
+        "rim": 1,
+        "knee": 1,
+    }
+    return dataclasses.replace(
+        cm,
+        **{name: getattr(cm, name) * 1e-2**power for name, power in powers.items()},
+        units=("m", "V"),
+    )
 
 
 def test_units_rescale():
@@ -298,7 +363,9 @@ def test_units_rescale():
     cm = state_coupled_four_tank(FAST_AREA)
     m = in_metres(cm)
     x, u = np.array([8.0, 5.0, 12.0, 20.0]), (3.0, 6.0)
-    np.testing.assert_allclose(held(m, tuple(x / 100), u, 0.1, 100) * 100, held(cm, tuple(x), u, 0.1, 100), rtol=1e-11)
+    np.testing.assert_allclose(
+        held(m, tuple(x / 100), u, 0.1, 100) * 100, held(cm, tuple(x), u, 0.1, 100), rtol=1e-11
+    )
 
 
 def test_rims_as_physics_stop_the_level_and_count_the_loss(gouta):
@@ -321,20 +388,31 @@ def test_rims_as_physics_stop_the_level_and_count_the_loss(gouta):
     ],
 )
 def test_a_network_that_does_not_fit_together_is_refused(change, words):
-    plain = {"area": [10.0, 10.0], "drain": 0.1, "pump_gain": 5.0, "feeds": ((0, None), (1, None)), "rim": 20.0}
+    plain = {
+        "area": [10.0, 10.0],
+        "drain": 0.1,
+        "pump_gain": 5.0,
+        "feeds": ((0, None), (1, None)),
+        "rim": 20.0,
+    }
     with pytest.raises(InputError, match=words):
         network(**{**plain, **change})
 
 
 def test_a_quadruple_tank_splits_its_pumps():
-    """Johansson's topology: pump 1 to tanks 1 and 4, pump 2 to tanks 2 and 3; its equilibrium is a fixed point."""
+    """Johansson's topology: pump 1 to tanks 1 and 4, pump 2 to tanks 2 and 3; its equilibrium is a
+    fixed point.
+    """
     plant = network(
         area=[28, 32, 28, 32], drain=[0.071, 0.057, 0, 0], links=((2, 0), (3, 1)), orifice=[0.071, 0.057], pump_gain=[3.33, 3.35],
         split=[0.7, 0.6], feeds=((0, 3), (1, 2)), rim=20.0, outputs=(0, 1),
     )  # fmt: skip
     x, u = equilibrium(plant, (12.4, 12.7))
-    np.testing.assert_allclose(x, (12.4, 12.7, 1.8, 1.4), atol=0.35)  # the published operating point, to its rounding
-    np.testing.assert_allclose(plant.derivative(0.0, tuple(x), tuple(u), None), np.zeros(4), atol=1e-12)
+    # the published operating point, to its rounding
+    np.testing.assert_allclose(x, (12.4, 12.7, 1.8, 1.4), atol=0.35)
+    np.testing.assert_allclose(
+        plant.derivative(0.0, tuple(x), tuple(u), None), np.zeros(4), atol=1e-12
+    )
 
 
 def test_the_clock_does_not_drift():
@@ -346,9 +424,19 @@ def test_the_clock_does_not_drift():
 
 
 def test_a_knee_too_small_for_its_powers_is_refused():
-    """At the least that is taken, value and slope of a root at an empty tank are numbers, in the shorter floats too."""
+    """At the least that is taken, value and slope of a root at an empty tank are numbers, in the
+    shorter floats too.
+    """
     with pytest.raises(InputError, match=r"plant\.knee = 1e-300 m: must be at least 1e-15 m"):
-        network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("m", "V"), knee=1e-300)
+        network(
+            area=1.0,
+            drain=1.0,
+            pump_gain=1.0,
+            feeds=[(0, None)],
+            rim=1.0,
+            units=("m", "V"),
+            knee=1e-300,
+        )
     least = network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, knee=1e-15).knee
     for level in (0.0, 1e-16, 1e-15, 1.0):
         for kind in (np.float32, np.float64):

@@ -1,4 +1,6 @@
-"""What the pages show is run: Python as written, commands by the same parser or in full; links and folder maps hold."""
+"""What the pages show is run: Python as written, commands by the same parser or in full; links and
+folder maps hold.
+"""
 
 import re
 import shlex
@@ -26,12 +28,18 @@ PAGES = {
         "tests/benchmarks/README.md",
     )
 }
-pytestmark = pytest.mark.skipif(not all(PAGES.values()), reason="the pages are not beside the tests")
+pytestmark = pytest.mark.skipif(
+    not all(PAGES.values()), reason="the pages are not beside the tests"
+)
 
 
 def blocks(language, *pages):
     """The code blocks of the pages, of all pages where none is named."""
-    return [b for p in pages or PAGES for b in re.findall(rf"```{language}\n(.*?)```", PAGES[p], re.DOTALL)]
+    return [
+        b
+        for p in pages or PAGES
+        for b in re.findall(rf"```{language}\n(.*?)```", PAGES[p], re.DOTALL)
+    ]
 
 
 def words(line):
@@ -52,7 +60,10 @@ COMMANDS = list(
 def anchors(page):
     """The anchors of a page's headings, as GitHub makes them."""
     text = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
-    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in re.findall(r"^#+ (.*)$", text, re.M)}
+    return {
+        re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-")
+        for h in re.findall(r"^#+ (.*)$", text, re.M)
+    }
 
 
 def test_the_front_page_is_at_most_10_kb():
@@ -97,7 +108,9 @@ def test_the_python_example_runs_and_is_short(capsys):
 
 
 def own_controller():
-    """The front page's example of a controller of one's own; there are no other examples in Python than its two."""
+    """The front page's example of a controller of one's own; there are no other examples in Python
+    than its two.
+    """
     _, example = blocks("python", "README.md")
     assert len(blocks("python")) == 2
     return compile(example, "README", "exec")

@@ -23,7 +23,11 @@ def test_a_change_is_found():
     assert recorded_runs.differences("cascaded/pi", found | {"bits": ""}, found, exact=True) != []
 
 
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in presets.names()])
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in presets.names()]
+)
 def test_a_case_runs_as_recorded(name):
     exact = RECORD["machine"] == recorded_runs.machine()
-    assert recorded_runs.differences(name, recorded_runs.run(name), RECORD["cases"][name], exact) == []
+    assert (
+        recorded_runs.differences(name, recorded_runs.run(name), RECORD["cases"][name], exact) == []
+    )

@@ -21,11 +21,20 @@ def made(count):
     """(t, u, y) of `count` samples of a rise."""
     t = np.arange(float(count))
     rise = 1 - np.exp(-t / 20)[:, None]
-    return t, np.tile([3.0, 2.8], (count, 1)), np.array([2.0, 2.0, 1.0, 1.0]) + rise * np.array([5.0, 6.0, 2.0, 3.0])
+    return (
+        t,
+        np.tile([3.0, 2.8], (count, 1)),
+        np.array([2.0, 2.0, 1.0, 1.0]) + rise * np.array([5.0, 6.0, 2.0, 3.0]),
+    )
 
 
 def text(t, u, y, header=HEADER):
-    return "\n".join([header, *(",".join(f"{v:.10g}" for v in row) for row in np.column_stack([t, u, y]))]) + "\n"
+    return (
+        "\n".join(
+            [header, *(",".join(f"{v:.10g}" for v in row) for row in np.column_stack([t, u, y]))]
+        )
+        + "\n"
+    )
 
 
 def late(count=30):
@@ -44,7 +53,17 @@ def refused(tmp_path, capsys, monkeypatch):
         if content is not None:
             (tmp_path / name).write_text(content)
         code = main.main(
-            ["identify", "mirakhorli/sfc", "--data", name, "--free", "plant.pump_gain=0.5:10", "--starts", "1", *options]
+            [
+                "identify",
+                "mirakhorli/sfc",
+                "--data",
+                name,
+                "--free",
+                "plant.pump_gain=0.5:10",
+                "--starts",
+                "1",
+                *options,
+            ]
         )
         said = capsys.readouterr()
         (line,) = said.err.splitlines()
@@ -74,15 +93,22 @@ def test_a_step_too_long_to_be_simulated(refused, case):
 
 
 def test_a_step_that_is_long_and_can_be_simulated_is_taken(case):
-    """Three minutes without a sample, among the samples held back: as many steps as it needs are taken over it."""
+    """Three minutes without a sample, among the samples held back: as many steps as it needs are
+    taken over it.
+    """
     t, u, y = made(40)
     t[-1] += 180.0
-    found = tuning.identify(case, tuning.log(t=t, u=u, y=y), {"plant.pump_gain": (5.0, 60.0)}, starts=1, gap=1e3)
+    found = tuning.identify(
+        case, tuning.log(t=t, u=u, y=y), {"plant.pump_gain": (5.0, 60.0)}, starts=1, gap=1e3
+    )
     assert np.all(np.isfinite(found.quality["rmse"])) and found.estimation.substeps > 2
 
 
 def test_a_header_of_thousands_of_digits_is_no_tank(refused):
-    header = HEADER.replace("h1 [cm],h2 [cm],h3 [cm],h4", ",".join(f"h{'9' * 4500}{i} [cm]" for i in range(3)) + ",h" + "9" * 4500)
+    header = HEADER.replace(
+        "h1 [cm],h2 [cm],h3 [cm],h4",
+        ",".join(f"h{'9' * 4500}{i} [cm]" for i in range(3)) + ",h" + "9" * 4500,
+    )
     assert "no column for a level among" in refused(text(*made(30), header))
 
 

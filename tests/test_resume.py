@@ -43,7 +43,10 @@ def told(result):
 @pytest.fixture(scope="module")
 def whole(gouta, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    return tuning.tune(gouta("backstepping", FAST), log=folder, **OPTIONS), (folder / NAME).read_bytes()
+    return (
+        tuning.tune(gouta("backstepping", FAST), log=folder, **OPTIONS),
+        (folder / NAME).read_bytes(),
+    )
 
 
 def test_with_and_without_a_log_alike(gouta, whole):
@@ -63,7 +66,9 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
 def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes(whole[1])
     monkeypatch.setattr(Log, "keep", lambda *_: pytest.fail("something was evaluated"))
-    assert told(tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)) == told(whole[0])
+    assert told(
+        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+    ) == told(whole[0])
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
@@ -71,7 +76,12 @@ def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, seed=1, **OPTIONS)
     with pytest.raises(InputError, match="what differs: case"):
-        tuning.tune(gouta("backstepping", {**FAST, "controller.k": 0.031}), log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(
+            gouta("backstepping", {**FAST, "controller.k": 0.031}),
+            log=tmp_path,
+            resume=True,
+            **OPTIONS,
+        )
     assert (tmp_path / NAME).read_bytes() == whole[1]
     with pytest.raises(InputError, match="cannot be read"):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path / "none", resume=True, **OPTIONS)
@@ -92,7 +102,9 @@ def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
 
 
-@pytest.mark.parametrize("change", ["a bit of a number", "another key", "a line of another log", "no digest"])
+@pytest.mark.parametrize(
+    "change", ["a bit of a number", "another key", "a line of another log", "no digest"]
+)
 def test_a_line_that_was_changed_is_refused(tmp_path, change):
     """Every one of them is JSON that could be an entry; the file is left as it is."""
     log = Log(tmp_path, {"p": 1})
@@ -115,7 +127,10 @@ def test_a_line_that_was_changed_is_refused(tmp_path, change):
         lines[2] = json.dumps({k: entry[k] for k in ("kind", "key", "result")}).encode() + b"\n"
     data = b"".join(lines)
     (tmp_path / NAME).write_bytes(data)
-    with pytest.raises(InputError, match=r"^--resume: line 3 of evaluations\.jsonl is not one of its entries, or was changed"):
+    with pytest.raises(
+        InputError,
+        match=r"^--resume: line 3 of evaluations\.jsonl is not one of its entries, or was changed",
+    ):
         Log(tmp_path, {"p": 1}, resume=True)
     assert (tmp_path / NAME).read_bytes() == data
     (tmp_path / NAME).write_bytes(b"".join(lines[:2] + lines[3:]))  # as the message says
@@ -123,10 +138,17 @@ def test_a_line_that_was_changed_is_refused(tmp_path, change):
 
 
 def test_numbers_go_through_a_log_without_loss(tmp_path):
-    result = (np.nan, np.array([[0.1, -np.inf], [5e-324, -0.0]]), ({"a": np.array([1 / 3])},), np.zeros((0, 2)))
+    result = (
+        np.nan,
+        np.array([[0.1, -np.inf], [5e-324, -0.0]]),
+        ({"a": np.array([1 / 3])},),
+        np.zeros((0, 2)),
+    )
     log = Log(tmp_path, {"p": 1})
     first = log.recall("x", [np.arange(2.0)], lambda: result)
-    again = Log(tmp_path, {"p": 1}, resume=True).recall("x", [np.arange(2.0)], lambda: pytest.fail("run again"))
+    again = Log(tmp_path, {"p": 1}, resume=True).recall(
+        "x", [np.arange(2.0)], lambda: pytest.fail("run again")
+    )
     for a, b in ((first, result), (again, result)):
         assert np.isnan(a[0]) and a[3].shape == (0, 2)
         np.testing.assert_array_equal(a[1], b[1])
@@ -135,7 +157,12 @@ def test_numbers_go_through_a_log_without_loss(tmp_path):
 
 def test_what_is_asked_decides(tmp_path):
     memo, calls = Memo(), []
-    for asked in ([np.zeros(2), False], [np.zeros(2), True], [np.zeros((1, 2)), False], [np.zeros(2), False]):
+    for asked in (
+        [np.zeros(2), False],
+        [np.zeros(2), True],
+        [np.zeros((1, 2)), False],
+        [np.zeros(2), False],
+    ):
         memo.recall("screen", asked, lambda: calls.append(1) or (0.0,))
     assert len(calls) == 3
 
@@ -144,10 +171,22 @@ def test_what_is_asked_decides(tmp_path):
 @pytest.mark.parametrize("wait", [8.0, 11.0, 15.0])
 def test_the_command_killed_and_resumed(tmp_path, wait):
     """SIGKILL at some moment of the search; the result is that of a run left alone."""
-    command = [sys.executable, "-m", "tuning.cli.main", "tune", "gouta2015/backstepping", "--quiet", "--json", "--starts", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "tuning.cli.main",
+        "tune",
+        "gouta2015/backstepping",
+        "--quiet",
+        "--json",
+        "--starts",
+        "2",
+    ]
     command += ["--screening", "8", "--validation", "8", "--set", "clock.dt=0.1"]
     alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    process = subprocess.Popen([*command, "--out", str(tmp_path / "run")], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "run")], stdout=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + wait
     while time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.05)
@@ -156,17 +195,24 @@ def test_the_command_killed_and_resumed(tmp_path, wait):
         process.wait()
         if not (tmp_path / "run" / NAME).exists():
             pytest.skip("killed before the search began")
-        done = subprocess.run([*command, "--resume", str(tmp_path / "run")], capture_output=True, check=True)
+        done = subprocess.run(
+            [*command, "--resume", str(tmp_path / "run")], capture_output=True, check=True
+        )
         page = json.loads(done.stdout)
         assert {k: page[k] for k in SAME} == {k: alone[k] for k in SAME}
-    assert json.loads((tmp_path / "run" / "result.json").read_text())["parameters"] == alone["parameters"]
+    assert (
+        json.loads((tmp_path / "run" / "result.json").read_text())["parameters"]
+        == alone["parameters"]
+    )
     assert not (tmp_path / "run" / NAME).exists()
 
 
 @pytest.mark.parametrize("command", ["tune", "uncertainty"])
 def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
-    """All that it left is its lock: there is nothing to lose, and a script that runs or else resumes need not know. A folder that is not
-    there, or has anything else in it, is refused as before."""
+    """All that it left is its lock: there is nothing to lose, and a script that runs or else
+    resumes need not know. A folder that is not there, or has anything else in it, is refused as
+    before.
+    """
     (tmp_path / files.LOCK).write_text("123456\n")
     assert files.untouched(tmp_path)
     (tmp_path / "note.txt").write_text("mine")
@@ -180,4 +226,8 @@ def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
 
 def began(command, folder):
     """Open the log, or the store of batches, of a run that goes on in `folder`."""
-    memo.Log(folder, {}, resume=True) if command == "tune" else batch_store.Store(folder, {}, resume=True)
+    (
+        memo.Log(folder, {}, resume=True)
+        if command == "tune"
+        else batch_store.Store(folder, {}, resume=True)
+    )

@@ -1,4 +1,6 @@
-"""Rig files: what is written is read back whole, and what cannot be used is told in one line that names the file and the thing."""
+"""Rig files: what is written is read back whole, and what cannot be used is told in one line that
+names the file and the thing.
+"""
 
 import dataclasses
 import re
@@ -22,7 +24,8 @@ HEAD = 'case = "gouta2015/backstepping"\n'
 
 def assert_same(a, b):
     assert (a.name, a.clock) == (b.name, b.clock)
-    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)  # components, static fields, absent leaves
+    # components, static fields, absent leaves
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)
     assert parameters(a.loop).keys() == parameters(b.loop).keys()
     for name, value in parameters(a.loop).items():
         other = parameters(b.loop)[name]
@@ -50,12 +53,26 @@ def test_every_case_is_read_back_as_it_was_written(name, tmp_path):
     "values",
     [
         {"actuator.dead_zone": 3.0, "actuator.dead_zone_kind": "hysteresis"},
-        {"actuator.dead_zone[1]": 2.5, "actuator.dead_zone_kind": "pulse", "actuator.lag": [0.5, 1 / 3]},
+        {
+            "actuator.dead_zone[1]": 2.5,
+            "actuator.dead_zone_kind": "pulse",
+            "actuator.lag": [0.5, 1 / 3],
+        },
         {"plant.overflow": True, "plant.rim": [30.0, 31.0, 32.0, 33.0]},
         {"reference.ramp": 0.0},
         {"reference.ramp": 12.5, "reference.shape": "quintic", "reference.targets[0]": 7.0},
-        {"clock.dt": 0.1, "clock.duration": 500, "clock.substeps": 3, "clock.integrator": "midpoint"},
-        {"actuator.saturation": "boxqp", "actuator.delay": 0.5, "sensor.noise": 0.02, "sensor.bits": 12},
+        {
+            "clock.dt": 0.1,
+            "clock.duration": 500,
+            "clock.substeps": 3,
+            "clock.integrator": "midpoint",
+        },
+        {
+            "actuator.saturation": "boxqp",
+            "actuator.delay": 0.5,
+            "sensor.noise": 0.02,
+            "sensor.bits": 12,
+        },
         {"controller.k1": 1 / 3, "plant.area[2]": 1e5, "plant.pump_gain": 1e22, "plant.knee": 0.02},
     ],
     ids=lambda values: next(iter(values)),
@@ -66,8 +83,13 @@ def test_overrides_are_read_back(gouta, values, tmp_path):
 
 
 def test_a_clock_finer_than_its_preset_allows_is_read_back(gouta, tmp_path):
-    # each of the two is out of range beside the preset's other one: only together do they describe a run
-    for clock in (Clock(dt=1e-5, duration=1.0), Clock(dt=20.0, duration=10_000.0), Clock(dt=0.001, duration=0.005)):
+    # each of the two is out of range beside the preset's other one: only together do they describe
+    # a run
+    for clock in (
+        Clock(dt=1e-5, duration=1.0),
+        Clock(dt=20.0, duration=10_000.0),
+        Clock(dt=0.001, duration=0.005),
+    ):
         case = gouta("ngpc").replace(clock=clock)
         assert round_trip(case, tmp_path).clock == clock
 
@@ -77,9 +99,19 @@ def test_another_reference_limits_free_and_objective_are_read_back(gouta, tmp_pa
     start, changes = (4.0, 5.0), [(30.0, 1, 6.0), (10.0, 0, 5.0), (30.0, 0, 7.0)]
     case = case.replace(
         name="mine",
-        loop=dataclasses.replace(case.loop, reference=ramps(start, changes, ramp=25.0, shape="quintic")),
-        limits={"max_level": [20.0, 21.0, 22.0, 23.0], "min_level": 0.5, "overshoot_percent": np.array([5.0, 6.0])},
-        free={"controller.k": Free(0.001, 2.0), "plant.area[1]": Free(10.0, 30.0, "linear"), "x0": (0, 10, "linear")},
+        loop=dataclasses.replace(
+            case.loop, reference=ramps(start, changes, ramp=25.0, shape="quintic")
+        ),
+        limits={
+            "max_level": [20.0, 21.0, 22.0, 23.0],
+            "min_level": 0.5,
+            "overshoot_percent": np.array([5.0, 6.0]),
+        },
+        free={
+            "controller.k": Free(0.001, 2.0),
+            "plant.area[1]": Free(10.0, 30.0, "linear"),
+            "x0": (0, 10, "linear"),
+        },
         objective={"iae": 1, "input_travel": 0.25},
     )
     again = round_trip(case, tmp_path)
@@ -93,7 +125,9 @@ def test_a_name_of_any_text_is_read_back(gouta, name, tmp_path):
     assert round_trip(gouta("ngpc").replace(name=name), tmp_path).name == name
 
 
-@pytest.mark.parametrize("name", ["of\tmine", "two\nlines", "\x1b[2J", "\x7f", "an unprintable \U000e0001 tag"])
+@pytest.mark.parametrize(
+    "name", ["of\tmine", "two\nlines", "\x1b[2J", "\x7f", "an unprintable \U000e0001 tag"]
+)
 def test_a_name_that_a_terminal_would_obey_is_refused(gouta, name):
     for said in (f"name = {toml(name)}", f"[[scenario]]\nname = {toml(name)}"):
         with pytest.raises(InputError, match="printable") as caught:
@@ -105,8 +139,11 @@ def test_a_name_that_a_terminal_would_obey_is_refused(gouta, name):
 
 def test_a_case_that_no_file_can_describe_is_not_written(gouta):
     case = gouta("ngpc")
-    case = case.replace(loop=dataclasses.replace(case.loop, reference=Constant(level=np.array([3.0, 3.0]))))
-    with pytest.raises(InputError, match="cannot be written"):  # no preset has such a reference, and [reference] makes ramps
+    case = case.replace(
+        loop=dataclasses.replace(case.loop, reference=Constant(level=np.array([3.0, 3.0])))
+    )
+    # no preset has such a reference, and [reference] makes ramps
+    with pytest.raises(InputError, match="cannot be written"):
         rig.dump(case)
 
 
@@ -132,26 +169,41 @@ def test_a_file_that_names_a_case_alone_is_that_case(tmp_path):
 
 
 def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
-    text = HEAD + 'name = "mine"\n[values]\n"plant.area[1]" = 20\n"reference.ramp" = 30\n[reference]\nchanges = [[50, 2, 4.5]]\n'
+    text = (
+        HEAD + 'name = "mine"\n[values]\n"plant.area[1]" = 20\n"reference.ramp" ='
+        " 30\n[reference]\nchanges = [[50, 2, 4.5]]\n"
+    )
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
     case, old = rig.load(tmp_path / "rig.toml"), presets.find("gouta2015/backstepping")
     assert case.name == "mine"
     assert case.loop.reference.changes == ((50.0, 1),) and case.loop.reference.ramp == 30.0
     np.testing.assert_array_equal(case.loop.reference.targets, [4.5])
-    changed = {n for n, v in parameters(case.loop).items() if not np.array_equal(v, parameters(old.loop)[n])}
-    assert changed == {"plant.area", "controller.model.area", "reference.targets"}  # the model is the plant's
+    changed = {
+        n
+        for n, v in parameters(case.loop).items()
+        if not np.array_equal(v, parameters(old.loop)[n])
+    }
+    # the model is the plant's
+    assert changed == {"plant.area", "controller.model.area", "reference.targets"}
     assert (case.clock, case.limits, case.free) == (old.clock, old.limits, old.free)
 
 
-@pytest.mark.parametrize("name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"])
+@pytest.mark.parametrize(
+    "name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"]
+)
 def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
     """Controller and observer; entries too. A file written of a case with a wrong model has it."""
     case = presets.find(name)
     gain, drain = 1.3 * case.loop.plant.pump_gain, 1.01 * case.loop.plant.drain[-1]
     last = case.loop.plant.tanks - 1
-    text = f'case = "{name}"\n[values]\n"plant.pump_gain" = {gain.tolist()}\n"plant.drain[{last}]" = {drain}\n'
+    text = (
+        f'case = "{name}"\n[values]\n"plant.pump_gain" = {gain.tolist()}\n"plant.drain[{last}]" ='
+        f" {drain}\n"
+    )
     loop = rig.loads(text).loop
-    models = [m for m in (loop.controller.model, getattr(loop.observer, "model", None)) if m is not None]
+    models = [
+        m for m in (loop.controller.model, getattr(loop.observer, "model", None)) if m is not None
+    ]
     for model in models:
         assert np.array_equal(model.pump_gain, gain) and model.drain[-1] == drain
         np.testing.assert_array_equal(model.drain, loop.plant.drain)
@@ -181,7 +233,10 @@ Ti = 50.0
 "plant.drain" = 0.3
 """
     case = rig.loads(text)
-    assert case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3 and rig.doubts(case) == []
+    assert (
+        case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3
+        and rig.doubts(case) == []
+    )
     wrong = rig.set_values(case, {"controller.model.drain": 0.2})
     assert_same(rig.loads(rig.dump(wrong)), wrong)
     assert rig.doubts(wrong) == []  # PID reads its model for the feed-forward alone
@@ -189,7 +244,12 @@ Ti = 50.0
 
 
 def test_values_relative_to_the_case_are_written_as_they_are():
-    changes = {"plant.pump_gain[0]": "x1.3", "x0": "steady", "sensor.noise": "0.05 if zero", "plant.drain[0]": "by -0.01"}
+    changes = {
+        "plant.pump_gain[0]": "x1.3",
+        "x0": "steady",
+        "sensor.noise": "0.05 if zero",
+        "plant.drain[0]": "by -0.01",
+    }
     case = presets.find("mirakhorli/sfc")
     case = case.replace(scenarios=(case.scenarios[1]._replace(values=changes),))
     assert rig.loads(rig.dump(case)).scenarios == case.scenarios
@@ -234,7 +294,8 @@ BAD = {  # text of a file: words its message must have
     HEAD + "[valeus]": ["valeus", "nearest: values"],
     HEAD + "values = 3": ["values = 3", "table"],
     values('"controller.kk" = 1'): ["controller.kk", "nearest: controller.k"],
-    values("controller.kk = 1"): ["controller.kk", "nearest: controller.k"],  # without its quotation marks TOML reads a table
+    # without its quotation marks TOML reads a table
+    values("controller.kk = 1"): ["controller.kk", "nearest: controller.k"],
     values('controller.k = 1\n"controller.k" = 2'): ["[values] controller.k is given twice"],
     values('"plant.area[9]" = 1'): ["plant.area[9]", "(4,)"],
     values('"plant.area[x]" = 1'): ["plant.area[x]"],
@@ -261,7 +322,10 @@ BAD = {  # text of a file: words its message must have
     values('"plant.overflow" = 1'): ["plant.overflow = 1", "true"],
     values('"plant.knee" = 0'): ["plant.knee = 0 cm", "at least 1e-15 cm"],
     values('"plant.knee" = 1e-300'): ["plant.knee = 1e-300 cm", "at least 1e-15 cm"],
-    values('"controller.model.knee" = 1e-300'): ["controller.model.knee = 1e-300 cm", "at least 1e-15 cm"],
+    values('"controller.model.knee" = 1e-300'): [
+        "controller.model.knee = 1e-300 cm",
+        "at least 1e-15 cm",
+    ],
     values('"sensor.bits" = 2.5'): ["sensor.bits = 2.5", "whole"],
     values('"sensor.bits" = nan'): ["sensor.bits = nan"],
     values('"sensor.bits" = inf'): ["sensor.bits = inf"],
@@ -295,7 +359,10 @@ BAD = {  # text of a file: words its message must have
     reference("changes = [[nan, 1, 5.0]]"): ["nan"],
     reference("changes = [[inf, 1, 5.0]]"): ["inf"],
     reference(f"changes = [[20.0, 1, {BIG}]]"): ["reference"],
-    reference("changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]"): ["[20.0, 2, 5.0] after [30.0, 1, 5.0]", "order of time"],
+    reference("changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]"): [
+        "[20.0, 2, 5.0] after [30.0, 1, 5.0]",
+        "order of time",
+    ],
     reference("changes = [[30.0, 1, 5.0], [30.0, 1, 6.0]]"): ["two changes of output 1 at 30 s"],
     reference("ramp = -1"): ["reference.ramp = -1 s"],
     reference("ramp = nan"): ["reference.ramp = nan"],
@@ -352,11 +419,14 @@ def test_a_bad_file_is_told_in_one_line_that_names_it(text, words, tmp_path):
 
 def test_a_reference_without_a_steady_state_names_outputs_and_tank(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(reference("initial = [3.0, 3.0]\nchanges = [[20.0, 1, 16.0]]"), encoding="utf-8")
+    path.write_text(
+        reference("initial = [3.0, 3.0]\nchanges = [[20.0, 1, 16.0]]"), encoding="utf-8"
+    )
     with pytest.raises(EquilibriumError) as caught:
         rig.load(path)
     message = str(caught.value)
-    # tank 3 feeds both lower tanks: what keeps tank 1 at 16 cm is already too much for tank 2 at 3 cm, so tank 4 would have to take
+    # tank 3 feeds both lower tanks: what keeps tank 1 at 16 cm is already too much for tank 2 at 3
+    # cm, so tank 4 would have to take
     assert all(word in message for word in (repr(str(path)), "reference", "(16, 3) cm", "tank 4"))
     assert len(message.splitlines()) == 1
 
@@ -364,7 +434,9 @@ def test_a_reference_without_a_steady_state_names_outputs_and_tank(tmp_path):
 def test_a_change_that_has_an_equilibrium_only_with_its_pair_is_read_if_both_come_at_once(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(reference("changes = [[20.0, 1, 16.0], [20.0, 2, 16.0]]"), encoding="utf-8")
-    np.testing.assert_array_equal(rig.load(path).loop.reference.plateaus(), [[3.0, 3.0], [16.0, 16.0]])
+    np.testing.assert_array_equal(
+        rig.load(path).loop.reference.plateaus(), [[3.0, 3.0], [16.0, 16.0]]
+    )
 
 
 def unreadable(path, prepare):
@@ -380,14 +452,18 @@ def test_what_is_no_text_file_is_told(tmp_path):
     assert "does not exist" in unreadable(tmp_path / "missing.toml", lambda p: None)
     assert "does not exist" in unreadable(tmp_path / "nul\0.toml", lambda p: None)
     assert "not a file" in unreadable(tmp_path / "folder.toml", lambda p: p.mkdir())
-    assert "UTF-8" in unreadable(tmp_path / "binary.toml", lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff"))
+    assert "UTF-8" in unreadable(
+        tmp_path / "binary.toml", lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff")
+    )
 
 
 def test_a_file_of_4_mib_is_read_and_a_longer_one_is_not(tmp_path):
     path = tmp_path / "long.toml"
     path.write_text(HEAD + "#" * (LARGEST_TEXT - len(HEAD)), encoding="utf-8")
     assert rig.load(path).name == "gouta2015/backstepping"
-    message = unreadable(path, lambda p: p.write_text(HEAD + "#" * (LARGEST_TEXT + 1 - len(HEAD)), encoding="utf-8"))
+    message = unreadable(
+        path, lambda p: p.write_text(HEAD + "#" * (LARGEST_TEXT + 1 - len(HEAD)), encoding="utf-8")
+    )
     assert str(LARGEST_TEXT) in message and str(4 * 2**20 + 1) in message
 
 
@@ -422,11 +498,20 @@ def test_scenarios_and_what_is_uncertain_go_through_a_file(tmp_path):
         ('scenario = "x"', "scenario = 'x': must be a list of tables"),
         ("scenario = [3]", "scenario 1 = 3: must be a table"),
         ("[[scenario]]\nvalue = 3", "unknown key of [[scenario]] 'value'; nearest: values"),
-        ('[[scenario]]\nvalues = { "plant.drian" = 1.0 }', "unknown parameter 'plant.drian'; nearest: plant.drain"),
-        ('[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }', "scenario 'a': sensor.noise[0] = -1 cm"),
+        (
+            '[[scenario]]\nvalues = { "plant.drian" = 1.0 }',
+            "unknown parameter 'plant.drian'; nearest: plant.drain",
+        ),
+        (
+            '[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }',
+            "scenario 'a': sensor.noise[0] = -1 cm",
+        ),
         ("[[scenario]]\nseed = 1.5", "seed = 1.5 must be a whole number"),
         ("[[scenario]]\nweight = 0.0", "weight = 0.0 must be a finite number above 0"),
-        ('[uncertain]\n"plant.drain" = 2.0', "uncertain plant.drain = 2.0: must be a share between 0 and 1"),
+        (
+            '[uncertain]\n"plant.drain" = 2.0',
+            "uncertain plant.drain = 2.0: must be a share between 0 and 1",
+        ),
         ('[uncertain]\n"plant.drian" = 0.1', "unknown parameter 'plant.drian'"),
     ],
 )
@@ -455,7 +540,9 @@ LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
     ],
 )
 def test_a_large_whole_number_is_the_float_next_to_it(line, big):
-    whole, real = (rig.loads(HEAD + line.replace("BIG", text)) for text in (str(big), repr(float(big))))
+    whole, real = (
+        rig.loads(HEAD + line.replace("BIG", text)) for text in (str(big), repr(float(big)))
+    )
     assert_same(whole, real)
     assert [s.weight for s in whole.scenarios] == [s.weight for s in real.scenarios]
 
@@ -472,14 +559,25 @@ def test_a_large_setpoint_is_told_as_the_float_next_to_it():
 
 
 def test_names_without_quotation_marks_are_dotted_names(gouta):
-    text = HEAD + "[values]\nclock.dt = 0.5\n[values.controller]\nk = 0.5\n[values.plant]\n'area[1]' = 20.0\n"
-    text += "[free]\ncontroller.k = [0.1, 9.0]\n[uncertain.plant]\ndrain = 0.1\n[[scenario]]\nvalues.sensor.noise = 0.1\n"
+    text = (
+        HEAD + "[values]\nclock.dt = 0.5\n[values.controller]\nk = 0.5\n[values.plant]\n'area[1]' ="
+        " 20.0\n"
+    )
+    text += (
+        "[free]\ncontroller.k = [0.1, 9.0]\n[uncertain.plant]\ndrain ="
+        " 0.1\n[[scenario]]\nvalues.sensor.noise = 0.1\n"
+    )
     case = rig.loads(text)
     assert_same(
         case.replace(free={}),
         gouta(
             "backstepping",
-            {"clock.dt": 0.5, "controller.k": 0.5, "plant.area[1]": 20.0, "controller.model.area[1]": 20.0},
+            {
+                "clock.dt": 0.5,
+                "controller.k": 0.5,
+                "plant.area[1]": 20.0,
+                "controller.model.area[1]": 20.0,
+            },
         ).replace(free={}),
     )
     assert set(case.free) == {"controller.k"} and case.uncertain == {"plant.drain": 0.1}
@@ -487,11 +585,7 @@ def test_names_without_quotation_marks_are_dotted_names(gouta):
 
 
 @pytest.mark.parametrize(
-    "lines, words",
-    [
-        ('"clock.duration" = 1e308', "samples"),
-        ('"clock.dt" = 5e-324', "samples"),
-    ],
+    "lines, words", [('"clock.duration" = 1e308', "samples"), ('"clock.dt" = 5e-324', "samples")]
 )
 def test_a_run_longer_than_any_whole_number_is_refused(lines, words):
     with pytest.raises(InputError, match=words):
@@ -504,4 +598,7 @@ def test_a_byte_order_mark_is_read_over():
 
 def test_more_tanks_than_a_loop_can_hold_are_refused_at_once():
     with pytest.raises(InputError, match="at most 100"):
-        rig.loads("[[tank]]\narea = 1.0\nrim = 1.0\n" * 101 + "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1.0\n")
+        rig.loads(
+            "[[tank]]\narea = 1.0\nrim = 1.0\n" * 101
+            + "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1.0\n"
+        )

@@ -1,4 +1,6 @@
-"""What the page of a tuning over several plants or scenarios says: whose numbers they are, and what was measured apart from what was expected."""
+"""What the page of a tuning over several plants or scenarios says: whose numbers they are, and what
+was measured apart from what was expected.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ RESTS = "; the other rows: the case's own run, on its own plant"
 
 @pytest.fixture(scope="module")
 def case():
-    return rig.set_values(presets.load("cascaded").cases["pi"], {"clock.dt": 4.0, "clock.duration": 400.0})
+    return rig.set_values(
+        presets.load("cascaded").cases["pi"], {"clock.dt": 4.0, "clock.duration": 400.0}
+    )
 
 
 def row(page, name):
@@ -35,11 +39,22 @@ def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case)
 
 
 @pytest.mark.parametrize(
-    ("weights", "words"), [((1.0, 1.0), "the mean of 2 scenarios"), ((1.0, 3.0), "the weighted mean of 2 scenarios")]
+    ("weights", "words"),
+    [((1.0, 1.0), "the mean of 2 scenarios"), ((1.0, 3.0), "the weighted mean of 2 scenarios")],
 )
 def test_scenarios_are_told_as_such(case, weights, words):
-    scenarios = tuple(Scenario(f"s{i}", {"controller.Kc": 1.0 + i}, weight=w) for i, w in enumerate(weights))
-    page = repr(tuning.tune(case, free={"controller.Ti": (20.0, 2000.0, "log")}, scenarios=scenarios, validation=0, **SEARCH))
+    scenarios = tuple(
+        Scenario(f"s{i}", {"controller.Kc": 1.0 + i}, weight=w) for i, w in enumerate(weights)
+    )
+    page = repr(
+        tuning.tune(
+            case,
+            free={"controller.Ti": (20.0, 2000.0, "log")},
+            scenarios=scenarios,
+            validation=0,
+            **SEARCH,
+        )
+    )
     assert f"objective: {words}{RESTS}" in page
 
 
@@ -48,13 +63,19 @@ def test_a_single_run_needs_no_such_line(case):
 
 
 def test_what_was_expected_is_not_said_of_what_was_measured():
-    """One plant of 16 at a limit: 1/17 is expected before a fresh one is run, 2 of 256 is what was found."""
+    """One plant of 16 at a limit: 1/17 is expected before a fresh one is run, 2 of 256 is what was
+    found.
+    """
     known = Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028])
     measured, bound, expected = _words(known, "worst", 0.0).split("; ")
-    assert measured == "on 256 fresh plants a limit was broken 2 times (95 % interval 0.00095 to 0.028)"
+    assert (
+        measured
+        == "on 256 fresh plants a limit was broken 2 times (95 % interval 0.00095 to 0.028)"
+    )
     assert "bounds the probability by 0.8 (N 16, support 1, confidence 1 - 1e-6)" in bound
     assert expected.startswith(
-        "1 of 16 plants holds the answer in place: before any fresh one was run up to about 5.9 % of them were"
+        "1 of 16 plants holds the answer in place: before any fresh one was run up to about 5.9 %"
+        " of them were"
     )
     assert "leaves" not in expected and "--back-off 0.03" in expected
 

@@ -1,4 +1,6 @@
-"""Words of the commands that are true of some rigs only: of those without limits, without spread, with one tank."""
+"""Words of the commands that are true of some rigs only: of those without limits, without spread,
+with one tank.
+"""
 
 from pathlib import Path
 
@@ -12,7 +14,10 @@ ONE_TANK = str(Path(__file__).parent / "rigs" / "watertank.toml")
 QUICK = {"starts": 1, "screening": 1, "iterations": 1, "validation": 2}
 
 
-@pytest.mark.parametrize("words", [["uncertainty", "--samples", "2"], ["sensitivity"], ["uncertainty", "--spread", "0.1"]])
+@pytest.mark.parametrize(
+    "words",
+    [["uncertainty", "--samples", "2"], ["sensitivity"], ["uncertainty", "--spread", "0.1"]],
+)
 def test_a_rig_with_nothing_uncertain_is_told_how_to_vary(words, capsys):
     assert main.main([words[0], ONE_TANK, *words[1:]]) == 2
     told = capsys.readouterr().err
@@ -31,7 +36,11 @@ def test_without_limits_nothing_is_said_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
     page = repr(tuning.tune(case, limits={}, **QUICK))
     assert "held-out runs" in page
-    assert "all limits held" not in page and "rims are limits" not in page and "nothing holds it" in page
+    assert (
+        "all limits held" not in page
+        and "rims are limits" not in page
+        and "nothing holds it" in page
+    )
     assert "all limits held" in repr(tuning.tune(case, **QUICK))
     assert "rims are limits" in repr(tuning.tune(case, limits={"max_level": "rim"}, **QUICK))
 

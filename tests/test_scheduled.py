@@ -1,4 +1,6 @@
-"""Gain schedules: the numbers they give, the run they leave alone, their derivatives, and what cannot be scheduled."""
+"""Gain schedules: the numbers they give, the run they leave alone, their derivatives, and what
+cannot be scheduled.
+"""
 
 import contextlib
 import dataclasses
@@ -25,7 +27,8 @@ from jaxtank.rig.schedule import schedule
 from jaxtank.xla.reachability import use_of
 from tuning.cli import main
 
-# 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within rounding of the others, where the slope would
+# 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within
+# rounding of the others, where the slope would
 # be that of one side and a difference that of both (at one sample of 24,001: 6e-4 of that slope).
 KNOTS = (4.317, 8.0, 11.137, 15.071)
 BOTH = {"controller.k": "r1", "controller.k1": "r1"}
@@ -35,7 +38,11 @@ MEASURES = ("rms_error_total", "max_level")
 
 def on(case, gains, variable, knots=KNOTS, values=None):
     case = schedule(case, {f"controller.{g}": variable for g in gains}, knots)
-    return case if values is None else case.replace(loop=with_values(case.loop, {"controller.values": values}))
+    return (
+        case
+        if values is None
+        else case.replace(loop=with_values(case.loop, {"controller.values": values}))
+    )
 
 
 # interpolation
@@ -46,7 +53,9 @@ def test_it_interpolates_as_numpy_does():
     knots, values = np.cumsum(rng.uniform(0.1, 5.0, 7)), rng.normal(size=(3, 7))
     at = np.concatenate([knots, rng.uniform(-3.0, knots[-1] + 3.0, 200)])
     got = np.stack(jax.vmap(lambda s: jnp.stack(interpolate(s, knots, values)))(at))
-    np.testing.assert_allclose(got, np.stack([np.interp(at, knots, row) for row in values], axis=1), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(
+        got, np.stack([np.interp(at, knots, row) for row in values], axis=1), rtol=1e-13, atol=1e-13
+    )
 
 
 def test_equal_values_give_exactly_that_value():
@@ -59,13 +68,18 @@ def test_slopes_are_central_differences_also_on_a_knot():
     for at in (1.0, 4.9, 8.0, 9.7, 15.071, 20.0, 4.317):
         x, step = np.array([at, *KNOTS, *VALUES.ravel()]), 1e-6 * np.eye(13)
         differences = [(f(x + h) - f(x - h)) / 2e-6 for h in step]
-        # on a knot: half the difference of the second derivatives of both sides (below 0.1) times the step; elsewhere round-off, 1e-10
-        np.testing.assert_allclose(jax.grad(f)(x), differences, rtol=0, atol=1e-7 if at in KNOTS else 1e-9)
+        # on a knot: half the difference of the second derivatives of both sides (below 0.1) times
+        # the step; elsewhere round-off, 1e-10
+        np.testing.assert_allclose(
+            jax.grad(f)(x), differences, rtol=0, atol=1e-7 if at in KNOTS else 1e-9
+        )
 
 
 def test_portion_has_half_slopes_at_its_ends():
     slopes = [jax.grad(portion, argnums=(0, 1, 2))(x, 1.0, 3.0) for x in (0.0, 1.0, 2.0, 3.0, 4.0)]
-    np.testing.assert_array_equal(slopes, [(0, 0, 0), (0.5, -0.5, 0), (1, -1, 0), (0.5, -1, 0.5), (0, -1, 1)])
+    np.testing.assert_array_equal(
+        slopes, [(0, 0, 0), (0.5, -0.5, 0), (1, -1, 0), (0.5, -1, 0.5), (0, -1, 1)]
+    )
 
 
 # the run
@@ -82,24 +96,42 @@ def test_portion_has_half_slopes_at_its_ends():
         pytest.param("gouta2022/pid", ("Kc", "Ti", "Td"), "h1", (5.0, 9.0), marks=pytest.mark.slow),
         pytest.param("gouta2022/fopi", ("Kc[1]",), "r2", (5.0, 9.0), marks=pytest.mark.slow),
         pytest.param("mirakhorli/sfc", ("K",), "r1", (11.0, 13.0), marks=pytest.mark.slow),
-        pytest.param("mirakhorli/hybrid", ("K[0,1]", "b", "ks"), "h3", (1.0, 3.0), marks=pytest.mark.slow),
-        pytest.param("calofir/backstepping", ("K_phi", "K_y"), "h2", (0.05, 0.1), marks=pytest.mark.slow),
+        pytest.param(
+            "mirakhorli/hybrid", ("K[0,1]", "b", "ks"), "h3", (1.0, 3.0), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "calofir/backstepping", ("K_phi", "K_y"), "h2", (0.05, 0.1), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_with_equal_values_it_is_the_plain_law(name, gains, variable, knots):
-    """Knots within the range of the run. 1e-11: the laws amplify a last digit of a product that is formed in another order."""
+    """Knots within the range of the run. 1e-11: the laws amplify a last digit of a product that is
+    formed in another order.
+    """
     case = presets.find(name)
-    case = case.replace(clock=dataclasses.replace(case.clock, duration=min(case.clock.duration, 150.0)))
-    plain, other = (jaxtank.simulate(c.loop, c.clock, save_every=10) for c in (case, on(case, gains, variable, knots)))
+    case = case.replace(
+        clock=dataclasses.replace(case.clock, duration=min(case.clock.duration, 150.0))
+    )
+    plain, other = (
+        jaxtank.simulate(c.loop, c.clock, save_every=10)
+        for c in (case, on(case, gains, variable, knots))
+    )
     for field in ("x", "command", "u"):
-        np.testing.assert_allclose(getattr(other, field), getattr(plain, field), rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(
+            getattr(other, field), getattr(plain, field), rtol=1e-11, atol=1e-11
+        )
 
 
 @pytest.mark.parametrize("variable", ["r1", "h2"])
 def test_at_every_sample_the_law_has_the_gains_of_that_sample(gouta, variable):
-    case = on(gouta("backstepping", {"clock.duration": 150.0}), ("k", "k1"), variable, values=VALUES)
+    case = on(
+        gouta("backstepping", {"clock.duration": 150.0}), ("k", "k1"), variable, values=VALUES
+    )
     run = jaxtank.simulate(case.loop, case.clock, save_every=500)
-    law, at = gouta("backstepping").loop.controller, {"r1": np.asarray(run.r)[:, 0], "h2": np.asarray(run.x)[:, 1]}[variable]
+    law, at = (
+        gouta("backstepping").loop.controller,
+        {"r1": np.asarray(run.r)[:, 0], "h2": np.asarray(run.x)[:, 1]}[variable],
+    )
     assert at.min() < KNOTS[0] and at.max() > 7.0
     for row in range(len(run.t)):
         k, k1 = (np.interp(at[row], KNOTS, v) for v in VALUES)
@@ -121,7 +153,9 @@ def test_the_anti_windup_has_them_too():
         Kc = np.array([np.interp(x[k, 0], knots, row) for row in gains])
         e = r[k] - x[k]
         commands.append(law.bias + Kc * e + integral)
-        integral = integral + case.clock.dt * Kc / law.Ti * (e + law.Ti / (law.Tt * Kc) * (applied[k] - commands[-1]))
+        integral = integral + case.clock.dt * Kc / law.Ti * (
+            e + law.Ti / (law.Tt * Kc) * (applied[k] - commands[-1])
+        )
     assert x[:, 0].min() < 3.0 and x[:, 0].max() > 6.0 and np.ptp(commands) > 1.0
     np.testing.assert_allclose(run.command, commands, rtol=1e-9, atol=1e-9)
 
@@ -145,7 +179,9 @@ def test_so_is_that_of_ten_derivatives(gouta):
     case = on(gouta("backstepping"), ("k", "k1"), "r1", (3.0, 6.0, 9.0, 12.0, 16.0))
     names = tuple(case.free)
     point = tuple(np.float64(get_value(case.loop, n)) for n in names)
-    compiled = sensitivities_compiled.lower(case.loop, case.clock, MEASURES, names, point, None).compile()
+    compiled = sensitivities_compiled.lower(
+        case.loop, case.clock, MEASURES, names, point, None
+    ).compile()
     assert len(names) == 10 and 'xla_cpu_small_call="true"' in compiled.as_text()
 
 
@@ -161,7 +197,9 @@ def test_other_values_and_knots_do_not_recompile(gouta):
 def test_vmap_equals_a_python_loop(gouta):
     case = on(gouta("backstepping", {"clock.dt": 0.1}), ("k", "k1"), "h1")
     batch = VALUES * np.array([0.5, 1.0, 2.0])[:, None, None]
-    run = lambda v: jaxtank.evaluate(with_values(case.loop, {"controller.values": v}), case.clock, MEASURES)
+    run = lambda v: jaxtank.evaluate(
+        with_values(case.loop, {"controller.values": v}), case.clock, MEASURES
+    )
     together = jax.vmap(run)(batch)
     for i, values in enumerate(batch):
         for name, value in run(values).items():
@@ -173,14 +211,24 @@ def test_vmap_equals_a_python_loop(gouta):
 
 @pytest.mark.parametrize(("variable", "plateau"), [("r1", 8.0), ("h1", 8.353)])
 def test_slopes_of_a_run_for_every_knot(gouta, variable, plateau):
-    """Values and positions of the knots. The steps are relative and the best of three counts: on a knot a central difference is of first
-    order, and elsewhere every sample whose level passes the knot within the step bends the cost a little. A level, unlike a setpoint, comes to
-    rest beside 8 cm by less than any step, so that no difference tells the slope of its side: there the knot is elsewhere."""
-    case = on(gouta("backstepping", {"clock.dt": 0.1, "clock.duration": 560.0}), ("k", "k1"), variable, values=VALUES)
+    """Values and positions of the knots. The steps are relative and the best of three counts: on a
+    knot a central difference is of first order, and elsewhere every sample whose level passes the
+    knot within the step bends the cost a little. A level, unlike a setpoint, comes to rest beside 8
+    cm by less than any step, so that no difference tells the slope of its side: there the knot is
+    elsewhere.
+    """
+    case = on(
+        gouta("backstepping", {"clock.dt": 0.1, "clock.duration": 560.0}),
+        ("k", "k1"),
+        variable,
+        values=VALUES,
+    )
     point = jnp.concatenate([VALUES.ravel(), jnp.array([KNOTS[0], plateau, *KNOTS[2:]])])
 
     def cost(v, run=jaxtank.evaluate):
-        loop = with_values(case.loop, {"controller.values": v[:8].reshape(2, 4), "controller.knots": v[8:]})
+        loop = with_values(
+            case.loop, {"controller.values": v[:8].reshape(2, 4), "controller.knots": v[8:]}
+        )
         return run(loop, case.clock, MEASURES[:1])[MEASURES[0]]
 
     slopes = np.asarray(jax.jit(jax.jacfwd(cost))(point))
@@ -198,24 +246,35 @@ def test_slopes_of_a_run_for_every_knot(gouta, variable, plateau):
 
 
 def test_a_schedule_beats_the_best_constant_gain(gouta):
-    """k1 on the setpoint of tank 1, limits off: 0.0344 cm against 0.0459 cm, the least of any constant k1 (k as published)."""
+    """k1 on the setpoint of tank 1, limits off: 0.0344 cm against 0.0459 cm, the least of any
+    constant k1 (k as published).
+    """
     case = gouta("backstepping")
     total = lambda z: float(
-        jaxtank.evaluate(with_values(case.loop, {"controller.k1": np.exp(z)}), case.clock, MEASURES[:1])[MEASURES[0]]
+        jaxtank.evaluate(
+            with_values(case.loop, {"controller.k1": np.exp(z)}), case.clock, MEASURES[:1]
+        )[MEASURES[0]]
     )
     grid = np.linspace(np.log(1e-2), np.log(5.0), 25)
     best = grid[np.argmin([total(z) for z in grid])]
     constant = minimize_scalar(total, bounds=(best - 0.3, best + 0.3), method="bounded")
-    case = case.replace(loop=with_values(case.loop, {"controller.k1": np.exp(constant.x)}), free={"controller.k1": Free(1e-3, 5.0)})
+    case = case.replace(
+        loop=with_values(case.loop, {"controller.k1": np.exp(constant.x)}),
+        free={"controller.k1": Free(1e-3, 5.0)},
+    )
     case = on(case, ("k1",), "r1", (3.0, 6.0, 9.0, 12.0, 16.0))
     names, point = list(case.free), np.log([float(get_value(case.loop, n)) for n in case.free])
 
     def cost(z):
-        values, slopes, _, _ = jaxtank.sensitivities(case.loop, case.clock, MEASURES[:1], dict(zip(names, np.exp(z))))
+        values, slopes, _, _ = jaxtank.sensitivities(
+            case.loop, case.clock, MEASURES[:1], dict(zip(names, np.exp(z)))
+        )
         return float(values[MEASURES[0]]), np.ravel(slopes[MEASURES[0]]) * np.exp(z)
 
     limits = [(np.log(1e-3), np.log(5.0))] * len(names)
-    tuned = minimize(cost, point, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 15})
+    tuned = minimize(
+        cost, point, jac=True, method="L-BFGS-B", bounds=limits, options={"maxiter": 15}
+    )
     assert cost(point)[0] == pytest.approx(constant.fun, rel=1e-9)
     assert tuned.fun < 0.8 * constant.fun
 
@@ -227,7 +286,11 @@ def test_names_units_and_ranges_are_those_of_the_gains():
     case = on(presets.find("gouta2022/pi"), ("Kc[0]", "Ti"), "h1", (5.0, 9.0))
     loop = case.loop
     assert loop.controller.gains == ("Kc[0]", "Ti[0]", "Ti[1]")
-    assert [describe(loop, f"controller.values[{i},1]")["unit"] for i in range(3)] == ["V/cm", "s", "s"]
+    assert [describe(loop, f"controller.values[{i},1]")["unit"] for i in range(3)] == [
+        "V/cm",
+        "s",
+        "s",
+    ]
     assert describe(loop, "controller.values")["unit"] == "V/cm, s"
     assert "Kc[0]" in describe(loop, "controller.values[0,0]")["doc"]
     assert describe(loop, "controller.knots")["unit"] == "cm"
@@ -243,7 +306,11 @@ def test_names_units_and_ranges_are_those_of_the_gains():
 
 def test_what_is_free_follows(gouta):
     case = gouta("backstepping").replace(
-        free={"plant.area": Free(10.0, 30.0), "controller.k": Free(0.1, 2.0), "controller.k1": (1, 3)}
+        free={
+            "plant.area": Free(10.0, 30.0),
+            "controller.k": Free(0.1, 2.0),
+            "controller.k1": (1, 3),
+        }
     )
     found = schedule(case, {"controller.k1": "r1"}, (5.0, 10.0)).free
     assert found == {
@@ -253,8 +320,14 @@ def test_what_is_free_follows(gouta):
         "controller.values[0,1]": Free(1, 3),
     }
     pi = presets.find("gouta2022/pi")
-    found = on(pi.replace(free={"controller.Kc": Free(0.1, 9.0)}), ("Kc[1]",), "h1", (5.0, 9.0)).free
-    assert set(found) == {"controller.law.Kc[0]", "controller.values[0,0]", "controller.values[0,1]"}
+    found = on(
+        pi.replace(free={"controller.Kc": Free(0.1, 9.0)}), ("Kc[1]",), "h1", (5.0, 9.0)
+    ).free
+    assert set(found) == {
+        "controller.law.Kc[0]",
+        "controller.values[0,0]",
+        "controller.values[0,1]",
+    }
 
 
 def test_all_else_is_kept(gouta):
@@ -275,7 +348,11 @@ def test_all_else_is_kept(gouta):
     [
         ({"controller.kk": "r1"}, KNOTS, ["unknown gain 'controller.kk'", "nearest: controller.k"]),
         ({"plant.area[0]": "r1"}, KNOTS, ["unknown gain 'plant.area[0]'", "controller.model.area"]),
-        ({"controller.reference_rates": "r1"}, KNOTS, ["controller.reference_rates", "compiled program"]),
+        (
+            {"controller.reference_rates": "r1"},
+            KNOTS,
+            ["controller.reference_rates", "compiled program"],
+        ),
         ({"controller.k": "r3"}, KNOTS, ["'r3'", "r1 to r2", "h1 to h4"]),
         ({"controller.k": "h5"}, KNOTS, ["'h5'", "h1 to h4"]),
         ({"controller.k": "h0"}, KNOTS, ["'h0'"]),
@@ -286,7 +363,11 @@ def test_all_else_is_kept(gouta):
         ({"controller.k": "r1"}, (5.0, np.inf), ["finite"]),
         ({"controller.k[0]": "r1"}, KNOTS, ["k[0]", "shape ()"]),
         ({}, KNOTS, ["at least one gain"]),
-        ({"controller.model.area": "r1", "controller.model.area[2]": "r1"}, KNOTS, ["model.area[2] is scheduled twice"]),
+        (
+            {"controller.model.area": "r1", "controller.model.area[2]": "r1"},
+            KNOTS,
+            ["model.area[2] is scheduled twice"],
+        ),
     ],
 )
 def test_a_bad_schedule_is_told(gouta, gains, knots, words):
@@ -332,7 +413,12 @@ class Odd(Controller):
 @pytest.mark.parametrize(("gain", "words"), [("start", "in its init"), ("branch", "Python's if")])
 def test_a_law_of_ones_own_is_looked_at_too(gouta, gain, words):
     case = gouta("backstepping")
-    case = case.replace(loop=dataclasses.replace(case.loop, controller=Odd(start=np.float64(1.0), branch=np.float64(1.0))), free={})
+    case = case.replace(
+        loop=dataclasses.replace(
+            case.loop, controller=Odd(start=np.float64(1.0), branch=np.float64(1.0))
+        ),
+        free={},
+    )
     with pytest.raises(InputError, match=words):
         on(case, (gain,), "r1")
 
@@ -340,7 +426,13 @@ def test_a_law_of_ones_own_is_looked_at_too(gouta, gain, words):
 def test_where_nothing_is_checked_a_gain_used_before_the_loop_gives_nan():
     case = presets.find("mirakhorli/smc")
     law = case.loop.controller
-    law = Scheduled(law=law, knots=np.array([1.0, 2.0]), values=np.full((1, 2), 3.0), gains=("model.drain[0]",), variable="r1")
+    law = Scheduled(
+        law=law,
+        knots=np.array([1.0, 2.0]),
+        values=np.full((1, 2), 3.0),
+        gains=("model.drain[0]",),
+        variable="r1",
+    )
     loop = dataclasses.replace(case.loop, controller=law)
     with pytest.raises(InputError, match="in its prepare"):
         jaxtank.evaluate(loop, case.clock, MEASURES)
@@ -365,7 +457,11 @@ def test_a_scheduled_loop_is_checked_before_it_runs(gouta):
     with pytest.raises(InputError, match=r"controller.law.Kc\[0\] is scheduled"):
         rig.check_free(entry, "controller.law.Kc[0]", 1.0, 2.0)
     with pytest.raises(InputError, match="input_metric"):
-        rig.check(rig.set_values(on(presets.find("gouta2022/pi"), ("Kc",), "h1"), {"actuator.saturation": "boxqp"}))
+        rig.check(
+            rig.set_values(
+                on(presets.find("gouta2022/pi"), ("Kc",), "h1"), {"actuator.saturation": "boxqp"}
+            )
+        )
 
 
 def test_dependence_is_followed_into_calls_and_loops():
@@ -383,8 +479,14 @@ def test_dependence_is_followed_into_calls_and_loops():
 
 def assert_same(one, other):
     assert jax.tree.structure(one.loop) == jax.tree.structure(other.loop)
-    assert all(np.array_equal(v, parameters(other.loop)[n]) for n, v in parameters(one.loop).items())
-    assert (one.name, one.clock, {n: Free(*s) for n, s in one.free.items()}) == (other.name, other.clock, dict(other.free))
+    assert all(
+        np.array_equal(v, parameters(other.loop)[n]) for n, v in parameters(one.loop).items()
+    )
+    assert (one.name, one.clock, {n: Free(*s) for n, s in one.free.items()}) == (
+        other.name,
+        other.clock,
+        dict(other.free),
+    )
 
 
 @pytest.mark.parametrize(
@@ -411,7 +513,12 @@ TABLE = '[schedule]\ngains = ["controller.k1"]\nvariable = "r1"\nknots = [5.0, 1
 
 def test_a_rig_file_may_set_gains_before_and_values_after(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(HEAD + TABLE + '[values]\n"controller.k1" = 0.05\n"controller.values[0,1]" = 0.2\n"controller.law.k" = 0.04\n')
+    path.write_text(
+        HEAD
+        + TABLE
+        + '[values]\n"controller.k1" = 0.05\n"controller.values[0,1]" = 0.2\n"controller.law.k" ='
+        " 0.04\n"
+    )
     law = rig.load(path).loop.controller
     assert isinstance(law.law, Backstepping) and law.law.k1 is None
     np.testing.assert_array_equal(law.values, [[0.05, 0.2]])
@@ -434,7 +541,10 @@ def test_a_rig_file_may_set_gains_before_and_values_after(tmp_path):
         (TABLE + '[values]\n"controller.law.k1" = 1.0\n', ["controller.law.k1 is scheduled"]),
         (TABLE + '[values]\n"controller.variable" = "r9"\n', ["'r9'"]),
         (TABLE + '[values]\n"controller.variable" = 3\n', ["controller.variable = 3", "text"]),
-        (TABLE + '[free]\n"controller.values[0,1]" = [0.0, 1.0]\n', ["controller.values[0,1]", "above 0"]),
+        (
+            TABLE + '[free]\n"controller.values[0,1]" = [0.0, 1.0]\n',
+            ["controller.values[0,1]", "above 0"],
+        ),
     ],
 )
 def test_a_bad_schedule_in_a_file_is_told_in_one_line(text, words, tmp_path):
@@ -443,7 +553,9 @@ def test_a_bad_schedule_in_a_file_is_told_in_one_line(text, words, tmp_path):
     with pytest.raises(InputError) as caught:
         rig.load(path)
     message = str(caught.value)
-    assert all(word in message for word in [*words, repr(str(path))]) and "\n" not in message, message
+    assert all(word in message for word in [*words, repr(str(path))]) and "\n" not in message, (
+        message
+    )
 
 
 def say(*args):
@@ -459,10 +571,14 @@ def test_the_command_schedules():
     plain = rig.set_values(presets.find(case[0]), {"clock.duration": 60, "clock.dt": 0.1})
     total = jaxtank.evaluate(plain.loop, plain.clock, MEASURES)["rms_error_total"]
     search = ("--limit", "none", "--starts", "1", "--screening", "4", "--iterations", "6")
-    code, out, _ = say("tune", *case, *gains, "--set", "controller.values[1,0]=0.088", "--json", "--quiet", *search)
+    code, out, _ = say(
+        "tune", *case, *gains, "--set", "controller.values[1,0]=0.088", "--json", "--quiet", *search
+    )
     found = json.loads(out)
     assert code in (0, 3)
-    assert set(found["parameters"]) == {f"controller.values[{i},{j}]" for i in (0, 1) for j in (0, 1)}
+    assert set(found["parameters"]) == {
+        f"controller.values[{i},{j}]" for i in (0, 1) for j in (0, 1)
+    }
     assert found["measures"]["before"]["rms_error_total"] == pytest.approx(float(total), rel=1e-12)
     assert found["objective"]["after"] < 0.5 * found["objective"]["before"]
     assert "Scheduled(Backstepping)" in say("show", *case, *gains)[1]
@@ -475,4 +591,7 @@ def test_the_command_schedules():
     }.items():
         code, out, err = say("simulate", *case, "--schedule", wrong)
         assert code == 2 and not out and words in err and err.count("\n") == 1
-    assert "the same for all" in say("show", *case, *gains[:2], "--schedule", "controller.k1=r2:4,8")[2]
+    assert (
+        "the same for all"
+        in say("show", *case, *gains[:2], "--schedule", "controller.k1=r2:4,8")[2]
+    )

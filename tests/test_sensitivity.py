@@ -35,7 +35,9 @@ ISHIGAMI = {"num_vars": 3, "names": list("abc"), "bounds": [[0.0, 1.0]] * 3}
 def ishigami(p):
     """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 with x uniform in (-pi, pi); Ishigami and Homma 1990."""
     x = np.pi * (2.0 * np.asarray(p) - 1.0)
-    return np.sin(x[..., 0]) + 7.0 * np.sin(x[..., 1]) ** 2 + 0.1 * x[..., 2] ** 4 * np.sin(x[..., 0])
+    return (
+        np.sin(x[..., 0]) + 7.0 * np.sin(x[..., 1]) ** 2 + 0.1 * x[..., 2] ** 4 * np.sin(x[..., 0])
+    )
 
 
 def ishigami_shares(a=7.0, b=0.1):
@@ -48,7 +50,9 @@ def ishigami_shares(a=7.0, b=0.1):
 @pytest.fixture(scope="module")
 def case():
     """A short run of gouta2015 in which both setpoints move and the loop is never at rest."""
-    return rig.set_values(presets.load("gouta2015").cases["backstepping"], {"clock.duration": 100.0, "clock.dt": 0.5})
+    return rig.set_values(
+        presets.load("gouta2015").cases["backstepping"], {"clock.duration": 100.0, "clock.dt": 0.5}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +65,14 @@ def at_cube(case):
         values = draws.values(np.asarray(p))
         rows = [{n: v[i] for n, v in values.items()} for i in range(len(p))]
         return np.array(
-            [float(jaxtank.evaluate(with_values(case.loop, r), case.clock, "rms_error_total")["rms_error_total"]) for r in rows]
+            [
+                float(
+                    jaxtank.evaluate(with_values(case.loop, r), case.clock, "rms_error_total")[
+                        "rms_error_total"
+                    ]
+                )
+                for r in rows
+            ]
         )
 
     return f
@@ -75,8 +86,10 @@ def test_ishigami_in_closed_form():
     for name, exact in (("first", first), ("total", total)):
         low, high = found[f"{name}_interval95"].T
         assert ((low <= exact) & (exact <= high)).all()
-        np.testing.assert_allclose(found[name], exact, atol=0.01)  # a random sample of 8192 would have 2 sd of 0.02
-        assert (high - low).max() < 0.07  # 3.92 sd, one sd of a total share of 0.56 being 1.3 / sqrt(N)
+        # a random sample of 8192 would have 2 sd of 0.02
+        np.testing.assert_allclose(found[name], exact, atol=0.01)
+        # 3.92 sd, one sd of a total share of 0.56 being 1.3 / sqrt(N)
+        assert (high - low).max() < 0.07
     assert found["sd"] == pytest.approx(np.sqrt(13.8446), rel=0.01)
 
 
@@ -98,7 +111,9 @@ def test_intervals_cover_the_closed_form():
 
 
 def test_additive_linear_model():
-    """y = sum c p: shares c^2 / sum c^2, first and total alike; elementary effects c, without spread."""
+    """y = sum c p: shares c^2 / sum c^2, first and total alike; elementary effects c, without
+    spread.
+    """
     c = np.array([3.0, -2.0, 1.0, 0.0])
     found = indices.sobol_indices(indices.sobol_points(4, 4096, seed=1) @ c)
     np.testing.assert_allclose(found["first"], c**2 / 14, atol=0.005)
@@ -115,14 +130,20 @@ def test_morris_points():
     points = indices.morris_points(5, 200, seed=3)
     assert points.min() == 0.0 and points.max() == 1.0
     moved = np.abs(np.diff(points, axis=1))
-    assert (np.isclose(moved, 2 / 3).sum(axis=2) == 1).all() and np.isclose(moved.sum(axis=(1, 2)), 5 * 2 / 3).all()
+    assert (np.isclose(moved, 2 / 3).sum(axis=2) == 1).all() and np.isclose(
+        moved.sum(axis=(1, 2)), 5 * 2 / 3
+    ).all()
     levels = np.round(points[:, 0] * 3)
     np.testing.assert_allclose(points[:, 0] * 3, levels, atol=1e-12)
-    assert [int((levels == k).sum()) for k in range(4)] == pytest.approx([250] * 4, abs=55)  # 4 sd of a binomial
+    # 4 sd of a binomial
+    assert [int((levels == k).sum()) for k in range(4)] == pytest.approx([250] * 4, abs=55)
 
 
 def test_sobol_agrees_with_salib():
-    sampler, analysis = pytest.importorskip("SALib.sample.sobol"), pytest.importorskip("SALib.analyze.sobol")
+    sampler, analysis = (
+        pytest.importorskip("SALib.sample.sobol"),
+        pytest.importorskip("SALib.analyze.sobol"),
+    )
     theirs = sampler.sample(ISHIGAMI, 512, calc_second_order=False, seed=np.random.default_rng(4))
     np.testing.assert_array_equal(theirs.reshape(512, 5, 3), indices.sobol_points(3, 512, seed=4))
     y = ishigami(theirs)
@@ -132,29 +153,42 @@ def test_sobol_agrees_with_salib():
     np.testing.assert_allclose(found["total"], other["ST"], atol=1e-12)
     for name, theirs in (("first", other["S1_conf"]), ("total", other["ST_conf"])):
         half = 0.5 * np.diff(found[f"{name}_interval95"], axis=1)[:, 0]
-        np.testing.assert_allclose(half, theirs, rtol=0.15)  # quantiles against 1.96 sd, 1000 resamples each: 4 % of noise on both
+        # quantiles against 1.96 sd, 1000 resamples each: 4 % of noise on both
+        np.testing.assert_allclose(half, theirs, rtol=0.15)
 
 
 def test_morris_agrees_with_salib():
-    sampler, analysis = pytest.importorskip("SALib.sample.morris"), pytest.importorskip("SALib.analyze.morris")
+    sampler, analysis = (
+        pytest.importorskip("SALib.sample.morris"),
+        pytest.importorskip("SALib.analyze.morris"),
+    )
     theirs = sampler.sample(ISHIGAMI, 40, num_levels=4, seed=2)
     for points in (theirs.reshape(40, 4, 3), indices.morris_points(3, 40, seed=2)):
         y = ishigami(points)
-        other = analysis.analyze(ISHIGAMI, points.reshape(-1, 3), y.ravel(), num_levels=4, num_resamples=1000, seed=1)
+        other = analysis.analyze(
+            ISHIGAMI, points.reshape(-1, 3), y.ravel(), num_levels=4, num_resamples=1000, seed=1
+        )
         found = indices.morris_indices(indices.morris_effects(points, y))
         for mine, his in (("mu", "mu"), ("mu_star", "mu_star"), ("sigma", "sigma")):
             np.testing.assert_allclose(found[mine], np.array(other[his], dtype=float), atol=1e-11)
         half = 0.5 * np.diff(found["mu_star_interval95"], axis=1)[:, 0]
         # Student's 2.02 for 1.96, n - 1 for n: 5 %; the bootstrap's own noise 2 sd of 5 %
-        np.testing.assert_allclose(half, np.array(other["mu_star_conf"], dtype=float), rtol=0.15, atol=1e-9)
+        np.testing.assert_allclose(
+            half, np.array(other["mu_star_conf"], dtype=float), rtol=0.15, atol=1e-9
+        )
 
 
 def test_a_closed_loop_agrees_with_salib(case, at_cube):
-    analyse_sobol, analyse_morris = pytest.importorskip("SALib.analyze.sobol"), pytest.importorskip("SALib.analyze.morris")
+    analyse_sobol, analyse_morris = (
+        pytest.importorskip("SALib.analyze.sobol"),
+        pytest.importorskip("SALib.analyze.morris"),
+    )
     sampler = pytest.importorskip("SALib.sample.sobol")
     x = sampler.sample(CUBE, 32, calc_second_order=False, seed=np.random.default_rng(9))
     other = analyse_sobol.analyze(CUBE, at_cube(x), calc_second_order=False, seed=1)
-    study = sensitivity(case, VARIED, method="sobol", samples=32, seed=9, measures="rms_error_total")
+    study = sensitivity(
+        case, VARIED, method="sobol", samples=32, seed=9, measures="rms_error_total"
+    )
     (column,) = study.columns
     assert study.runs == len(x) == 32 * (D + 2)
     np.testing.assert_allclose(column.felt["first"], other["S1"], atol=1e-9)
@@ -163,7 +197,9 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
     points = indices.morris_points(D, 8, seed=9)
     y = at_cube(points.reshape(-1, D))
     other = analyse_morris.analyze(CUBE, points.reshape(-1, D), y, num_levels=4, seed=1)
-    (column,) = sensitivity(case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total").columns
+    (column,) = sensitivity(
+        case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
+    ).columns
     for name in ("mu", "mu_star", "sigma"):
         np.testing.assert_allclose(column.felt[name], np.array(other[name], dtype=float), atol=1e-9)
     own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
@@ -171,8 +207,10 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
 
 
 def test_local_against_central_differences(case, monkeypatch):
-    """In chunks of 4 numbers; with tied entries, absolute, normal and discrete distributions. A step of 1e-5 of the half-width leaves 1e-9
-    of third derivatives and 1e-11 of rounding over a slope of 1e-2 or more."""
+    """In chunks of 4 numbers; with tied entries, absolute, normal and discrete distributions. A
+    step of 1e-5 of the half-width leaves 1e-9 of third derivatives and 1e-11 of rounding over a
+    slope of 1e-2 or more.
+    """
     monkeypatch.setattr(local, "CHUNK", 4)
     loop, names = case.loop, ("rms_error_total", "max_level", "rms_input")
     varied = {
@@ -183,8 +221,18 @@ def test_local_against_central_differences(case, monkeypatch):
         "controller.k": Normal(mean=1.0, sd=0.004),
     }
     study = sensitivity(case, varied, measures=names)
-    drain, gain, orifice = (np.asarray(get_value(loop, n)) for n in ("plant.drain", "plant.pump_gain", "plant.orifice[0]"))
-    assert study.parameters == ["plant.drain[0]", "plant.drain[1]", "plant.pump_gain", "plant.orifice[0]", "x0[1]", "controller.k"]
+    drain, gain, orifice = (
+        np.asarray(get_value(loop, n))
+        for n in ("plant.drain", "plant.pump_gain", "plant.orifice[0]")
+    )
+    assert study.parameters == [
+        "plant.drain[0]",
+        "plant.drain[1]",
+        "plant.pump_gain",
+        "plant.orifice[0]",
+        "x0[1]",
+        "controller.k",
+    ]
     moves = [
         {"plant.drain[0]": 0.05 * drain[0]},
         {"plant.drain[1]": 0.05 * drain[1]},
@@ -210,25 +258,41 @@ def test_local_against_central_differences(case, monkeypatch):
     assert seen > 15
     column = study.columns[0]
     assert column.felt["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.felt["effect"][0])
-    assert column.felt["elasticity"][0] == pytest.approx(column.felt["effect"][0] / 0.05 / column.nominal)
+    assert column.felt["elasticity"][0] == pytest.approx(
+        column.felt["effect"][0] / 0.05 / column.nominal
+    )
     assert np.isnan(column.felt["derivative"][2])
     sizes = np.abs(column.felt["effect"])[study.order(column)]
     assert (np.diff(sizes) <= 0).all()
     shown = study.to_json()["parameters"]
-    assert shown["plant.pump_gain"]["half_width_is"] == "2 standard deviations" and shown["x0[1]"]["half_width"] == 1.5
+    assert (
+        shown["plant.pump_gain"]["half_width_is"] == "2 standard deviations"
+        and shown["x0[1]"]["half_width"] == 1.5
+    )
 
 
 def test_batches_and_seeds(case):
-    """A run is the same in any batch, but for the last bits; the same seed gives the same bits, another one others."""
+    """A run is the same in any batch, but for the last bits; the same seed gives the same bits,
+    another one others.
+    """
     options = {"method": "sobol", "samples": 16, "measures": ("rms_error", "max_level")}
     told = []
-    first = sensitivity(case, VARIED, seed=3, progress=lambda done, total: told.append((done, total)), **options)
+    first = sensitivity(
+        case, VARIED, seed=3, progress=lambda done, total: told.append((done, total)), **options
+    )
     assert told[-1] == (96, 96)
     other = sensitivity(case, VARIED, seed=3, batch=7, **options)
     for a, b in zip(first.columns, other.columns):
         np.testing.assert_allclose(a.felt["total"], b.felt["total"], rtol=1e-9, atol=1e-12)
-    again, different = sensitivity(case, VARIED, seed=3, **options), sensitivity(case, VARIED, seed=4, **options)
-    assert [c.label for c in first.columns][:3] == ["rms_error of output 1", "rms_error of output 2", "max_level of tank 1"]
+    again, different = (
+        sensitivity(case, VARIED, seed=3, **options),
+        sensitivity(case, VARIED, seed=4, **options),
+    )
+    assert [c.label for c in first.columns][:3] == [
+        "rms_error of output 1",
+        "rms_error of output 2",
+        "max_level of tank 1",
+    ]
     for a, b, c in zip(first.columns, again.columns, different.columns):
         for name, value in a.felt.items():
             np.testing.assert_array_equal(value, b.felt[name])
@@ -236,26 +300,37 @@ def test_batches_and_seeds(case):
 
 
 def test_noise_is_the_same_in_every_run(case):
-    """That of `evaluate` with the key of the seed. A parameter that does nothing has no effect at all, although every run is noisy."""
+    """That of `evaluate` with the key of the seed. A parameter that does nothing has no effect at
+    all, although every run is noisy.
+    """
     noisy = rig.set_values(case, {"sensor.noise": 0.1})
     varied = {"plant.rim": Uniform(relative=0.01), "plant.drain": Uniform(relative=0.05, tied=True)}
-    (column,) = sensitivity(noisy, varied, method="morris", samples=4, seed=6, measures="rms_error_total").columns
+    (column,) = sensitivity(
+        noisy, varied, method="morris", samples=4, seed=6, measures="rms_error_total"
+    ).columns
     assert not column.felt["mu_star"][:4].any() and column.felt["mu_star"][4] > 0
-    own = jaxtank.evaluate(noisy.loop, noisy.clock, "rms_error_total", jax.random.key(6))["rms_error_total"]
+    own = jaxtank.evaluate(noisy.loop, noisy.clock, "rms_error_total", jax.random.key(6))[
+        "rms_error_total"
+    ]
     assert column.nominal == pytest.approx(float(own), rel=1e-12)
 
 
 def test_noise_may_vary_from_none(case):
     """Travel of the pumps grows with the noise, which the case itself has none of."""
     varied = {"sensor.noise": Uniform(low=0.0, high=0.2, tied=True)}
-    for column in sensitivity(case, varied, method="morris", samples=4, measures="input_travel").columns:
+    for column in sensitivity(
+        case, varied, method="morris", samples=4, measures="input_travel"
+    ).columns:
         assert column.felt["mu"][0] > 0 and column.felt["mu"][0] == column.felt["mu_star"][0]
 
 
 def test_runs_that_fail_are_counted_and_told(case):
     study = sensitivity(
         case,
-        {"plant.drain[0]": LogUniform(low=1e-3, high=1e300), "plant.pump_gain": Uniform(relative=0.05)},
+        {
+            "plant.drain[0]": LogUniform(low=1e-3, high=1e300),
+            "plant.pump_gain": Uniform(relative=0.05),
+        },
         method="sobol",
         samples=32,
         measures="max_level",
@@ -267,7 +342,9 @@ def test_runs_that_fail_are_counted_and_told(case):
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count
     said = study.to_json()
-    assert said["failed"] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
+    assert said[
+        "failed"
+    ] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
@@ -291,7 +368,9 @@ def test_estimators_leave_out_what_is_not_finite():
     found = indices.morris_indices(steps)
     assert sorted(found["kept"]) == [5, 5, 6]
     np.testing.assert_allclose(found["mu"], np.nanmean(steps, axis=0))
-    np.testing.assert_allclose(1e300 * indices.sobol_indices(holed)["sd"], indices.sobol_indices(1e300 * holed)["sd"])
+    np.testing.assert_allclose(
+        1e300 * indices.sobol_indices(holed)["sd"], indices.sobol_indices(1e300 * holed)["sd"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -323,7 +402,10 @@ def test_bad_input(case, options, words):
 def test_correlated_parameters_have_local_effects_only(case):
     names = ("plant.drain[0]", "plant.drain[1]")
     joint = {"fit": distributions.Correlated(names=names, covariance=((4e-4, 3e-4), (3e-4, 9e-4)))}
-    assert local.half_widths(distributions.Draws(case.loop, joint)) == [{names[0]: 0.04}, {names[1]: pytest.approx(0.06)}]
+    assert local.half_widths(distributions.Draws(case.loop, joint)) == [
+        {names[0]: 0.04},
+        {names[1]: pytest.approx(0.06)},
+    ]
     with pytest.raises(InputError, match="vary together"):
         sensitivity(case, joint, method="sobol")
 
@@ -348,7 +430,8 @@ SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 
 
 @pytest.mark.parametrize(
-    ("method", "samples", "picture"), [("local", "5", "tornado"), ("morris", "4", "tornado"), ("sobol", "20", "sobol")]
+    ("method", "samples", "picture"),
+    [("local", "5", "tornado"), ("morris", "4", "tornado"), ("sobol", "20", "sobol")],
 )
 def test_command(tmp_path, method, samples, picture):
     code, out, err = say(
@@ -375,16 +458,27 @@ def test_command(tmp_path, method, samples, picture):
     (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
     for row in rows:
         value = said["measures"][row["measure"]]["parameters"][row["parameter"]][key]
-        assert float(row[key] or "nan") == pytest.approx(np.nan if value is None else value, rel=1e-9, nan_ok=True)
+        assert float(row[key] or "nan") == pytest.approx(
+            np.nan if value is None else value, rel=1e-9, nan_ok=True
+        )
     assert matplotlib.image.imread(tmp_path / "found" / f"{picture}.png").shape[0] > 100
-    assert {p.name for p in (tmp_path / "found").iterdir()} == {"result.json", "sensitivity.csv", "report.html", f"{picture}.png"}
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {
+        "result.json",
+        "sensitivity.csv",
+        "report.html",
+        f"{picture}.png",
+    }
     assert ("run " in err) and "written to" in err
 
 
 def test_command_prints_tables():
-    code, out, err = say(*SHORT, "--method", "sobol", "--samples", "16", "--spread", "0.02", "--quiet")
+    code, out, err = say(
+        *SHORT, "--method", "sobol", "--samples", "16", "--spread", "0.02", "--quiet"
+    )
     assert code == 0 and err == ""
-    assert "rms_error_total [V]" in out and "max_level of tank 2 [V]" in out and "relative 0.02" in out
+    assert (
+        "rms_error_total [V]" in out and "max_level of tank 2 [V]" in out and "relative 0.02" in out
+    )
     assert "plant.pump_gain[0]" in out and "16 base points, 80 runs, 0 not finite" in out
 
 
@@ -433,7 +527,8 @@ def test_three_devices_give_the_bits_of_one():
     numbers = [line for line in lines if line.startswith("[")]
     assert half == 2 and numbers[0] == numbers[1] and "nan" not in numbers[0]
     done = [int(line.split()[0]) for line in lines if not line.startswith("[")]
-    assert done.count(54) == 2 and len(done) == 7 + 3  # 55 runs in batches of 8: seven, or three groups of three
+    # 55 runs in batches of 8: seven, or three groups of three
+    assert done.count(54) == 2 and len(done) == 7 + 3
     with pytest.raises(InputError, match="devices = 2: this process has 1"):
         sensitivity(presets.find("cascaded/pi"), method="morris", devices=2)
 
@@ -442,12 +537,16 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
     pairs = np.array([[1.0, 0.5], [2.0, 1.0], [3.0, 3.5], [2.5, 1.5]])
     held = np.array([[True, True], [False, True], [False, False], [False, True]])
     ax = responses.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("highest level before [cm]", "highest level after [cm]")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "highest level before [cm]",
+        "highest level after [cm]",
+    )
     drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
     assert drawn == {
         "broke a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
         "holds every limit, before and after (1 of 4)": [[1.0, 0.5]],
-        "breaks a limit after (1 of 4)": [[3.0, 3.5]],  # it broke one before, too: the counts are of runs, each in one place
+        # it broke one before, too: the counts are of runs, each in one place
+        "breaks a limit after (1 of 4)": [[3.0, 3.5]],
     }
     labels = [line.get_label() for line in ax.lines]
     assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
@@ -463,16 +562,24 @@ def test_pictures():
     ends = np.stack([np.abs(effect) - 0.1, np.abs(effect) + 0.1], axis=1)
     ax = responses.tornado(axes[0], names, effect, "cm", "x")
     assert (
-        ax.get_xlabel() == "change [cm]" and len(ax.patches) == 2 * responses.BARS and "6 smaller ones not shown" in ax.get_title()
+        ax.get_xlabel() == "change [cm]"
+        and len(ax.patches) == 2 * responses.BARS
+        and "6 smaller ones not shown" in ax.get_title()
     )
     assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
-    ax = responses.elementary(axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x")
-    assert ax.get_xlabel() == "change over the range [cm]" and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
+    ax = responses.elementary(
+        axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x"
+    )
+    assert (
+        ax.get_xlabel() == "change over the range [cm]"
+        and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
+    )
     ax = responses.shares(axes[2], names[:3], np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
     assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
     segments = np.array(ax.collections[0].get_segments())
     np.testing.assert_allclose(
-        np.sort(segments[:, :, 0], axis=1), np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1)
+        np.sort(segments[:, :, 0], axis=1),
+        np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1),
     )
     plt.close(figure)
 
@@ -492,16 +599,35 @@ def test_the_unit_of_a_derivative(unit, of, words):
 
 
 def test_numbers_with_a_unit_say_it(tmp_path):
-    """Centimetres of error for a square centimetre of an outlet, or for a volt and second of a pump: in table, JSON and CSV."""
-    words = ("mirakhorli/sfc", "--vary", "plant.drain=uniform:5%", "--vary", "plant.split=uniform:5%:tied")
+    """Centimetres of error for a square centimetre of an outlet, or for a volt and second of a
+    pump: in table, JSON and CSV.
+    """
+    words = (
+        "mirakhorli/sfc",
+        "--vary",
+        "plant.drain=uniform:5%",
+        "--vary",
+        "plant.split=uniform:5%:tied",
+    )
     words += ("--set", "clock.duration=20", "--measure", "max_level", "--measure", "ise")
     code, out, err = say(*words, "--method", "local", "--out", str(tmp_path))
     assert code == 0, err
-    assert "effect [cm]" in out and "effect [cm^2 s]" in out and re.search(r"\d cm per cm\^2\b", out) and "cm^2 s per cm^2" in out
+    assert (
+        "effect [cm]" in out
+        and "effect [cm^2 s]" in out
+        and re.search(r"\d cm per cm\^2\b", out)
+        and "cm^2 s per cm^2" in out
+    )
     said = json.loads((tmp_path / "result.json").read_text())["measures"]
-    assert said["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"] == "cm per cm^2"
+    assert (
+        said["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"]
+        == "cm per cm^2"
+    )
     assert said["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
     rows = list(csv.DictReader((tmp_path / "sensitivity.csv").open()))
-    assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {"cm^2 s per cm^2", "cm^2 s"}
+    assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {
+        "cm^2 s per cm^2",
+        "cm^2 s",
+    }
     code, out, _ = say(*words, "--method", "morris", "--samples", "4", "--quiet")
     assert code == 0 and "mu* [cm]" in out and "sigma [cm^2 s]" in out

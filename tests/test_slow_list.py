@@ -1,4 +1,6 @@
-"""slow.txt names tests that exist: a test that is renamed falls out of it otherwise, and into every run."""
+"""slow.txt names tests that exist: a test that is renamed falls out of it otherwise, and into every
+run.
+"""
 
 import ast
 from pathlib import Path
@@ -13,5 +15,9 @@ def test_the_list_of_slow_tests_is_of_tests():
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.FunctionDef)
     }
-    listed = [line.split("[")[0] for line in (HERE / "slow.txt").read_text().splitlines() if not line.startswith("#")]
+    listed = [
+        line.split("[")[0]
+        for line in (HERE / "slow.txt").read_text().splitlines()
+        if not line.startswith("#")
+    ]
     assert len(listed) > 50 and set(listed) <= names

@@ -1,4 +1,6 @@
-"""What is shipped, and what it never does: pickles, evaluates text, talks to a network, or reads a file of any size."""
+"""What is shipped, and what it never does: pickles, evaluates text, talks to a network, or reads a
+file of any size.
+"""
 
 import ast
 import importlib.util
@@ -33,12 +35,27 @@ SUSPECT = {
     "subprocess", "ctypes", "cffi", "multiprocessing", "pty",
 }  # fmt: skip
 IMPORTED = {
-    ("tuning.bench.bench", "subprocess"): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
+    (
+        "tuning.bench.bench",
+        "subprocess",
+    ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
     ("tuning.bench.bench", "ctypes"): "and calls it",
 }
 
 # Calls that run text, and those that open a file to read it.
-CALLS = {"eval", "exec", "__import__", "import_module", "system", "popen", "execv", "execve", "spawnv", "startfile", "breakpoint"}
+CALLS = {
+    "eval",
+    "exec",
+    "__import__",
+    "import_module",
+    "system",
+    "popen",
+    "execv",
+    "execve",
+    "spawnv",
+    "startfile",
+    "breakpoint",
+}
 READS = {
     "open",
     "read_text",
@@ -70,7 +87,11 @@ READ = {
     ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
     ("tuning.storage.evaluation_log", "keep", "open"): "to write",
-    ("tuning.storage.batch_store", "read_part", "ZipFile"): "after `refusal`; unpacked sizes are added up first",
+    (
+        "tuning.storage.batch_store",
+        "read_part",
+        "ZipFile",
+    ): "after `refusal`; unpacked sizes are added up first",
     ("tuning.storage.batch_store", "read_part", "load"): "after that; allow_pickle=False",
     ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
     ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
@@ -84,7 +105,9 @@ def sources():
     """(module, syntax tree) of every file of the packages."""
     for package, root in PACKAGES.items():
         for path in sorted(root.rglob("*.py")):
-            name = ".".join([package, *path.relative_to(root).with_suffix("").parts]).removesuffix(".__init__")
+            name = ".".join([package, *path.relative_to(root).with_suffix("").parts]).removesuffix(
+                ".__init__"
+            )
             yield name, ast.parse(path.read_text())
 
 
@@ -97,7 +120,9 @@ def called(tree):
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             f = node.func
-            name = f.id if isinstance(f, ast.Name) else f.attr if isinstance(f, ast.Attribute) else ""
+            name = (
+                f.id if isinstance(f, ast.Name) else f.attr if isinstance(f, ast.Attribute) else ""
+            )
             yield inside.get(id(node), ""), name, ast.unparse(f), node
 
 
@@ -112,31 +137,44 @@ def test_nothing_is_imported_that_unpickles_talks_or_starts_programs():
 
 
 def test_no_text_is_run():
-    found = {(m, where, name) for m, tree in sources() for where, name, _, _ in called(tree) if name in CALLS}
+    found = {
+        (m, where, name)
+        for m, tree in sources()
+        for where, name, _, _ in called(tree)
+        if name in CALLS
+    }
     assert found == set(MADE)
     for module, tree in sources():
         for _, name, _, node in called(tree):
             assert not any(
-                k.arg == "allow_pickle" and not (isinstance(k.value, ast.Constant) and k.value.value is False)
+                k.arg == "allow_pickle"
+                and not (isinstance(k.value, ast.Constant) and k.value.value is False)
                 for k in node.keywords
             )
-            assert name not in ("to_pickle", "read_pickle") and not any(k.arg == "shell" for k in node.keywords), module
+            assert name not in ("to_pickle", "read_pickle") and not any(
+                k.arg == "shell" for k in node.keywords
+            ), module
 
 
 def test_every_reading_of_a_file_is_known_and_why_it_is_safe():
-    ours = ("presets.", "jaxtank.presets", "rig.", "rigs.")  # load: of a case by its name, of a rig by read_text
+    # load: of a case by its name, of a rig by read_text
+    ours = ("presets.", "jaxtank.presets", "rig.", "rigs.")
     found = {
         (m, where, name)
         for m, tree in sources()
         for where, name, whole, _ in called(tree)
-        if name in READS and not whole.startswith(ours) and not (m in ("jaxtank.presets", "jaxtank.rig.read") and whole == "load")
+        if name in READS
+        and not whole.startswith(ours)
+        and not (m in ("jaxtank.presets", "jaxtank.rig.read") and whole == "load")
     }
     assert found == set(READ)
     assert all(READ.values()) and all(MADE.values()) and all(IMPORTED.values())
 
 
 def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
-    """A device, a pipe, a folder, a huge file where a log, a batch, a manifest or a rig file should be."""
+    """A device, a pipe, a folder, a huge file where a log, a batch, a manifest or a rig file should
+    be.
+    """
     (tmp_path / "huge").touch()
     os.truncate(tmp_path / "huge", 1 << 32)  # takes no room
     os.mkfifo(tmp_path / "pipe")
@@ -144,7 +182,13 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
     for i, odd in enumerate((Path("/dev/zero"), tmp_path / "pipe", tmp_path, tmp_path / "huge")):
         folder = tmp_path / f"run{i}"
         folder.mkdir()
-        for name in (evaluation_log.NAME, batch_store.MANIFEST, "part-000000.npz", "rig.toml", "log.csv"):
+        for name in (
+            evaluation_log.NAME,
+            batch_store.MANIFEST,
+            "part-000000.npz",
+            "rig.toml",
+            "log.csv",
+        ):
             (folder / name).symlink_to(odd)
         says = "is not a file|at most"
         with pytest.raises(InputError, match=says):
@@ -161,7 +205,10 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
 
 def header(shape):
     """The beginning of an .npy file that claims to hold an array of this shape."""
-    text = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    text = (
+        f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode()
+        + b"\n"
+    )
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
@@ -172,9 +219,15 @@ HOSTILE = {
     "a name of a folder": {"/x.npy": ARRAY},
     "a batch twice": {"x.npy": ARRAY, "y.npy": ARRAY},
     "an array of 745 GiB": {"x.npy": header("(100000000000,)") + bytes(16)},
-    "a header that is a program": {"x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"},
-    "a header of 9,000 brackets": {"x.npy": b"\x93NUMPY\x01\x00" + (9000).to_bytes(2, "little") + b"[" * 9000},
-    "a header of 9,000 signs": {"x.npy": b"\x93NUMPY\x01\x00" + (9001).to_bytes(2, "little") + b"-" * 9000 + b"1"},
+    "a header that is a program": {
+        "x.npy": b"\x93NUMPY\x01\x00\x20\x00" + b"__import__('os').abort()".ljust(31) + b"\n"
+    },
+    "a header of 9,000 brackets": {
+        "x.npy": b"\x93NUMPY\x01\x00" + (9000).to_bytes(2, "little") + b"[" * 9000
+    },
+    "a header of 9,000 signs": {
+        "x.npy": b"\x93NUMPY\x01\x00" + (9001).to_bytes(2, "little") + b"-" * 9000 + b"1"
+    },
     "an array longer than a number can say": {"x.npy": header(f"({10**30},)")},
     "an object, pickled": {"x.npy": ARRAY.replace(b"<f8", b"|O ")},
     "nothing": {},
@@ -189,7 +242,9 @@ def test_a_batch_is_not_trusted(held, tmp_path):
             archive.writestr(name, data)
     with pytest.raises(InputError, match=r"part-000000\.npz: is not a batch of this program"):
         batch_store.read_part(path, {"x"})
-    assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (tmp_path.parent / "x.npy").exists()
+    assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (
+        tmp_path.parent / "x.npy"
+    ).exists()
 
 
 def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
@@ -198,7 +253,13 @@ def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
         archive.writestr("x.npy", ARRAY + bytes(1 << 20))
     whole = path.read_bytes()
     at = whole.rfind(b"PK\x01\x02")  # its entry in the directory
-    for where, value in ((at + 24, b"\x0a\0\0\0"), (at + 8, b"\x01\0"), (at + 10, b"\x63\0"), (60, b"\xff" * 40), (0, b"\0" * 4)):
+    for where, value in (
+        (at + 24, b"\x0a\0\0\0"),
+        (at + 8, b"\x01\0"),
+        (at + 10, b"\x63\0"),
+        (60, b"\xff" * 40),
+        (0, b"\0" * 4),
+    ):
         path.write_bytes(whole[:where] + value + whole[where + len(value) :])
         with pytest.raises(InputError, match="not a batch of this program"):
             batch_store.read_part(path, {"x"})
@@ -217,7 +278,8 @@ def test_json_without_end_is_refused(tmp_path):
     for text, words in (
         (deep, "not a log"),
         (head + deep, "line 2"),
-        (head + entry + '{"all": [' * 900 + "]}" * 900 + "]}\n", "line 2"),  # JSON that is read, and is too deep to be a result
+        # JSON that is read, and is too deep to be a result
+        (head + entry + '{"all": [' * 900 + "]}" * 900 + "]}\n", "line 2"),
         (head + entry + '{"shape": [1000000000, 1000000000], "hex": ["0x1p0"]}]}\n', "line 2"),
         (head + entry + '{"shape": [1], "hex": ["__import__"]}]}\n', "line 2"),
     ):
@@ -233,7 +295,12 @@ def built(tmp_path_factory):
     if importlib.util.find_spec("hatchling") is None or not (ROOT / "pyproject.toml").exists():
         pytest.skip("hatchling, or the repository, is not here")
     folder = tmp_path_factory.mktemp("dist")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(folder)], cwd=ROOT, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-d", str(folder)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
     return wheel, sdist
 
@@ -252,7 +319,12 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         if path.is_file() and "__pycache__" not in path.parts
     }
     assert packed == there
-    assert {"tuning/bench/floor.c", "tuning/cli/names.txt", "jaxtank/README.md", "tuning/README.md"} <= packed
+    assert {
+        "tuning/bench/floor.c",
+        "tuning/cli/names.txt",
+        "jaxtank/README.md",
+        "tuning/README.md",
+    } <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt", "typed"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
@@ -271,8 +343,17 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
         "CITATION.cff",
         "tests/conftest.py",
     } <= names
-    assert {"tests/rigs/watertank.toml", "tests/slow.txt", "tests/versions.sh", "notebooks/run.py"} <= names
-    assert {"tests/benchmarks/README.md", "notebooks/README.md", "notebooks/images/tuned.gif"} <= names
+    assert {
+        "tests/rigs/watertank.toml",
+        "tests/slow.txt",
+        "tests/versions.sh",
+        "notebooks/run.py",
+    } <= names
+    assert {
+        "tests/benchmarks/README.md",
+        "notebooks/README.md",
+        "notebooks/images/tuned.gif",
+    } <= names
     assert not any("__pycache__" in n or n.endswith((".pyc", ".so", ".log")) for n in names)
 
 
@@ -280,13 +361,24 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
 def test_it_installs_into_an_empty_environment_and_runs(built, tmp_path):
     """From wheel and from sdist, away from the repository; needs the dependencies from pip."""
     for package, words in zip(
-        built, (["tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "1", "--out", "tuned"], ["list"])
+        built,
+        (
+            ["tune", "gouta2015/backstepping", "--dt", "0.5", "--starts", "1", "--out", "tuned"],
+            ["list"],
+        ),
     ):
         home = tmp_path / package.suffix[1:]
         venv.create(home, with_pip=True)
         clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
-        subprocess.run([home / "bin" / "pip", "install", "--quiet", package], check=True, capture_output=True, env=clean)
-        done = subprocess.run([home / "bin" / "jaxtank", *words], cwd=home, capture_output=True, text=True, env=clean)
+        subprocess.run(
+            [home / "bin" / "pip", "install", "--quiet", package],
+            check=True,
+            capture_output=True,
+            env=clean,
+        )
+        done = subprocess.run(
+            [home / "bin" / "jaxtank", *words], cwd=home, capture_output=True, text=True, env=clean
+        )
         assert done.returncode == 0 and "backstepping" in done.stdout, done.stderr
         where = subprocess.run(
             [home / "bin" / "python", "-c", "import tuning; print(tuning.__file__)"],
@@ -296,4 +388,6 @@ def test_it_installs_into_an_empty_environment_and_runs(built, tmp_path):
             env=clean,
         )
         assert where.stdout.startswith(str(home))
-    assert {"result.json", "rig.toml", "report.html", "responses.png"} <= {p.name for p in (tmp_path / "whl" / "tuned").iterdir()}
+    assert {"result.json", "rig.toml", "report.html", "responses.png"} <= {
+        p.name for p in (tmp_path / "whl" / "tuned").iterdir()
+    }

@@ -1,4 +1,6 @@
-"""The table of stress tests in benchmarks/README.md is that of the record, and a drill that fails is reported as such."""
+"""The table of stress tests in benchmarks/README.md is that of the record, and a drill that fails
+is reported as such.
+"""
 
 import survived
 
@@ -22,8 +24,14 @@ def test_a_record_keeps_the_others(tmp_path, monkeypatch):
     survived.record("kills", 50, "all went on")
     survived.record("fuzz", 10_000, "1 failed")
     assert survived.table().splitlines()[2:] == [
-        "| broken rig files, logs and command lines | 10,000 | 1 failed | `pytest -m slow tests/test_fuzz.py` |",
-        "| SIGKILLs of tune, uncertainty and identify | 50 | all went on | `python tests/fault_drill.py 50` |",
+        (
+            "| broken rig files, logs and command lines | 10,000 | 1 failed | `pytest -m slow"
+            " tests/test_fuzz.py` |"
+        ),
+        (
+            "| SIGKILLs of tune, uncertainty and identify | 50 | all went on | `python"
+            " tests/fault_drill.py 50` |"
+        ),
     ]
 
 

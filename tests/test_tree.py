@@ -25,8 +25,16 @@ def loop(gouta):
 
 def test_every_parameter_can_be_read_described_and_set_by_its_name(loop):
     values = parameters(loop)
-    assert {"plant.area", "controller.k1", "controller.model.drain", "sensor.noise", "reference.targets", "x0"} <= set(values)
-    assert not {"plant.overflow", "plant.links", "reference.ramp"} & set(values)  # static fields are not parameters
+    assert {
+        "plant.area",
+        "controller.k1",
+        "controller.model.drain",
+        "sensor.noise",
+        "reference.targets",
+        "x0",
+    } <= set(values)
+    # static fields are not parameters
+    assert not {"plant.overflow", "plant.links", "reference.ramp"} & set(values)
     for name, value in values.items():
         assert np.array_equal(get_value(loop, name), value)
         assert describe(loop, name)["kind"] == "leaf"
@@ -47,13 +55,20 @@ def test_an_entry_is_read_and_set_alone(loop):
 
 def test_a_number_fills_an_array(loop):
     np.testing.assert_array_equal(with_values(loop, {"plant.area": 3}).plant.area, [3.0] * 4)
-    np.testing.assert_array_equal(with_values(loop, {"plant.area": [1, 2, 3, 4]}).plant.area, [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(
+        with_values(loop, {"plant.area": [1, 2, 3, 4]}).plant.area, [1.0, 2.0, 3.0, 4.0]
+    )
     assert with_values(loop, {"plant.area": 3}).plant.area.dtype == np.float64
 
 
 def test_later_values_win(loop):
-    np.testing.assert_array_equal(with_values(loop, {"plant.area": 3.0, "plant.area[1]": 5.0}).plant.area, [3.0, 5.0, 3.0, 3.0])
-    np.testing.assert_array_equal(with_values(loop, {"plant.area[1]": 5.0, "plant.area": 3.0}).plant.area, [3.0] * 4)
+    np.testing.assert_array_equal(
+        with_values(loop, {"plant.area": 3.0, "plant.area[1]": 5.0}).plant.area,
+        [3.0, 5.0, 3.0, 3.0],
+    )
+    np.testing.assert_array_equal(
+        with_values(loop, {"plant.area[1]": 5.0, "plant.area": 3.0}).plant.area, [3.0] * 4
+    )
 
 
 @pytest.mark.parametrize(
@@ -74,7 +89,17 @@ def test_a_wrong_shape_is_told(loop, name, value, shape):
     assert name in str(caught.value) and shape in str(caught.value)
 
 
-NO_NUMBERS = ["abc", "3", True, None, 1 + 2j, np.bool_(True), np.array([1j, 1, 1, 1]), [1.0, "a", 2.0, 3.0], [1.0, True, 2.0, 3.0]]
+NO_NUMBERS = [
+    "abc",
+    "3",
+    True,
+    None,
+    1 + 2j,
+    np.bool_(True),
+    np.array([1j, 1, 1, 1]),
+    [1.0, "a", 2.0, 3.0],
+    [1.0, True, 2.0, 3.0],
+]
 NO_NUMBERS += [
     [None, 1.0, 1.0, 1.0],
     ["1", "2", "3", "4"],
@@ -88,13 +113,21 @@ NO_NUMBERS += [
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=range(len(NO_NUMBERS)))
 def test_what_is_no_number_is_told(loop, value):
-    with pytest.raises(InputError, match=r"plant\.area = .*must be a real number or a list of real numbers"):
+    with pytest.raises(
+        InputError, match=r"plant\.area = .*must be a real number or a list of real numbers"
+    ):
         with_values(loop, {"plant.area": value})
 
 
-@pytest.mark.parametrize("value", [True, None, 1 + 2j, np.array([1j, 1, 1, 1]), jnp.ones(4) > 0, jax.random.key(0)], ids=range(6))
+@pytest.mark.parametrize(
+    "value",
+    [True, None, 1 + 2j, np.array([1j, 1, 1, 1]), jnp.ones(4) > 0, jax.random.key(0)],
+    ids=range(6),
+)
 def test_a_leaf_that_is_no_number_is_told_at_the_door(loop, value):
-    with pytest.raises(InputError, match=r"^plant\.drain = .*: must be a real number or an array of real numbers$"):
+    with pytest.raises(
+        InputError, match=r"^plant\.drain = .*: must be a real number or an array of real numbers$"
+    ):
         check_leaves(dataclasses.replace(loop, plant=dataclasses.replace(loop.plant, drain=value)))
 
 
@@ -118,7 +151,8 @@ def test_complex_values_are_told_inside_a_trace(loop):
     with pytest.raises(InputError, match=r"plant\.area"):
         jax.jit(lambda v: with_values(loop, {"plant.area": v}).plant.area)(1j)
     np.testing.assert_array_equal(
-        jax.vmap(lambda v: with_values(loop, {"plant.area": v}).plant.area)(jnp.arange(1, 3)), [[1.0] * 4, [2.0] * 4]
+        jax.vmap(lambda v: with_values(loop, {"plant.area": v}).plant.area)(jnp.arange(1, 3)),
+        [[1.0] * 4, [2.0] * 4],
     )
 
 
@@ -198,14 +232,19 @@ def test_values_are_set_under_jit_and_vmap(loop):
 
 def test_derivatives_of_setting_and_reading_an_entry_are_one_hot(loop):
     one_hot = np.array([0.0, 0.0, 1.0, 0.0])
-    np.testing.assert_array_equal(jax.jacfwd(lambda v: with_values(loop, {"plant.area[2]": v}).plant.area)(5.0), one_hot)
+    np.testing.assert_array_equal(
+        jax.jacfwd(lambda v: with_values(loop, {"plant.area[2]": v}).plant.area)(5.0), one_hot
+    )
     assert jax.grad(lambda v: with_values(loop, {"plant.area[2]": v}).plant.area.sum())(5.0) == 1.0
     assert jax.grad(lambda v: with_values(loop, {"plant.area": v}).plant.area.sum())(5.0) == 4.0
     slopes = parameters(jax.grad(lambda tree: get_value(tree, "plant.area[2]") + 0.0)(loop))
     np.testing.assert_array_equal(slopes.pop("plant.area"), one_hot)
     assert all(not np.any(slope) for slope in slopes.values())
-    replaced = jax.grad(lambda tree: with_values(tree, {"plant.area[2]": 1.0}).plant.area.sum())(loop)
-    np.testing.assert_array_equal(replaced.plant.area, 1.0 - one_hot)  # what is overwritten is not felt
+    replaced = jax.grad(lambda tree: with_values(tree, {"plant.area[2]": 1.0}).plant.area.sum())(
+        loop
+    )
+    # what is overwritten is not felt
+    np.testing.assert_array_equal(replaced.plant.area, 1.0 - one_hot)
 
 
 def test_optional_leaves_are_absent_until_they_are_set(loop):
@@ -295,7 +334,8 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
     assert len(set(costs)) == len(changes)
     error(rig.set_values(case, {"reference.ramp": 30.0}).loop)
     assert len(traces) == 2
-    error(with_values(case.loop, {"actuator.lag": 0.5}))  # a leaf that was absent is a new program too
+    # a leaf that was absent is a new program too
+    error(with_values(case.loop, {"actuator.lag": 0.5}))
     assert len(traces) == 3
 
 
@@ -307,12 +347,32 @@ def test_a_component_is_frozen(loop):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda case: jaxtank.simulate(case.clock, case.loop), "loop is a Clock: must be a ClosedLoop"),
-        (lambda case: jaxtank.evaluate(case, case.clock, ["ise"]), "loop is a Case: must be a ClosedLoop, as case.loop"),
-        (lambda case: jaxtank.simulate(case.loop, 10.0), "clock is a float: must be a jaxtank.Clock"),
-        (lambda case: jaxtank.simulate(case.loop, case.clock, key=0), "key is a int: must be one random key, as jax.random.key(0)"),
-        (lambda case: jaxtank.simulate(case.loop, case.clock, key=np.arange(2)), "key is a ndarray: must be one random key"),
-        (lambda case: jaxtank.simulate(case.loop, case.clock, key=jax.random.split(jax.random.key(0), 3)), "key has shape (3,)"),
+        (
+            lambda case: jaxtank.simulate(case.clock, case.loop),
+            "loop is a Clock: must be a ClosedLoop",
+        ),
+        (
+            lambda case: jaxtank.evaluate(case, case.clock, ["ise"]),
+            "loop is a Case: must be a ClosedLoop, as case.loop",
+        ),
+        (
+            lambda case: jaxtank.simulate(case.loop, 10.0),
+            "clock is a float: must be a jaxtank.Clock",
+        ),
+        (
+            lambda case: jaxtank.simulate(case.loop, case.clock, key=0),
+            "key is a int: must be one random key, as jax.random.key(0)",
+        ),
+        (
+            lambda case: jaxtank.simulate(case.loop, case.clock, key=np.arange(2)),
+            "key is a ndarray: must be one random key",
+        ),
+        (
+            lambda case: jaxtank.simulate(
+                case.loop, case.clock, key=jax.random.split(jax.random.key(0), 3)
+            ),
+            "key has shape (3,)",
+        ),
     ],
 )
 def test_arguments_in_each_others_place_are_told(gouta, call, words):
@@ -322,14 +382,25 @@ def test_arguments_in_each_others_place_are_told(gouta, call, words):
 
 
 def test_keys_of_both_kinds_are_taken_traced_or_not():
-    for key in (None, jax.random.key(1), jax.random.PRNGKey(1), jax.random.key(1, impl="rbg"), np.arange(2, dtype=np.uint32)):
+    for key in (
+        None,
+        jax.random.key(1),
+        jax.random.PRNGKey(1),
+        jax.random.key(1, impl="rbg"),
+        np.arange(2, dtype=np.uint32),
+    ):
         check_key(key)
-    for keys in (jax.random.split(jax.random.key(0), 3), jax.random.split(jax.random.PRNGKey(0), 3)):
+    for keys in (
+        jax.random.split(jax.random.key(0), 3),
+        jax.random.split(jax.random.PRNGKey(0), 3),
+    ):
         jax.vmap(lambda key: check_key(key) or 0)(keys)
         jax.jit(lambda key: check_key(key))(keys[0])
 
 
 def test_a_part_of_the_structure_is_not_called_unknown():
     loop = jaxtank.presets.find("gouta2015/backstepping").loop
-    with pytest.raises(InputError, match=r"^sensor\.bits is no number of the loop .*rig\.set_values$"):
+    with pytest.raises(
+        InputError, match=r"^sensor\.bits is no number of the loop .*rig\.set_values$"
+    ):
         with_values(loop, {"sensor.bits": 8})

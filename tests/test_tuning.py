@@ -53,10 +53,14 @@ def limited(gouta):
 
 
 def test_backstepping_under_the_rims(gouta, limited):
-    """The published gains reach 33.1 cm in tank 4; the tuned ones keep every tank at or below 30.000 cm, 0.636 cm or better."""
+    """The published gains reach 33.1 cm in tank 4; the tuned ones keep every tank at or below
+    30.000 cm, 0.636 cm or better.
+    """
     assert limited.success and limited.method == "slsqp"
     np.testing.assert_allclose(limited.measures["before"]["max_level"][3], 33.08, atol=0.05)
-    again = jaxtank.evaluate(limited.tuned.loop, gouta("backstepping").clock, ["max_level", "rms_error_total"])
+    again = jaxtank.evaluate(
+        limited.tuned.loop, gouta("backstepping").clock, ["max_level", "rms_error_total"]
+    )
     assert np.all(np.asarray(again["max_level"]) <= 30.0)
     assert float(again["rms_error_total"]) <= 0.636
     assert again["rms_error_total"] == pytest.approx(limited.objective["after"], rel=1e-9)
@@ -65,24 +69,41 @@ def test_backstepping_under_the_rims(gouta, limited):
 def test_the_answer_says_which_tank_is_tight_and_when(limited):
     tight = min(limited.constraints, key=lambda c: c["margin"])
     assert tight["tank"] == 3 and tight["measure"] == "max_level" and 0 <= tight["margin"] < 1e-3
-    assert 800 < tight["time_s"] < 840  # as setpoint 2 comes down to 10 cm and tank 3 has to carry tank 1
+    # as setpoint 2 comes down to 10 cm and tank 3 has to carry tank 1
+    assert 800 < tight["time_s"] < 840
     assert f"tight: max_level of tank 3 at {tight['time_s']:.2f} s" in limited.message
-    assert "starting values break a limit (max_level of tank 3" in limited.message and "tank 4" in limited.message
+    assert (
+        "starting values break a limit (max_level of tank 3" in limited.message
+        and "tank 4" in limited.message
+    )
 
 
 def test_the_answer_says_which_gain_is_barely_felt(gouta, limited):
-    """k acts through k + k1 alone; at the answer a tenth of it changes the error by a hundredth of a percent (checked by runs)."""
+    """k acts through k + k1 alone; at the answer a tenth of it changes the error by a hundredth of
+    a percent (checked by runs).
+    """
     k = limited.parameters["controller.k"]
     less = rig.set_values(
-        gouta("backstepping"), {"controller.k": 0.9 * k["after"], "controller.k1": limited.parameters["controller.k1"]["after"]}
+        gouta("backstepping"),
+        {
+            "controller.k": 0.9 * k["after"],
+            "controller.k1": limited.parameters["controller.k1"]["after"],
+        },
     )
     error = float(jaxtank.evaluate(less.loop, less.clock, "rms_error_total")["rms_error_total"])
-    np.testing.assert_allclose(k["felt_percent"], 100 * abs(error / limited.objective["after"] - 1), rtol=1e-4)
-    assert "controller.k is barely felt" in limited.message and "controller.k1 is barely felt" not in limited.message
+    np.testing.assert_allclose(
+        k["felt_percent"], 100 * abs(error / limited.objective["after"] - 1), rtol=1e-4
+    )
+    assert (
+        "controller.k is barely felt" in limited.message
+        and "controller.k1 is barely felt" not in limited.message
+    )
 
 
 def test_eight_distinct_starts_agree(limited):
-    starts = np.log([[s["from"][n] for n in ("controller.k", "controller.k1")] for s in limited.starts])
+    starts = np.log(
+        [[s["from"][n] for n in ("controller.k", "controller.k1")] for s in limited.starts]
+    )
     apart = np.linalg.norm(starts[:, None] - starts[None], axis=-1) + 99 * np.eye(len(starts))
     assert len(starts) == 8 and apart.min() > 0.1
     held = [s["cost"] for s in limited.starts if s["violation"] == 0]
@@ -103,7 +124,9 @@ def test_first_order_conditions_hold(limited):
 
 
 def test_the_true_step_decides_on_gains_that_only_the_coarse_step_makes_unstable(gouta):
-    """k + k1 = 30 1/s: three times the coarse step's stability limit of 2/0.1 s is passed, the true step's 2/0.01 s is not."""
+    """k + k1 = 30 1/s: three times the coarse step's stability limit of 2/0.1 s is passed, the true
+    step's 2/0.01 s is not.
+    """
     problem = Problem(gouta("backstepping"))
     coarse = coarse_clock(problem.clock)
     assert coarse.dt == pytest.approx(0.1)
@@ -125,26 +148,37 @@ PENALISED = {"rms_error_total": 1.0, "rms_over_rim": 1.0, "saturation_excess": 0
 
 @pytest.mark.parametrize("Tp", [pytest.param(3.0, marks=pytest.mark.slow), 46.0])
 def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
-    """D = 30 s, penalised cost of gouta2015 notes S10: minima at 7.33 s (1.796) and 46 s (2.257), a ridge near 24 s between."""
+    """D = 30 s, penalised cost of gouta2015 notes S10: minima at 7.33 s (1.796) and 46 s (2.257), a
+    ridge near 24 s between.
+    """
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
-    result = tuning.tune(case, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4)
+    result = tuning.tune(
+        case, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4
+    )
     np.testing.assert_allclose(result.parameters["controller.Tp"]["after"], 7.33, atol=0.15)
     np.testing.assert_allclose(result.objective["after"], 1.796, rtol=5e-3)
 
 
-@pytest.mark.parametrize("Tp, cost", [(1, 1.901), (5, 1.833), (7.33, 1.796), (11, 1.956), (18, 2.340), (46, 2.257), (100, 2.648)])
+@pytest.mark.parametrize(
+    "Tp, cost",
+    [(1, 1.901), (5, 1.833), (7.33, 1.796), (11, 1.956), (18, 2.340), (46, 2.257), (100, 2.648)],
+)
 def test_the_penalised_cost_is_that_of_the_tuning_study(gouta, Tp, cost):
     """At 0.05 s, the step of that study; at 0.01 s the flat far end, Tp = 100 s, is 0.5 % higher."""
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": float(Tp), "clock.dt": 0.05})
     values = jaxtank.evaluate(case.loop, case.clock, list(PENALISED))
-    np.testing.assert_allclose(sum(w * float(values[m]) for m, w in PENALISED.items()), cost, rtol=5e-4)
+    np.testing.assert_allclose(
+        sum(w * float(values[m]) for m, w in PENALISED.items()), cost, rtol=5e-4
+    )
 
 
 # any problem
 
 
 def quick(gouta, name="backstepping", values=None, **options):
-    return tuning.tune(gouta(name, {**FAST, **(values or {})}), **{"starts": 2, "screening": 8, **options})
+    return tuning.tune(
+        gouta(name, {**FAST, **(values or {})}), **{"starts": 2, "screening": 8, **options}
+    )
 
 
 @pytest.mark.parametrize("method", [LBFGS, "adam"])
@@ -159,7 +193,11 @@ def test_every_method_improves_and_holds_the_limits(gouta, method):
 def test_every_method_finds_the_unlimited_optimum(gouta, method):
     result = quick(gouta, "ngpc", method=method, limits={})
     best = quick(gouta, "ngpc", method="trf", limits={})
-    assert result.objective["after"] <= 1.01 * best.objective["after"] < 0.6 * result.objective["before"]
+    assert (
+        result.objective["after"]
+        <= 1.01 * best.objective["after"]
+        < 0.6 * result.objective["before"]
+    )
 
 
 def test_a_search_repeats_bit_for_bit(gouta):
@@ -186,7 +224,9 @@ def test_lower_limits_and_several_measures(gouta):
     result = quick(gouta, limits={"min_level": [2.5, 2.5, 0.6, 1.0], "max_error": 2.0})
     assert {c["measure"] for c in result.constraints} == {"min_level", "max_error"}
     for c in result.constraints:
-        assert c["margin"] == pytest.approx(c["value"] - c["limit"] if c["measure"] == "min_level" else c["limit"] - c["value"])
+        assert c["margin"] == pytest.approx(
+            c["value"] - c["limit"] if c["measure"] == "min_level" else c["limit"] - c["value"]
+        )
 
 
 def test_rims_as_physics_turn_the_limit_into_one_of_overflow(gouta):
@@ -204,9 +244,15 @@ def test_a_limit_of_no_overflow_can_be_met_and_is_held_by_the_answer(gouta):
 
 
 def test_the_weight_of_the_objective_does_not_move_the_answer(gouta):
-    plain, heavy = (quick(gouta, "ngpc", limits={}, objective={"rms_error_total": w}) for w in (1.0, 100.0))
+    plain, heavy = (
+        quick(gouta, "ngpc", limits={}, objective={"rms_error_total": w}) for w in (1.0, 100.0)
+    )
     assert heavy.method == "trf" and heavy.success
-    np.testing.assert_allclose(heavy.parameters["controller.Tp"]["after"], plain.parameters["controller.Tp"]["after"], rtol=1e-3)
+    np.testing.assert_allclose(
+        heavy.parameters["controller.Tp"]["after"],
+        plain.parameters["controller.Tp"]["after"],
+        rtol=1e-3,
+    )
 
 
 def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged(gouta):
@@ -250,7 +296,9 @@ def test_forward_and_reverse_derivatives_of_the_problem_agree(gouta, monkeypatch
 
 
 class Bowl:
-    """(z1 - 0.7)^2 + 4 (z2 - 0.2)^2 + 0.1 under z1 <= 0.5: optimum (0.5, 0.2), multiplier 0.4. NaN in a corner."""
+    """(z1 - 0.7)^2 + 4 (z2 - 0.2)^2 + 0.1 under z1 <= 0.5: optimum (0.5, 0.2), multiplier 0.4. NaN
+    in a corner.
+    """
 
     limits = (Limit("max_level", 0, 1.0),)
     rooms = np.ones(1)
@@ -262,7 +310,9 @@ class Bowl:
         cost = (z[0] - 0.7) ** 2 + 4 * (z[1] - 0.2) ** 2 + 0.1
         if z[0] > 0.8 and z[1] > 0.8:
             cost, g = np.nan, g * np.nan
-        return Point(z, cost, g, np.diag([2.0, 8.0]), np.array([0.5 - z[0]]), np.array([[-1.0, 0.0]]), {})
+        return Point(
+            z, cost, g, np.diag([2.0, 8.0]), np.array([0.5 - z[0]]), np.array([[-1.0, 0.0]]), {}
+        )
 
 
 @pytest.mark.parametrize("method", ["slsqp", "lbfgs", "adam"])
@@ -278,7 +328,9 @@ def test_multipliers_of_a_bowl():
     reference = Bowl().point(np.array([0.5, 0.2]))
     search = Search(Bowl(), reference, lambda s: None)
     norm, residual, multipliers = optimality(search, reference)
-    np.testing.assert_allclose((norm, residual, multipliers[0]), (0.4 / search.scale, 0.0, 0.4 / search.scale), atol=1e-12)
+    np.testing.assert_allclose(
+        (norm, residual, multipliers[0]), (0.4 / search.scale, 0.0, 0.4 / search.scale), atol=1e-12
+    )
 
 
 def test_points_that_are_not_finite_are_shrunk_away_from():
@@ -329,43 +381,88 @@ def test_what_cannot_be_used_is_refused_before_anything_runs(gouta, options, wor
 def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(gouta, tmp_path):
     result = quick(gouta)
     names = {p.name for p in result.save(tmp_path / "out")}
-    pictures = {"responses.png", "rig.png", "margins.png", "inner.png", "convergence.png", "landscape.png"}
+    pictures = {
+        "responses.png",
+        "rig.png",
+        "margins.png",
+        "inner.png",
+        "convergence.png",
+        "landscape.png",
+    }
     pictures |= {"clouds.png"} if result.validation else set()
-    assert names == {"result.json", "rig.toml", "trajectory.csv", "before.csv", "report.html", *pictures}
+    assert names == {
+        "result.json",
+        "rig.toml",
+        "trajectory.csv",
+        "before.csv",
+        "report.html",
+        *pictures,
+    }
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
     table = json.loads((tmp_path / "out" / "result.json").read_text())
     case = rig.load(tmp_path / "out" / "rig.toml")
-    values = run_measures(case.loop, case.clock, None)  # the same program: one of other measures may differ in the last bit
+    # the same program: one of other measures may differ in the last bit
+    values = run_measures(case.loop, case.clock, None)
     assert float(values["rms_error_total"]) == table["objective"]["after"]
-    rows = np.genfromtxt(tmp_path / "out" / "trajectory.csv", delimiter=",", names=True, deletechars="")
+    rows = np.genfromtxt(
+        tmp_path / "out" / "trajectory.csv", delimiter=",", names=True, deletechars=""
+    )
     assert np.asarray(rows["h3_[cm]"]).max() <= 30.0 and rows["t_[s]"][-1] == 400.0
 
 
 def test_a_slice_of_the_landscape_is_drawn_where_there_are_more_parameters(gouta):
     figures = quick(
-        gouta, free={"controller.k": (1e-3, 5.0), "controller.k1": (1e-3, 5.0), "controller.level_floor": (1e-3, 1.0)}
+        gouta,
+        free={
+            "controller.k": (1e-3, 5.0),
+            "controller.k1": (1e-3, 5.0),
+            "controller.level_floor": (1e-3, 1.0),
+        },
     ).plot()
-    assert set(figures) - {"clouds"} == {"responses", "rig", "margins", "inner", "convergence", "landscape"}
+    assert set(figures) - {"clouds"} == {
+        "responses",
+        "rig",
+        "margins",
+        "inner",
+        "convergence",
+        "landscape",
+    }
     assert "slice" in figures["landscape"].axes[0].get_title()
 
 
 def test_chatter_is_told_and_drawn(gouta):
-    """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every sample."""
+    """k + k1 = 22 1/s at a step of 0.1 s, past 2/dt: the pumps jump from limit to limit at every
+    sample.
+    """
     from tuning.report.artifacts import run_for_people
     from tuning.search.result import message
 
     wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})
-    assert np.abs(np.diff(run_for_people(wild).u, axis=0)).max() > 5.0  # and not the same sample of every pair
+    # and not the same sample of every pair
+    assert np.abs(np.diff(run_for_people(wild).u, axis=0)).max() > 5.0
     result = quick(gouta)
     calm = result.measures["before"]
     told = {"before": calm, "after": run_measures(wild.loop, wild.clock, None)}
-    z = [float(b.to_unit(p["after"])) for b, p in zip(result.problem.bounds, result.parameters.values())]
+    z = [
+        float(b.to_unit(p["after"]))
+        for b, p in zip(result.problem.bounds, result.parameters.values())
+    ]
     assert "the pumps travel" in message(result.replace(measures=told), z, [None, None], 0)
-    assert "the pumps travel" not in message(result.replace(measures={"before": calm, "after": calm}), z, [None, None], 0)
+    assert "the pumps travel" not in message(
+        result.replace(measures={"before": calm, "after": calm}), z, [None, None], 0
+    )
 
 
 @pytest.mark.filterwarnings("error")
 def test_an_objective_of_zero_gives_no_share_and_no_warning():
-    case = rig.set_values(rig.loads('case = "cascaded/pi"\n[reference]\ninitial = [4.0]\nchanges = []\n'), {"clock.duration": 40.0})
-    result = tuning.tune(case, free={"controller.Kc": (0.5, 2.0)}, starts=1, screening=4, validation=0)
-    assert result.objective["after"] == 0.0 and result.parameters["controller.Kc[0]"]["felt_percent"] is None
+    case = rig.set_values(
+        rig.loads('case = "cascaded/pi"\n[reference]\ninitial = [4.0]\nchanges = []\n'),
+        {"clock.duration": 40.0},
+    )
+    result = tuning.tune(
+        case, free={"controller.Kc": (0.5, 2.0)}, starts=1, screening=4, validation=0
+    )
+    assert (
+        result.objective["after"] == 0.0
+        and result.parameters["controller.Kc[0]"]["felt_percent"] is None
+    )

@@ -19,11 +19,14 @@ CODE = HERE / "type_checks"
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory):
     """{file: lines of it with an error} of pyright's basic mode."""
-    pyright = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which("pyright")
+    pyright = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which(
+        "pyright"
+    )
     if pyright is None:
         pytest.skip("pyright is not installed: pip install pyright")
     started = subprocess.run([pyright, "--version"], capture_output=True, text=True)
-    if started.returncode != 0:  # the package of PyPI fetches the program itself when it is first run
+    # the package of PyPI fetches the program itself when it is first run
+    if started.returncode != 0:
         pytest.skip(f"pyright cannot run here: {started.stderr[-200:]}")
     folder = tmp_path_factory.mktemp("types")
     (folder / "pyrightconfig.json").write_text('{"typeCheckingMode": "basic"}')
@@ -50,8 +53,15 @@ def test_mistyped_names_and_keywords_are_reported(reported):
 @pytest.mark.parametrize("package", [jaxtank, tuning])
 def test_a_type_checker_is_given_every_public_name_from_where_it_is(package):
     tree = ast.parse(Path(package.__file__).read_text())
-    (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
-    given = {a.asname: (n.module, a.name) for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    (block,) = (
+        n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
+    )
+    given = {
+        a.asname: (n.module, a.name)
+        for n in block.body
+        if isinstance(n, ast.ImportFrom)
+        for a in n.names
+    }
     assert set(package.__all__) <= set(given)
     table = {name: (module, name) for name, module in package._NAMES.items()}
     assert {name: given[name] for name in table} == table

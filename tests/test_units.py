@@ -26,7 +26,8 @@ FLOW = ("m", "m^3/s")
         ("V^2 s", ("m", "U0"), "U0^2 s"),
         ("V^2 s", ("cm", "V"), "V^2 s"),
         ("cm/volt", ("m", "V"), "m/V"),
-        # a pump input that holds the name of a length, and one that looks like a group of an expression
+        # a pump input that holds the name of a length, and one that looks like a group of an
+        # expression
         ("V", ("m", "cm^3/s"), "cm^3/s"),
         ("cm/V", ("mm", "cm^3/s"), "mm/(cm^3/s)"),
         ("V", ("m", r"a\1"), r"a\1"),
@@ -73,7 +74,10 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
         "[reference]\ninitial = [10.0]\nchanges = [[5.0, 1, 12.0]]\n"
     )
     for language in ("c", "m"):
-        assert main.main(["export", str(file), "--lang", language, "--out", str(tmp_path / language)]) == 0
+        assert (
+            main.main(["export", str(file), "--lang", language, "--out", str(tmp_path / language)])
+            == 0
+        )
         (source,) = (tmp_path / language).glob(f"*.{language}")
         text = source.read_text()
         assert "controller.Kc = [1.] (L/min)/cm" in text and "controller.bias = [" in text

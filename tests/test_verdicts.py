@@ -33,7 +33,9 @@ class Valley:
     def point(self, z):
         side = 1.0 if z[0] >= 0.6 else -1.0
         cost, g = abs(z[0] - 0.6) + (z[1] - 0.3) ** 2 + 1.0, np.array([side, 2 * (z[1] - 0.3)])
-        return Point(z, cost, g, np.eye(2), np.array([z[1] - self.floor]), np.array([[0.0, 1.0]]), {})
+        return Point(
+            z, cost, g, np.eye(2), np.array([z[1] - self.floor]), np.array([[0.0, 1.0]]), {}
+        )
 
 
 def looked_at(valley, z):
@@ -54,7 +56,9 @@ def test_slsqp_on_the_kink_is_no_false_success():
     assert search.best.cost < 1.0 + 1e-3
 
 
-@pytest.mark.parametrize("name", ["calofir/backstepping", "cascaded/pi", "gouta2015/backstepping", "khalid/gpc"])
+@pytest.mark.parametrize(
+    "name", ["calofir/backstepping", "cascaded/pi", "gouta2015/backstepping", "khalid/gpc"]
+)
 def test_room_of_a_limit_is_of_its_own_size_in_any_unit(name):
     """A back-off of 1e-6 of it must leave room below the limit, which in cubic metres is 1e-8."""
     case = presets.find(name)
@@ -66,12 +70,22 @@ def test_room_of_a_limit_is_of_its_own_size_in_any_unit(name):
 
 @pytest.mark.slow
 def test_a_limit_in_cubic_metres_is_met_where_it_is_tight():
-    """Found by a grid of 40 by 40: 0.00597149 m at K = (0.0523, 0.0212) 1/s; a search that scaled the limit by 1 m^3/s ended at 0.00598032."""
+    """Found by a grid of 40 by 40: 0.00597149 m at K = (0.0523, 0.0212) 1/s; a search that scaled
+    the limit by 1 m^3/s ended at 0.00598032.
+    """
     case = presets.find("calofir/backstepping")
-    result = tuning.tune(case, limits={"max_level": "rim", "input_travel": 1e-3}, starts=2, screening=16, validation=0)
+    result = tuning.tune(
+        case,
+        limits={"max_level": "rim", "input_travel": 1e-3},
+        starts=2,
+        screening=16,
+        validation=0,
+    )
     assert result.success and result.objective["after"] < 0.0059715
     travel = next(c for c in result.constraints if c["measure"] == "input_travel")
-    assert 0 <= travel["margin"] < 1e-3 * travel["limit"] and "tight: input_travel" in result.message
+    assert (
+        0 <= travel["margin"] < 1e-3 * travel["limit"] and "tight: input_travel" in result.message
+    )
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +118,9 @@ def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure(quick):
 
 @pytest.mark.slow
 def test_a_staircase_is_not_called_an_optimum(quick):
-    result = tuning.tune(quick, objective={"settling_time": 1.0}, limits={}, starts=1, screening=4, validation=0)
+    result = tuning.tune(
+        quick, objective={"settling_time": 1.0}, limits={}, starts=1, screening=4, validation=0
+    )
     assert result.status == "not_converged" and "changes in steps" in result.message
 
 
@@ -125,15 +141,37 @@ def test_what_is_given_twice_or_empty_is_refused(words, capsys):
 
 @pytest.mark.slow
 def test_a_lowest_level_is_told_with_its_time(quick):
-    result = tuning.tune(quick, limits={"min_level": 0.2}, starts=1, screening=1, iterations=2, validation=0)
+    result = tuning.tune(
+        quick, limits={"min_level": 0.2}, starts=1, screening=1, iterations=2, validation=0
+    )
     assert all(0 <= c["time_s"] <= 1200 for c in result.constraints)
 
 
 @pytest.mark.slow
 def test_a_search_over_choices_is_resumed(tmp_path, capsys):
     """Killed after its first combination: the same answer, and no log is left."""
-    words = ["--choose", "controller.pairing=cross,same", "--free", "controller.b=0.5:3", "--scenario", "none", "--dt", "0.5"]
-    words += ["--starts", "1", "--screening", "2", "--iterations", "3", "--validation", "0", "--quiet", "--json"]
+    words = [
+        "--choose",
+        "controller.pairing=cross,same",
+        "--free",
+        "controller.b=0.5:3",
+        "--scenario",
+        "none",
+        "--dt",
+        "0.5",
+    ]
+    words += [
+        "--starts",
+        "1",
+        "--screening",
+        "2",
+        "--iterations",
+        "3",
+        "--validation",
+        "0",
+        "--quiet",
+        "--json",
+    ]
     whole, halted = tmp_path / "whole", tmp_path / "halted"
     main.main(["tune", "mirakhorli/hybrid", *words, "--out", str(whole)])
     first = json.loads(capsys.readouterr().out)
@@ -145,7 +183,11 @@ def test_a_search_over_choices_is_resumed(tmp_path, capsys):
             raise RuntimeError("killed")
 
     case = rig.set_values(presets.find("mirakhorli/hybrid"), {"clock.dt": 0.5})
-    options = dict(free={"controller.b": (0.5, 3.0)}, scenarios=(), choices={"controller.pairing": ["cross", "same"]})
+    options = dict(
+        free={"controller.b": (0.5, 3.0)},
+        scenarios=(),
+        choices={"controller.pairing": ["cross", "same"]},
+    )
     options |= dict(starts=1, screening=2, iterations=3, validation=0)
     with pytest.raises(RuntimeError):
         tuning.tune(case, log=halted, progress=stop, **options)
@@ -171,7 +213,9 @@ def edited(tmp_path, **lines):
     """The path of watertank.toml with the values of some keys replaced; None drops the line."""
     text = Path(WATERTANK).read_text()
     for key, value in lines.items():
-        text, count = re.subn(rf"(?m)^{key} = .*$", "" if value is None else f"{key} = {value}", text)
+        text, count = re.subn(
+            rf"(?m)^{key} = .*$", "" if value is None else f"{key} = {value}", text
+        )
         assert count == 1
     path = tmp_path / "rig.toml"
     path.write_text(text)
@@ -182,7 +226,9 @@ def edited(tmp_path, **lines):
 def test_one_start_does_not_end_above_a_screened_point(capsys, seed):
     """The search from the rig's own values ends at 1.0285; a screened point within the limits is at
     0.187, and 8 starts find 0.18719."""
-    code, found, _ = told(capsys, "tune", WATERTANK, "--starts", "1", "--seed", seed, "--validation", "0")
+    code, found, _ = told(
+        capsys, "tune", WATERTANK, "--starts", "1", "--seed", seed, "--validation", "0"
+    )
     assert code == 0 and found["objective"]["after"] < 0.1872
     assert all(c["margin"] >= 0 for c in found["constraints"])
     assert found["starts"][0]["cost"] > 1.0 and len(found["starts"]) == 2
@@ -199,7 +245,11 @@ def test_a_trade_off_starts_from_what_was_screened(capsys):
     case = rig.load(WATERTANK)
     loop = jaxtank.with_values(case.loop, points[-1]["parameters"])
     held = jaxtank.evaluate(loop, case.clock, ["overshoot_percent", "rise_time", "settling_time"])
-    assert held["overshoot_percent"][0] == 0.0 and held["rise_time"][0] <= 2.5 and held["settling_time"][0] <= 20.0
+    assert (
+        held["overshoot_percent"][0] == 0.0
+        and held["rise_time"][0] <= 2.5
+        and held["settling_time"][0] <= 20.0
+    )
 
 
 NOISY = [
@@ -216,8 +266,9 @@ NOISY = [
 
 
 def test_a_search_leaves_an_unstable_start_or_gives_the_reason_why_it_cannot(capsys):
-    """At the paper's gains the loop with this noise and delay is unstable and its slopes exceed 1e9,
-    so no search can begin there."""
+    """At the paper's gains the loop with this noise and delay is unstable and its slopes exceed
+    1e9, so no search can begin there.
+    """
     words = ["--scenario", "none", "--starts", "1", "--screening", "8", "--validation", "0"]
     code, found, _ = told(capsys, "tune", *NOISY, *words, "--free", "controller.Tp=0.1:20")
     assert code == 0 and found["objective"]["after"] < 0.975 * found["objective"]["before"]
@@ -229,37 +280,65 @@ def test_a_search_leaves_an_unstable_start_or_gives_the_reason_why_it_cannot(cap
 @pytest.mark.slow
 def test_robust_tuning_with_one_start_leaves_an_unstable_one(capsys):
     """The objective at the start is 5.27, of several starts 4.83."""
-    words = ["--robust", "mean", "--samples", "4", "--fresh", "4", "--screening", "16", "--starts", "1"]
+    words = [
+        "--robust",
+        "mean",
+        "--samples",
+        "4",
+        "--fresh",
+        "4",
+        "--screening",
+        "16",
+        "--starts",
+        "1",
+    ]
     varied = ["--vary", "plant.pump_gain=uniform:10%", "--vary", "plant.drain=uniform:5%"]
     code, found, _ = told(capsys, "tune", *NOISY, *words, *varied)
     assert code == 0 and found["objective"]["after"] < 4.84 < 5.2 < found["objective"]["before"]
 
 
-@pytest.mark.parametrize("command", [["tune", "--starts", "1"], ["uncertainty", "--vary", "plant.drain=uniform:5%"]])
+@pytest.mark.parametrize(
+    "command", [["tune", "--starts", "1"], ["uncertainty", "--vary", "plant.drain=uniform:5%"]]
+)
 @pytest.mark.parametrize(
     "limit, why",
-    [("settling_time=10", "no setpoint is stepped within its 40 s"), ("overshoot_percent=5", "--limit overshoot_percent=none")],
+    [
+        ("settling_time=10", "no setpoint is stepped within its 40 s"),
+        ("overshoot_percent=5", "--limit overshoot_percent=none"),
+    ],
 )
 def test_a_limit_that_no_run_can_be_measured_by_is_refused(capsys, tmp_path, command, limit, why):
     path = edited(tmp_path, changes="[]")
     assert main.main([command[0], path, *command[1:], "--limit", "none", "--limit", limit]) == 2
     out, err = capsys.readouterr()
     assert out == "" and err.count("\n") == 1
-    assert err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ") and "undefined on this run" in err and why in err
+    assert (
+        err.startswith(f"jaxtank: limit {limit.replace('=', ' = ')} ")
+        and "undefined on this run" in err
+        and why in err
+    )
 
 
 def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
     case = gouta("backstepping", {"clock.dt": 0.5})
-    case = case.replace(loop=dataclasses.replace(case.loop, reference=ramps((3.0, 3.0), ((5.0, 0, 8.0),), ramp=40.0)))
+    case = case.replace(
+        loop=dataclasses.replace(
+            case.loop, reference=ramps((3.0, 3.0), ((5.0, 0, 8.0),), ramp=40.0)
+        )
+    )
     assert [limit.index for limit in resolve_limits(case, {"settling_time": 50.0})] == [0]
     still = case.replace(clock=dataclasses.replace(case.clock, duration=4.0))
     with pytest.raises(
-        jaxtank.InputError, match=r"settling_time = 50 s: undefined on this run: no setpoint is stepped within its 4 s"
+        jaxtank.InputError,
+        match=r"settling_time = 50 s: undefined on this run: no setpoint is stepped within its 4 s",
     ):
         resolve_limits(still, {"settling_time": 50.0})
     quiet = presets.find("gouta2022/chadpc")
     quiet = quiet.replace(clock=dataclasses.replace(quiet.clock, duration=400.0))
-    with pytest.raises(jaxtank.InputError, match="recovery_time = 5 s: undefined on this run: nothing is poured within its 400 s"):
+    with pytest.raises(
+        jaxtank.InputError,
+        match="recovery_time = 5 s: undefined on this run: nothing is poured within its 400 s",
+    ):
         resolve_limits(quiet, {"recovery_time": 5.0})
 
 
@@ -270,21 +349,32 @@ def test_what_becomes_undefined_in_the_search_breaks_its_limit(capsys, tmp_path)
     code, found, _ = told(capsys, "tune", path, *free, "--starts", "1", "--validation", "0")
     (row,) = found["constraints"]
     assert code in (3, 4) and row["value"] is None and row["margin"] < 0 and "90 %" in row["reason"]
-    assert "rise_time of output 1 is undefined (no change of the setpoint was followed to 90 %" in found["message"]
-    code, found, _ = told(capsys, "uncertainty", path, "--samples", "8", "--vary", "plant.drain=uniform:5%")
+    assert (
+        "rise_time of output 1 is undefined (no change of the setpoint was followed to 90 %"
+        in found["message"]
+    )
+    code, found, _ = told(
+        capsys, "uncertainty", path, "--samples", "8", "--vary", "plant.drain=uniform:5%"
+    )
     assert code == 0 and found["violations"][0]["count"] == 8
 
 
 def test_gains_that_no_run_exercises_are_kept(capsys):
-    """The setpoint goes from 1 to 2 cm: knots at 5 and 8 cm have no effect, nor has the one at 1 cm,
-    where there is no error."""
+    """The setpoint goes from 1 to 2 cm: knots at 5 and 8 cm have no effect, nor has the one at 1
+    cm, where there is no error.
+    """
     words = ["--schedule", "controller.Kc[0]=r1:1,2,5,8", "--starts", "2", "--validation", "0"]
     code, found, _ = told(capsys, "tune", WATERTANK, *words)
     assert code == 0
     idle = [n for n, p in found["parameters"].items() if not p["exercised"]]
     assert idle == ["controller.values[0,0]", "controller.values[0,2]", "controller.values[0,3]"]
-    assert all(found["parameters"][n]["after"] == found["parameters"][n]["before"] == 1.6 for n in idle)
+    assert all(
+        found["parameters"][n]["after"] == found["parameters"][n]["before"] == 1.6 for n in idle
+    )
     assert found["parameters"]["controller.values[0,1]"]["after"] == pytest.approx(3.05, abs=0.02)
-    assert "no run exercises controller.values[0,0] 1.6 V/cm, controller.values[0,2]" in found["message"]
+    assert (
+        "no run exercises controller.values[0,0] 1.6 V/cm, controller.values[0,2]"
+        in found["message"]
+    )
     others = [words for words in found["message"].split("; ") if "no run exercises" not in words]
     assert not any(n in words for n in idle for words in others)

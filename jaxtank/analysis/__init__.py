@@ -1,4 +1,6 @@
-"""Steady states, linear models, Riccati equations and quadratic programmes of a rig, before it is run."""
+"""Steady states, linear models, Riccati equations and quadratic programmes of a rig, before it is
+run.
+"""
 
 from jaxtank.analysis.steady_state import (
     equilibrium,

@@ -1,11 +1,13 @@
-"""Small quadratic programmes with two-sided rows, solved by an interior point and differentiable in everything.
+"""Small quadratic programmes with two-sided rows, solved by an interior point and differentiable in
+everything.
 
     min_x 1/2 x'H x + f'x    subject to    l <= G x <= u
 
-Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl the slacks of the two sides), which
-ends when it has arrived. Its derivatives are those of the optimality conditions: the implicit function theorem at the solution, in forward
-and in reverse mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A run that is not differentiated does
-not pay for them.
+Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl
+the slacks of the two sides), which ends when it has arrived. Its derivatives are those of the
+optimality conditions: the implicit function theorem at the solution, in forward and in reverse
+mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A run that
+is not differentiated does not pay for them.
 """
 
 import functools
@@ -17,17 +19,24 @@ import jax.numpy as jnp
 import numpy as np
 
 MU_MIN = 1e-12
-"""Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a closed loop by percents, 1e-13 loses
-digits in the normal matrix (khalid notes S4.5)."""
+"""Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a
+closed loop by percents, 1e-13 loses digits in the normal matrix (khalid notes S4.5).
+"""
 
 OFF = 1e-4
-"""How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not their mean: the derivatives are those of
-the central path, and a row that ends elsewhere, as it will at a corner, bends the slope that differences see by percents."""
-NEAR = 100.0  # largest complementarity, in MU_MIN, from which on plain Newton steps go straight to the central path
+"""How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not
+their mean: the derivatives are those of the central path, and a row that ends elsewhere, as it will
+at a corner, bends the slope that differences see by percents.
+"""
+# largest complementarity, in MU_MIN, from which on plain Newton steps go straight to the central
+# path
+NEAR = 100.0
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
 MOST = 40
-"""Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to 20 (8 leave 3e-7 of the answer in easy
-ones, khalid notes S4.5; 15 left a pump at 0.003 V that belonged at 0)."""
+"""Iterations at most. Most programmes of a closed loop take 6, those at the edge of a limit up to
+20 (8 leave 3e-7 of the answer in easy ones, khalid notes S4.5; 15 left a pump at 0.003 V that
+belonged at 0).
+"""
 
 CORRECTIONS = 4  # of a derivative
 UNROLLED = 40  # variables up to which the elimination is written out
@@ -36,7 +45,9 @@ BACK = 0.99  # share of the way to the nearest bound that a step may go
 
 
 class Point(NamedTuple):
-    """An iterate: x (n,); slacks and multipliers of the upper and lower sides (rows,), all positive."""
+    """An iterate: x (n,); slacks and multipliers of the upper and lower sides (rows,), all
+    positive.
+    """
 
     x: jax.Array
     su: jax.Array
@@ -49,8 +60,9 @@ class Point(NamedTuple):
 def solve(H, f, G, l, u, iterations=MOST):
     """x (n,) that minimises 1/2 x'Hx + f'x within l <= G x <= u.
 
-    H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u; iterations: the most that are done. Rows may
-    be collinear, and x is unique all the same. A problem without a feasible point gives a meaningless x: nothing is raised inside a trace.
+    H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u;
+    iterations: the most that are done. Rows may be collinear, and x is unique all the same. A
+    problem without a feasible point gives a meaningless x: nothing is raised inside a trace.
     Differentiable in all five.
     """
     unit, inside = _scaled(H, f, G, l, u)
@@ -58,9 +70,11 @@ def solve(H, f, G, l, u, iterations=MOST):
 
 
 def _scaled(H, f, G, l, u):
-    """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length 1, and a z of the order of 1, for what the
-    iterates begin and end with are plain numbers. The unit of x is the largest of the narrowest row, of the slope at 0, and of how far from there
-    the limits are."""
+    """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length
+    1, and a z of the order of 1, for what the iterates begin and end with are plain numbers. The
+    unit of x is the largest of the narrowest row, of the slope at 0, and of how far from there the
+    limits are.
+    """
     each = jax.lax.rsqrt(jnp.diagonal(H))
     length = jnp.sqrt(jnp.sum((G * each) ** 2, axis=1))
     length = jnp.where(length > 0.0, length, 1.0)
@@ -69,7 +83,13 @@ def _scaled(H, f, G, l, u):
     # held as they are: the answer does not depend on them but for what the corners are rounded by
     each, length, size = jax.lax.stop_gradient((each, length, size))
     row = 1.0 / (length * size)
-    return size * each, (H * jnp.outer(each, each), f * each / size, G * (each / length[:, None]), l * row, u * row)
+    return size * each, (
+        H * jnp.outer(each, each),
+        f * each / size,
+        G * (each / length[:, None]),
+        l * row,
+        u * row,
+    )
 
 
 @solve.defjvp
@@ -81,7 +101,9 @@ def _slope(iterations, primals, tangents):
 
 @jax.custom_jvp
 def _held(point, H, f, G, l, u):
-    """The solution `point` as it is, but knowing how it moves with the data: what derivatives of derivatives ask for."""
+    """The solution `point` as it is, but knowing how it moves with the data: what derivatives of
+    derivatives ask for.
+    """
     return point
 
 
@@ -94,17 +116,22 @@ def _held_slope(primals, tangents):
     dx = _implicit(found, data, moved)
     dg = data[2] @ dx + moved[2] @ x
     dsu, dsl = moved[4] - dg, dg - moved[3]
-    return found, Point(dx, dsu, dsl, -lu / su * dsu, -ll / sl * dsl)  # along the path on which every product s lam stays
+    # along the path on which every product s lam stays
+    return found, Point(dx, dsu, dsl, -lu / su * dsu, -ll / sl * dsl)
 
 
 def _implicit(point, data, moved):
-    """How x moves when the `data` (H, f, G, l, u) do: one Newton step on the optimality conditions at the solution,
+    """How x moves when the `data` (H, f, G, l, u) do: one Newton step on the optimality conditions
+    at the solution,
 
         H dx + A' v = a,    A dx - D v = b,
 
-    of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that every entry is of the order of 1. The matrix
-    H + A' D^-1 A that v leaves for dx (`_normal`) loses four to ten digits of H in the shadow of binding rows; corrections by what the two
-    equations above leave bring them back. The elimination itself is not differentiated: second derivatives are those of a linear system."""
+    of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
+    every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
+    loses four to ten digits of H in the shadow of binding rows; corrections by what the two
+    equations above leave bring them back. The elimination itself is not differentiated: second
+    derivatives are those of a linear system.
+    """
     H, _, G, _, _ = data
     x, su, sl, lu, ll = point
     up, low = lu / su, ll / sl
@@ -120,7 +147,9 @@ def _implicit(point, data, moved):
     factor = _factor(jax.lax.stop_gradient(normal))
 
     def solved(right):
-        return jax.lax.custom_linear_solve(lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True)
+        return jax.lax.custom_linear_solve(
+            lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True
+        )
 
     def corrected(found, _):
         dx, v = found
@@ -128,15 +157,20 @@ def _implicit(point, data, moved):
         step = solved(left + A.T @ (over / D))
         return (dx + step, v + (A @ step - over) / D), None
 
-    return jax.lax.scan(corrected, (jnp.zeros_like(a), jnp.zeros_like(b)), None, length=1 + CORRECTIONS)[0][0]
+    return jax.lax.scan(
+        corrected, (jnp.zeros_like(a), jnp.zeros_like(b)), None, length=1 + CORRECTIONS
+    )[0][0]
 
 
 def interior_point(H, f, G, l, u, iterations=MOST):
-    """The `Point` at which the iterates have arrived, or the last of `iterations`; arguments as in `solve`. Not for reverse mode."""
+    """The `Point` at which the iterates have arrived, or the last of `iterations`; arguments as in
+    `solve`. Not for reverse mode.
+    """
     rows = G.shape[0]
     x = jnp.zeros_like(f)
     one = jnp.full(rows, 0.1, f.dtype)
-    rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))  # of a slack
+    # of a slack
+    rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
     start = Point(x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), one, one)
 
     def residuals(p):
@@ -146,7 +180,10 @@ def interior_point(H, f, G, l, u, iterations=MOST):
     def under_way(state):
         k, p = state
         worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in residuals(p)]))
-        off = [jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam) for s, lam in ((p.su, p.lu), (p.sl, p.ll))]
+        off = [
+            jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam)
+            for s, lam in ((p.su, p.lu), (p.sl, p.ll))
+        ]
         return (k < iterations) & ~((jnp.maximum(*off) < OFF * MU_MIN) & (worst < RESIDUAL))
 
     def advance(state):
@@ -156,26 +193,44 @@ def interior_point(H, f, G, l, u, iterations=MOST):
         factor = _factor(_normal(H, G, p))
 
         def towards(cu, cl):
-            """The step that clears the residuals and brings s * lam to the values that leave cu and cl."""
-            dx = -_substitute(factor, dual + G.T @ ((p.lu * up - cu) / p.su - (p.ll * low - cl) / p.sl))
+            """The step that clears the residuals and brings s * lam to the values that leave cu and
+            cl.
+            """
+            dx = -_substitute(
+                factor, dual + G.T @ ((p.lu * up - cu) / p.su - (p.ll * low - cl) / p.sl)
+            )
             dg = G @ dx
             dsu, dsl = -up - dg, dg - low
             return Point(dx, dsu, dsl, -(cu + p.lu * dsu) / p.su, -(cl + p.ll * dsl) / p.sl)
 
         guess = towards(p.su * p.lu, p.sl * p.ll)
         reach = _reach(p, guess, 1.0)
-        after = ((p.su + reach * guess.su) @ (p.lu + reach * guess.lu) + (p.sl + reach * guess.sl) @ (p.ll + reach * guess.ll)) / (
-            2 * rows
-        )
+        after = (
+            (p.su + reach * guess.su) @ (p.lu + reach * guess.lu)
+            + (p.sl + reach * guess.sl) @ (p.ll + reach * guess.ll)
+        ) / (2 * rows)
         near = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll)) < NEAR * MU_MIN
         centre = jnp.where(near, MU_MIN, jnp.maximum((after / mu) ** 3 * mu, MU_MIN))
         ahead = jnp.where(near, 0.0, 1.0)
-        step = towards(p.su * p.lu + ahead * guess.su * guess.lu - centre, p.sl * p.ll + ahead * guess.sl * guess.ll - centre)
+        step = towards(
+            p.su * p.lu + ahead * guess.su * guess.lu - centre,
+            p.sl * p.ll + ahead * guess.sl * guess.ll - centre,
+        )
         reach = _reach(p, step, BACK)
         new = jax.tree.map(lambda a, b: a + reach * b, p, step)
-        # where no point is feasible the multipliers grow until they are no numbers: the last that were are kept
-        good = jnp.sum(jnp.abs(new.x)) + jnp.sum(new.lu) + jnp.sum(new.ll) + jnp.sum(new.su) + jnp.sum(new.sl) < 1e300
-        return jnp.where(good, k + 1, iterations), jax.tree.map(lambda a, b: jnp.where(good, b, a), p, new)
+        # where no point is feasible the multipliers grow until they are no numbers: the last that
+        # were are kept
+        good = (
+            jnp.sum(jnp.abs(new.x))
+            + jnp.sum(new.lu)
+            + jnp.sum(new.ll)
+            + jnp.sum(new.su)
+            + jnp.sum(new.sl)
+            < 1e300
+        )
+        return jnp.where(good, k + 1, iterations), jax.tree.map(
+            lambda a, b: jnp.where(good, b, a), p, new
+        )
 
     return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 
@@ -203,18 +258,24 @@ def _weighted(G, weight):
 
 
 def _reach(p, step, back):
-    """The largest share, at most 1, of `step` that keeps slacks and multipliers positive, short of the bound by `back`."""
-    shares = [jnp.min(jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0)) for v, d in zip(p[1:], step[1:])]
+    """The largest share, at most 1, of `step` that keeps slacks and multipliers positive, short of
+    the bound by `back`.
+    """
+    shares = [
+        jnp.min(jnp.where(d < 0, -back * v / jnp.where(d < 0, d, -1.0), 1.0))
+        for v, d in zip(p[1:], step[1:])
+    ]
     return jnp.minimum(1.0, jnp.min(jnp.stack(shares)))
 
 
 def _factor(A):
     """Return a factor of A (n, n) symmetric positive definite, for `_substitute`.
 
-    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by column.
-    Above: `_cholesky`. No LAPACK in either. Its call takes longer than the work on so small a matrix,
-    and in jaxlib 0.10 a batched call divides its work among the threads on which it runs itself: as
-    many such calls at once as there are threads wait for each other for ever.
+    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by
+        column.
+    Above: `_cholesky`. No LAPACK in either. Its call takes longer than the work on so small a
+    matrix, and in jaxlib 0.10 a batched call divides its work among the threads on which it runs
+    itself: as many such calls at once as there are threads wait for each other for ever.
     """
     if A.shape[0] > UNROLLED:
         return _cholesky(A)
@@ -240,11 +301,12 @@ def _substitute(factor, b):
 
 @jax.jit
 def _cholesky(A):
-    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is not).
+    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is
+    not).
 
-    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts of
-    fixed shape, so that little of a product is spent on entries that are zero. `codegen` writes this
-    function and `_cholesky_solve` as loops of its own: it knows them by their names.
+    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts
+    of fixed shape, so that little of a product is spent on entries that are zero. `codegen` writes
+    this function and `_cholesky_solve` as loops of its own: it knows them by their names.
     """
     n = A.shape[0]
     ends = [round(n * k / STAGES) for k in range(STAGES + 1)]

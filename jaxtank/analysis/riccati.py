@@ -1,11 +1,15 @@
-"""Linear systems: discretisation, Lyapunov and Riccati equations, linear-quadratic gains. Jittable and differentiable, forward and
-reverse; for use in front of the time loop (in a law's `step` too: the loop moves such work out of itself)."""
+"""Linear systems: discretisation, Lyapunov and Riccati equations, linear-quadratic gains. Jittable
+and differentiable, forward and reverse; for use in front of the time loop (in a law's `step` too:
+the loop moves such work out of itself).
+"""
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import expm
 
-SIGN_STEPS = 30  # scaled Newton steps of the matrix sign: about 10 are needed; once it has converged, more change nothing
+# scaled Newton steps of the matrix sign: about 10 are needed; once it has converged, more change
+# nothing
+SIGN_STEPS = 30
 DOUBLINGS = 40  # 2^40 samples of memory: closed-loop poles up to 1 - 1e-11
 
 
@@ -21,9 +25,11 @@ def zero_order_hold(A, B, dt):
 
 
 def lyapunov(A, Q):
-    """X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns: meant for n up to about 10.
+    """X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns: meant for n up to about
+    10.
 
-    A: (n, n) [1/s]; Q: (n, n) [unit of X per s]. Unique where no two eigenvalues of A sum to zero; otherwise not finite.
+    A: (n, n) [1/s]; Q: (n, n) [unit of X per s]. Unique where no two eigenvalues of A sum to zero;
+        otherwise not finite.
     """
     n = A.shape[0]
     eye = jnp.eye(n)
@@ -31,7 +37,9 @@ def lyapunov(A, Q):
 
 
 def discrete_lyapunov(A, Q):
-    """X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns. A: (n, n) [-]; Q: (n, n) [unit of X]."""
+    """X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns. A: (n, n) [-]; Q: (n, n)
+    [unit of X].
+    """
     n = A.shape[0]
     return jnp.linalg.solve(jnp.eye(n * n) - jnp.kron(A, A), jnp.ravel(Q)).reshape(n, n)
 
@@ -39,12 +47,14 @@ def discrete_lyapunov(A, Q):
 def riccati(A, B, Q, R):
     """The stabilising P (n, n) of A'P + P A - P B R^-1 B'P + Q = 0.
 
-    A: (n, n) [1/s]; B: (n, m); Q: (n, n) symmetric, at least 0; R: (m, m) symmetric, above 0. Needs (A, B) stabilisable and no mode
-    of A on the imaginary axis that Q does not see; otherwise P is not finite, or not a solution.
+    A: (n, n) [1/s]; B: (n, m); Q: (n, n) symmetric, at least 0; R: (m, m) symmetric, above 0. Needs
+    (A, B) stabilisable and no mode of A on the imaginary axis that Q does not see; otherwise P is
+    not finite, or not a solution.
 
-    P0 comes from the matrix sign of the Hamiltonian (Roberts 1980), without derivatives. One Newton step of Kleinman (1968) from P0,
-    a Lyapunov equation, gives P and its derivatives: Newton's map has slope zero in P0 at the solution, so what is left, its slope in
-    A, B, Q and R, is the derivative of the implicit function.
+    P0 comes from the matrix sign of the Hamiltonian (Roberts 1980), without derivatives. One Newton
+    step of Kleinman (1968) from P0, a Lyapunov equation, gives P and its derivatives: Newton's map
+    has slope zero in P0 at the solution, so what is left, its slope in A, B, Q and R, is the
+    derivative of the implicit function.
     """
     P = jax.lax.stop_gradient(_riccati_by_sign(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R))))
     K = jnp.linalg.solve(R, B.T @ P)
@@ -66,13 +76,15 @@ def _riccati_by_sign(A, B, Q, R):
     left = jnp.concatenate([S[:n, n:], S[n:, n:] + jnp.eye(n)])
     right = -jnp.concatenate([S[:n, :n] + jnp.eye(n), S[n:, :n]])
     P = _symmetric(jnp.linalg.solve(left.T @ left, left.T @ right))
-    # the normal equations square the condition number, and one Newton step mends it: the derivatives are taken at the solution
+    # the normal equations square the condition number, and one Newton step mends it: the
+    # derivatives are taken at the solution
     K = jnp.linalg.solve(R, B.T @ P)
     return _symmetric(lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
 
 def lqr(A, B, Q, R):
-    """K (m, n) of u = -K x, the least of the integral of x'Q x + u'R u: R^-1 B'P (mirakhorli eq. 15, without its transpose).
+    """K (m, n) of u = -K x, the least of the integral of x'Q x + u'R u: R^-1 B'P (mirakhorli eq.
+    15, without its transpose).
 
     Arguments as in `riccati`.
     """
@@ -82,13 +94,16 @@ def lqr(A, B, Q, R):
 def discrete_riccati(A, B, Q, R):
     """The stabilising P (n, n) of P = A'P A - A'P B (R + B'P B)^-1 B'P A + Q.
 
-    A: (n, n) [-]; B: (n, m); Q: (n, n) symmetric, at least 0; R: (m, m) symmetric, above 0. For a Kalman filter's prior covariance
-    give A', C' and the covariances of process and measurement. Conditions as in `riccati`, with the unit circle.
+    A: (n, n) [-]; B: (n, m); Q: (n, n) symmetric, at least 0; R: (m, m) symmetric, above 0. For a
+    Kalman filter's prior covariance give A', C' and the covariances of process and measurement.
+    Conditions as in `riccati`, with the unit circle.
 
-    P0 by structured doubling (Anderson 1978; Chu et al. 2004), without derivatives; P and its derivatives by one step of
-    Hewer (1971), as in `riccati`.
+    P0 by structured doubling (Anderson 1978; Chu et al. 2004), without derivatives; P and its
+    derivatives by one step of Hewer (1971), as in `riccati`.
     """
-    P = jax.lax.stop_gradient(_discrete_riccati_by_doubling(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R))))
+    P = jax.lax.stop_gradient(
+        _discrete_riccati_by_doubling(*(jax.lax.stop_gradient(a) for a in (A, B, Q, R)))
+    )
     K = jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     return _symmetric(discrete_lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
@@ -103,7 +118,9 @@ def _discrete_riccati_by_doubling(A, B, Q, R):
         return AW @ A, _symmetric(G + AW @ G @ A.T), _symmetric(H + A.T @ H @ W @ A)
 
     start = (A, B @ jnp.linalg.solve(R, B.T), Q)
-    return jax.lax.fori_loop(0, DOUBLINGS, double, jax.tree.map(lambda a: a + 0.0 * Q[0, 0], start))[2]
+    return jax.lax.fori_loop(
+        0, DOUBLINGS, double, jax.tree.map(lambda a: a + 0.0 * Q[0, 0], start)
+    )[2]
 
 
 def _symmetric(P):

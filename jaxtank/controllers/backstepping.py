@@ -6,7 +6,13 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.controllers.feedback_linearisation import (
+    check_state_coupled,
+    coefficients,
+    decouple,
+    floored_roots,
+    input_metric,
+)
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
@@ -17,12 +23,15 @@ from jaxtank.signals.base import Signal
 class Backstepping(Controller):
     """Backstepping law of gouta2015, eqs. (46)-(48), for the state-coupled four-tank.
 
-        v_i = -(k + k1) (z_i - c_i sqrt(r_i) + k1 (h_i - r_i)),     z = inflow of the lower tanks, c_i sqrt(r_i): their outflow at r
+        v_i = -(k + k1) (z_i - c_i sqrt(r_i) + k1 (h_i - r_i)),     z = inflow of the lower tanks,
+        c_i sqrt(r_i): their outflow at r
 
-    followed by the inversion of `decoupling.decouple`. The printed law knows no rates of the reference and lags behind ramps;
-    with `reference_rates` it carries the missing terms (gouta2015 notes S4.4; not in the paper):
+    followed by the inversion of `decoupling.decouple`. The printed law knows no rates of the
+    reference and lags behind ramps; with `reference_rates` it carries the missing terms (gouta2015
+    notes S4.4; not in the paper):
 
-        v_i = r''_i + c_i r'_i / (2 sqrt(r_i)) - (k + k1) (z_i - c_i sqrt(r_i) - r'_i + k1 (h_i - r_i))
+        v_i = r''_i + c_i r'_i / (2 sqrt(r_i)) - (k + k1) (z_i - c_i sqrt(r_i) - r'_i + k1 (h_i -
+        r_i))
 
     k and k1 act through k1 and k + k1 only, so k is weakly felt.
     """
@@ -30,8 +39,12 @@ class Backstepping(Controller):
     model: Plant
     k: float = leaf("1/s", "gain k of the second step", low=0.0, strict=True)
     k1: float = leaf("1/s", "gain k1 of the first step", low=0.0, strict=True)
-    level_floor: float = leaf("cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True)
-    reference_rates: bool = static("-", "use r' and r'' (backstepping-ff)", choices=(False, True), default=False)
+    level_floor: float = leaf(
+        "cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True
+    )
+    reference_rates: bool = static(
+        "-", "use r' and r'' (backstepping-ff)", choices=(False, True), default=False
+    )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)

@@ -1,4 +1,6 @@
-"""Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance estimate (gouta2022, sec. 3 and 4)."""
+"""Explicit nonlinear predictive control of tanks that each have their own pump, with a disturbance
+estimate (gouta2022, sec. 3 and 4).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,27 +18,45 @@ DRIFTS = ("derived", "printed")
 
 @component
 class ENMPC(Controller):
-    """The minimiser of J = 1/2 int_0^Tp |y - r|^2 with a first-order Taylor prediction (gouta2022 eqs. 9-12; gouta2022 notes S4.1):
+    """The minimiser of J = 1/2 int_0^Tp |y - r|^2 with a first-order Taylor prediction (gouta2022
+    eqs. 9-12; gouta2022 notes S4.1):
 
         u_i = -(1/c2) (k e_i + f_i(h) - r'_i + d_i),   e = h - r,  k = 3/(2 Tp)
 
-    Unsaturated and with an exact model the loop is e' = -k e. `compensation`: "none" leaves d out (ENMPC); "single" takes the observer's
-    estimate once (CHADPC as it must be read, gouta2022 notes S4.3); "double" subtracts it twice, as eqs. (27) and (28) do together.
-    `drift`: "printed" has f with the sign of eqs. (12) and (27), which is not the minimiser and leaves an offset 2 f/k (gouta2022 notes E2).
+    Unsaturated and with an exact model the loop is e' = -k e. `compensation`: "none" leaves d out
+    (ENMPC); "single" takes the observer's estimate once (CHADPC as it must be read, gouta2022 notes
+    S4.3); "double" subtracts it twice, as eqs. (27) and (28) do together.
+    `drift`: "printed" has f with the sign of eqs. (12) and (27), which is not the minimiser and
+        leaves an offset 2 f/k (gouta2022 notes E2).
     """
 
     model: Plant
     Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
-    compensation: str = static("-", "how often the disturbance estimate is subtracted", choices=COMPENSATIONS, default="none")
-    drift: str = static("-", "sign of f in the law: derived, or as printed", choices=DRIFTS, default="derived")
+    compensation: str = static(
+        "-",
+        "how often the disturbance estimate is subtracted",
+        choices=COMPENSATIONS,
+        default="none",
+    )
+    drift: str = static(
+        "-", "sign of f in the law: derived, or as printed", choices=DRIFTS, default="derived"
+    )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c2, k = authority(self.model), 1.5 / self.Tp
         f = drift(self.model, estimate.x)
-        sign, times = (1.0 if self.drift == "derived" else -1.0), COMPENSATIONS.index(self.compensation)
+        sign, times = (
+            (1.0 if self.drift == "derived" else -1.0),
+            COMPENSATIONS.index(self.compensation),
+        )
         d = estimate.d if times else (0.0,) * len(f)
         e = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
-        return tuple(-(k * e[i] + sign * f[i] - tick.dr[i] + times * d[i]) / c2[i] for i in range(len(f))), state
+        return (
+            tuple(
+                -(k * e[i] + sign * f[i] - tick.dr[i] + times * d[i]) / c2[i] for i in range(len(f))
+            ),
+            state,
+        )
 
     def check(self, reference: Signal) -> None:
         check_own_pumps(self.model)

@@ -1,4 +1,6 @@
-"""The inner inversion that both laws of gouta2015 share: from demanded output accelerations to voltages."""
+"""The inner inversion that both laws of gouta2015 share: from demanded output accelerations to
+voltages.
+"""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +15,9 @@ from jaxtank.signals.setpoints import Ramps
 
 
 def drift(model, x):
-    """f(h) [cm/s]: level rates of the model with its pumps off, one per output; x: (n) levels [cm], scalars or arrays."""
+    """f(h) [cm/s]: level rates of the model with its pumps off, one per output; x: (n) levels [cm],
+    scalars or arrays.
+    """
     rate = model.derivative(0.0, tuple(x), (0.0,) * model.pumps, None)
     return tuple(rate[i] for i in model.outputs)
 
@@ -24,17 +28,27 @@ def authority(model):
 
 
 def check_own_pumps(model, every=True):
-    """Raise InputError unless pump j fills the j-th controlled tank alone and, with `every`, every tank is controlled."""
-    if tuple(first for first, _ in model.feeds) != model.outputs or any(second is not None for _, second in model.feeds):
+    """Raise InputError unless pump j fills the j-th controlled tank alone and, with `every`, every
+    tank is controlled.
+    """
+    if tuple(first for first, _ in model.feeds) != model.outputs or any(
+        second is not None for _, second in model.feeds
+    ):
         raise InputError(
-            "controller.model must have one pump per controlled tank, in the same order: this law inverts it tank by tank"
+            "controller.model must have one pump per controlled tank, in the same order: this law"
+            " inverts it tank by tank"
         )
     if every and model.outputs != tuple(range(model.tanks)):
-        raise InputError("controller.model has tanks whose levels are not controlled: this law needs the setpoint of every tank")
+        raise InputError(
+            "controller.model has tanks whose levels are not controlled: this law needs the"
+            " setpoint of every tank"
+        )
 
 
 class Coefficients(NamedTuple):
-    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (gouta2015 notes E1) [cm^0.5/s]; c8, c10 [cm/(V s)]."""
+    """c1 .. c10 of gouta2015 eq. (7), with the receiving tank's area (gouta2015 notes E1)
+    [cm^0.5/s]; c8, c10 [cm/(V s)].
+    """
 
     c1: Any
     c2: Any
@@ -49,7 +63,9 @@ class Coefficients(NamedTuple):
 
     @property
     def alpha(self):
-        """alpha = (c2 c6 - c3 c5) / 2 [cm/s^2], the determinant of the decoupling matrix without its roots."""
+        """alpha = (c2 c6 - c3 c5) / 2 [cm/s^2], the determinant of the decoupling matrix without
+        its roots.
+        """
         return 0.5 * (self.c2 * self.c6 - self.c3 * self.c5)
 
 
@@ -73,19 +89,23 @@ def coefficients(model):
 
 
 def floored_roots(levels, floor):
-    """sqrt(max(h, floor)) of each level. The floor keeps roots and their inverses finite where a tank is dry or noise makes a
-    level negative. The law multiplies by the roots of the upper levels, so with a dry tank its command is zero and stays so: a
-    floor of about 1 cm lets it restart (gouta2015 notes H3)."""
+    """sqrt(max(h, floor)) of each level. The floor keeps roots and their inverses finite where a
+    tank is dry or noise makes a level negative. The law multiplies by the roots of the upper
+    levels, so with a dry tank its command is zero and stays so: a floor of about 1 cm lets it
+    restart (gouta2015 notes H3).
+    """
     return tuple(floored_root(h, floor) for h in levels)
 
 
 def decouple(c, s3, s4, v1, v2, scale=1.0):
-    """Voltages (u1, u2) that give the outputs the accelerations scale * v (gouta2015 eqs. 28, 48): b^-1 (v - g), division-free.
+    """Voltages (u1, u2) that give the outputs the accelerations scale * v (gouta2015 eqs. 28, 48):
+    b^-1 (v - g), division-free.
 
         u1 = [sqrt(h3) (c6 v1 - c3 v2)/alpha + c7 sqrt(h3)] / c8,   u2 likewise
 
-    c: Coefficients; s3, s4: roots of the upper levels [cm^0.5]; scale * v1, scale * v2 [cm/s^2] without the terms of the lower
-    outlets. Never forms b, whose entries grow as 1/sqrt(h) while its inverse stays finite.
+    c: Coefficients; s3, s4: roots of the upper levels [cm^0.5]; scale * v1, scale * v2 [cm/s^2]
+    without the terms of the lower outlets. Never forms b, whose entries grow as 1/sqrt(h) while its
+    inverse stays finite.
     """
     a8, a10 = c.alpha * c.c8, c.alpha * c.c10
     u1 = s3 * ((c.c7 / c.c8 + (scale * c.c6 / a8) * v1) - (scale * c.c3 / a8) * v2)
@@ -94,23 +114,41 @@ def decouple(c, s3, s4, v1, v2, scale=1.0):
 
 
 def input_metric(c, s3, s4):
-    """(g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10) (gouta2015 eq. 26; gouta2015 notes S4.5)."""
+    """(g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10) (gouta2015 eq.
+    26; gouta2015 notes S4.5).
+    """
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
-    return p * p * (c.c2**2 + c.c5**2), p * q * (c.c2 * c.c3 + c.c5 * c.c6), q * q * (c.c3**2 + c.c6**2)
+    return (
+        p * p * (c.c2**2 + c.c5**2),
+        p * q * (c.c2 * c.c3 + c.c5 * c.c6),
+        q * q * (c.c3**2 + c.c6**2),
+    )
 
 
 def check_state_coupled(model, reference):
-    """Raise InputError unless `model` is a state-coupled four-tank and the reference stays above zero (the laws take sqrt(r))."""
-    if model.links != STATE_COUPLED_LINKS or model.feeds != STATE_COUPLED_FEEDS or model.outputs != (0, 1):
-        raise InputError("controller.model must be a state-coupled four-tank (plants.state_coupled_four_tank): this law inverts it")
+    """Raise InputError unless `model` is a state-coupled four-tank and the reference stays above
+    zero (the laws take sqrt(r)).
+    """
+    if (
+        model.links != STATE_COUPLED_LINKS
+        or model.feeds != STATE_COUPLED_FEEDS
+        or model.outputs != (0, 1)
+    ):
+        raise InputError(
+            "controller.model must be a state-coupled four-tank (plants.state_coupled_four_tank):"
+            " this law inverts it"
+        )
     s31, s32, s41, s42 = (float(s) for s in model.orifice)
     if not abs(s31 * s42 - s41 * s32) > 1e-9 * (s31 * s42 + s41 * s32):  # alpha without the areas
         raise InputError(
-            f"controller.model.orifice = {np.asarray(model.orifice)} cm^2: the upper tanks pour into the lower ones in the same "
-            "proportion, so the outputs cannot be moved apart"
+            f"controller.model.orifice = {np.asarray(model.orifice)} cm^2: the upper tanks pour"
+            " into the lower ones in the same proportion, so the outputs cannot be moved apart"
         )
     named = {Ramps: ("initial", "targets"), Constant: ("level",)}.get(type(reference), ())
     for field in named:
         for i, level in enumerate(np.asarray(getattr(reference, field), dtype=float)):
             if not level > 0:
-                raise InputError(f"reference.{field}[{i}] = {level:g} cm: must be above 0 cm (the law takes its square root)")
+                raise InputError(
+                    f"reference.{field}[{i}] = {level:g} cm: must be above 0 cm (the law takes its"
+                    " square root)"
+                )

@@ -15,16 +15,22 @@ from jaxtank.signals.base import Signal
 class GPC(LinearPredictive):
     """The next Nc increments of every pump are free, and later ones are zero.
 
-        Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)   (khalid eqs. 21-22, khalid notes S4.2)
+        Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)
+        (khalid eqs. 21-22, khalid notes S4.2)
 
-    The first of them is applied. Modes and constraints as in `LinearPredictive`; with "constrained" they are imposed on the Nc samples.
+    The first of them is applied. Modes and constraints as in `LinearPredictive`; with "constrained"
+    they are imposed on the Nc samples.
     """
 
     model: TankNetwork
-    operating_point: np.ndarray = leaf("cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True)
+    operating_point: np.ndarray = leaf(
+        "cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True
+    )
     r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
     q: np.ndarray = leaf("-", "(outputs,) weight of each output (Qy)", low=0.0)
-    du_limit: np.ndarray = leaf("V", "(m,) largest change of each input in a sample", low=0.0, strict=True)
+    du_limit: np.ndarray = leaf(
+        "V", "(m,) largest change of each input in a sample", low=0.0, strict=True
+    )
     u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
     u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
     Nc: int = static("-", "control horizon (Nc)", low=1, high=100, default=10)
@@ -37,9 +43,13 @@ class GPC(LinearPredictive):
 
     def basis(self) -> jax.Array:
         pumps = self.model.pumps
-        return jnp.eye(self.Np * pumps)[:, : self.Nc * pumps].reshape(self.Np, pumps, self.Nc * pumps)
+        return jnp.eye(self.Np * pumps)[:, : self.Nc * pumps].reshape(
+            self.Np, pumps, self.Nc * pumps
+        )
 
     def check(self, reference: Signal) -> None:
         super().check(reference)
         if self.Nc > self.Np:
-            raise InputError(f"controller.Nc = {self.Nc}: must be at most controller.Np = {self.Np}")
+            raise InputError(
+                f"controller.Nc = {self.Nc}: must be at most controller.Np = {self.Np}"
+            )

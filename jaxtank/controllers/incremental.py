@@ -1,4 +1,6 @@
-"""What the linear predictive laws of khalid share: the incremental model, the quadratic cost, the constraints, and the sampled law."""
+"""What the linear predictive laws of khalid share: the incremental model, the quadratic cost, the
+constraints, and the sampled law.
+"""
 
 import abc
 import dataclasses
@@ -21,7 +23,8 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-EXACT = 1e-9  # knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact
+# knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact
+EXACT = 1e-9
 
 
 class Memory(NamedTuple):
@@ -32,28 +35,38 @@ class Memory(NamedTuple):
 
 
 def incremental_model(model, operating_point, dt):
-    """(A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
+    """(A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid eqs.
+    16-17, khalid notes S4.1; C_m for C_m^T).
 
         A = [[Am, 0], [Cm Am, I]],   B = [Bm; Cm Bm],   C = [0, I]
 
-    Am, Bm: the rig linearised at levels `operating_point` (n) [cm] and sampled every `dt` [s]. A: (n+q, n+q), B: (n+q, m), C: (q, n+q)
-    for n tanks, m pumps, q outputs. No steady input enters: u is absolute, and its changes are what is decided.
+    Am, Bm: the rig linearised at levels `operating_point` (n) [cm] and sampled every `dt` [s]. A:
+    (n+q, n+q), B: (n+q, m), C: (q, n+q) for n tanks, m pumps, q outputs. No steady input enters: u
+    is absolute, and its changes are what is decided.
     """
     still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, still)
     Am, Bm = zero_order_hold(Ac, Bc, dt)
     n, q = Am.shape[0], Cm.shape[0]
     A = jnp.block([[Am, jnp.zeros((n, q))], [Cm @ Am, jnp.eye(q)]])
-    return A, jnp.concatenate([Bm, Cm @ Bm]), jnp.concatenate([jnp.zeros((q, n)), jnp.eye(q)], axis=1)
+    return (
+        A,
+        jnp.concatenate([Bm, Cm @ Bm]),
+        jnp.concatenate([jnp.zeros((q, n)), jnp.eye(q)], axis=1),
+    )
 
 
 def quadratic_cost(A, B, C, q, r_w, basis):
-    """(Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) = basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
+    """(Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) =
+    basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
 
-        phi(m)' = A phi(m-1)' + B basis(m-1),   Omega = sum_m phi(m) Q phi(m)' + r_w I,   Psi = sum_m phi(m) Q A^m,   m = 1 .. Np
+        phi(m)' = A phi(m-1)' + B basis(m-1),   Omega = sum_m phi(m) Q phi(m)' + r_w I,   Psi =
+        sum_m phi(m) Q A^m,   m = 1 .. Np
 
-    with Q = C' diag(q) C and x_e = [dx_m; y - r]. A, B, C: `incremental_model`; q: (outputs,) [-]; r_w [cm^2/V^2];
-    basis: (Np, m, variables). The sums go to Np, not to the number of terms as printed (khalid notes E10).
+    with Q = C' diag(q) C and x_e = [dx_m; y - r]. A, B, C: `incremental_model`; q: (outputs,) [-];
+    r_w [cm^2/V^2];
+    basis: (Np, m, variables). The sums go to Np, not to the number of terms as printed (khalid
+        notes E10).
     """
     n, variables = A.shape[0], basis.shape[2]
 
@@ -61,19 +74,24 @@ def quadratic_cost(A, B, C, q, r_w, basis):
         phi, power = carry
         phi, power = A @ phi + B @ now, A @ power
         outputs = C @ phi
-        return (phi, power), (outputs.T @ (q[:, None] * outputs), outputs.T @ (q[:, None] * (C @ power)))
+        return (phi, power), (
+            outputs.T @ (q[:, None] * outputs),
+            outputs.T @ (q[:, None] * (C @ power)),
+        )
 
     _, (squares, products) = jax.lax.scan(ahead, (jnp.zeros((n, variables)), jnp.eye(n)), basis)
     return squares.sum(axis=0) + r_w * jnp.eye(variables), products.sum(axis=0)
 
 
 class LinearPredictive(Controller):
-    """A sampled law u(k) = u(k-1) + du(k) whose du minimises a quadratic cost over a horizon, on the incremental model.
+    """A sampled law u(k) = u(k-1) + du(k) whose du minimises a quadratic cost over a horizon, on
+    the incremental model.
 
-    Fields of every such law: model, operating_point, r_w, q, du_limit, u_low, u_high, Np, mode. `mode`: "unconstrained" is the linear
-    law du = -K x_e, which knows no limits; "clipped" holds its du within du_limit and then u within [u_low, u_high]; "constrained" solves
-    the quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes S4.4). u(k-1) is what the
-    pumps' limits let through, which is all the anti-windup there is.
+    Fields of every such law: model, operating_point, r_w, q, du_limit, u_low, u_high, Np, mode.
+    `mode`: "unconstrained" is the linear law du = -K x_e, which knows no limits; "clipped" holds
+    its du within du_limit and then u within [u_low, u_high]; "constrained" solves the quadratic
+    programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes
+    S4.4). u(k-1) is what the pumps' limits let through, which is all the anti-windup there is.
     """
 
     model: TankNetwork
@@ -95,7 +113,9 @@ class LinearPredictive(Controller):
         """(Np, m, variables): increments of the m pumps over the horizon, one column per variable."""
 
     def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """(Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt` [s]; see `quadratic_cost`."""
+        """(Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt`
+        [s]; see `quadratic_cost`.
+        """
         basis = self.basis()
         A, B, C = incremental_model(self.model, self.operating_point, dt)
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
@@ -110,7 +130,9 @@ class LinearPredictive(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         x = estimate.x
-        error = [a - b for a, b in zip(x, state.x)] + [x[i] - r for i, r in zip(self.model.outputs, tick.r)]
+        error = [a - b for a, b in zip(x, state.x)] + [
+            x[i] - r for i, r in zip(self.model.outputs, tick.r)
+        ]
         pumps = range(self.model.pumps)
         if self.mode == "constrained":
             du = self._constrained(state.u, jnp.stack(error), tick.dt)
@@ -122,20 +144,26 @@ class LinearPredictive(Controller):
         u = [state.u[i] + du[i] for i in pumps]
         if (
             self.mode != "unconstrained"
-        ):  # of a constrained law this takes off what the interior point leaves, some 1e-9 of the range
+            # of a constrained law this takes off what the interior point leaves, some 1e-9 of the
+            # range
+        ):
             u = [clip(u[i], self.u_low[i], self.u_high[i]) for i in pumps]
         return tuple(u), Memory(x=x, u=state.u)
 
     def _constrained(self, before, error, dt):
-        """(m,) first increments of the quadratic programme, for inputs `before` (m) and error x_e (n+q,).
+        """(m,) first increments of the quadratic programme, for inputs `before` (m) and error x_e
+        (n+q,).
 
-        An active limit on the sum over several samples is not lost when its row is one of many: rows of Laguerre functions are nearly
-        collinear, which the interior point does not mind.
+        An active limit on the sum over several samples is not lost when its row is one of many:
+        rows of Laguerre functions are nearly collinear, which the interior point does not mind.
         """
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
         rows = jnp.concatenate([steps, jnp.cumsum(steps, axis=0)]).reshape(-1, Omega.shape[0])
-        limit, low, high = (jnp.stack([v[i] for i in range(self.model.pumps)]) for v in (self.du_limit, self.u_low, self.u_high))
+        limit, low, high = (
+            jnp.stack([v[i] for i in range(self.model.pumps)])
+            for v in (self.du_limit, self.u_low, self.u_high)
+        )
         u = jnp.stack(before)
         least = jnp.concatenate([jnp.tile(-limit, self.ahead), jnp.tile(low - u, self.ahead)])
         most = jnp.concatenate([jnp.tile(limit, self.ahead), jnp.tile(high - u, self.ahead)])
@@ -149,35 +177,57 @@ class LinearPredictive(Controller):
         if self.mode != "constrained":
             return
         unit = self.model.units[1]
-        pumps = zip(*(np.asarray(v, dtype=float) for v in (self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high)))
+        pumps = zip(
+            *(
+                np.asarray(v, dtype=float)
+                for v in (self.u_low, self.u_high, actuator.initial, actuator.low, actuator.high)
+            )
+        )
         for i, (low, high, before, bottom, top) in enumerate(pumps):
             own = f"controller.u_low = {low:g} {unit} to controller.u_high = {high:g} {unit}"
             if not low <= before <= high:
                 raise InputError(
-                    f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a constrained law, {own}"
+                    f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a"
+                    f" constrained law, {own}"
                 )
             if bottom > high or top < low:
                 raise InputError(
-                    f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits of a constrained law, {own}"
+                    f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits"
+                    f" of a constrained law, {own}"
                 )
 
     def check(self, reference: Signal) -> None:
         point, n, m = np.asarray(self.operating_point), self.model.tanks, self.model.pumps
         length = self.model.units[0]
         if point.shape != (n,):
-            raise InputError(f"controller.operating_point has shape {point.shape}: must be ({n},), one level per tank")
+            raise InputError(
+                f"controller.operating_point has shape {point.shape}: must be ({n},), one level per"
+                " tank"
+            )
         for one, other in self.model.pipes:
             if not abs(point[one] - point[other]) > 10 * self.model.knee:
                 raise InputError(
-                    f"controller.operating_point = {point} {length}: levels joined by a pipe must differ by more than "
-                    f"{10 * self.model.knee:g} {length}, the model has no slope where they are equal (khalid notes H4)"
+                    f"controller.operating_point = {point} {length}: levels joined by a pipe must"
+                    f" differ by more than {10 * self.model.knee:g} {length}, the model has no"
+                    " slope where they are equal (khalid notes H4)"
                 )
-        for name, size in (("du_limit", m), ("u_low", m), ("u_high", m), ("q", len(self.model.outputs))):
+        for name, size in (
+            ("du_limit", m),
+            ("u_low", m),
+            ("u_high", m),
+            ("q", len(self.model.outputs)),
+        ):
             if np.shape(getattr(self, name)) != (size,):
-                raise InputError(f"controller.{name} has shape {np.shape(getattr(self, name))}: must be ({size},)")
+                raise InputError(
+                    f"controller.{name} has shape {np.shape(getattr(self, name))}: must be"
+                    f" ({size},)"
+                )
         if np.ndim(self.r_w) != 0:
             raise InputError(
-                f"controller.r_w = {np.asarray(self.r_w).tolist()}: must be one number, the weight of the increments of all inputs"
+                f"controller.r_w = {np.asarray(self.r_w).tolist()}: must be one number, the weight"
+                " of the increments of all inputs"
             )
         if not np.all(np.asarray(self.u_low) < np.asarray(self.u_high)):
-            raise InputError(f"controller.u_low = {self.u_low}: must be below controller.u_high = {self.u_high}")
+            raise InputError(
+                f"controller.u_low = {self.u_low}: must be below controller.u_high = {self.u_high}"
+            )

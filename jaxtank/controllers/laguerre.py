@@ -12,12 +12,14 @@ from jaxtank.signals.base import Signal
 
 
 def laguerre_functions(a, N, samples):
-    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, khalid notes S4.3).
+    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, khalid
+    notes S4.3).
 
         L(0) = sqrt(1 - a^2) [1, -a, a^2, ...]',   L(k+1) = A_l L(k)
 
-    A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. a: pole, 0 <= a < 1 [-]. With a = 0 they are unit
-    pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a) [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (khalid notes E7).
+    A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. a: pole, 0 <= a < 1
+    [-]. With a = 0 they are unit pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a)
+    [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (khalid notes E7).
     """
     beta = 1.0 - a * a
     power = [jnp.ones_like(a)]  # products, not powers: 0^0 has no slope
@@ -31,25 +33,35 @@ def laguerre_functions(a, N, samples):
 
 @component
 class Laguerre(LinearPredictive):
-    """The increments of pump i over the horizon are N Laguerre functions, du_i(k+m) = L_i(m)' eta_i (khalid eqs. 26-31, khalid notes S4.3).
+    """The increments of pump i over the horizon are N Laguerre functions, du_i(k+m) = L_i(m)' eta_i
+    (khalid eqs. 26-31, khalid notes S4.3).
 
         J = eta' Omega eta + 2 eta' Psi x_e,   eta = -Omega^-1 Psi x_e,   du_i(k) = L_i(0)' eta_i
 
-    N numbers per pump do what takes GPC ten or more. With a = 0 it is GPC with Nc = N. Modes and constraints as in `LinearPredictive`;
-    with "constrained" they are imposed on the next `rows` samples: 5 are enough, 15 those of the tables in khalid notes S7.2.
+    N numbers per pump do what takes GPC ten or more. With a = 0 it is GPC with Nc = N. Modes and
+    constraints as in `LinearPredictive`; with "constrained" they are imposed on the next `rows`
+    samples: 5 are enough, 15 those of the tables in khalid notes S7.2.
     """
 
     model: TankNetwork
-    operating_point: np.ndarray = leaf("cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True)
+    operating_point: np.ndarray = leaf(
+        "cm", "(n,) levels at which the model is linearised (H1, H2)", low=0.0, strict=True
+    )
     r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", low=0.0, strict=True)
-    a: np.ndarray = leaf("-", "(m,) pole of each pump's Laguerre functions (a)", low=0.0, high=0.999)
+    a: np.ndarray = leaf(
+        "-", "(m,) pole of each pump's Laguerre functions (a)", low=0.0, high=0.999
+    )
     q: np.ndarray = leaf("-", "(outputs,) weight of each output (Qy)", low=0.0)
-    du_limit: np.ndarray = leaf("V", "(m,) largest change of each input in a sample", low=0.0, strict=True)
+    du_limit: np.ndarray = leaf(
+        "V", "(m,) largest change of each input in a sample", low=0.0, strict=True
+    )
     u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
     u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
     N: int = static("-", "Laguerre functions per pump (N)", low=1, high=30, default=4)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
-    rows: int = static("-", "samples ahead on which constraints are imposed (Ncon)", low=1, high=1000, default=15)
+    rows: int = static(
+        "-", "samples ahead on which constraints are imposed (Ncon)", low=1, high=1000, default=15
+    )
     mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
 
     @property
@@ -67,6 +79,11 @@ class Laguerre(LinearPredictive):
     def check(self, reference: Signal) -> None:
         super().check(reference)
         if np.shape(self.a) != (self.model.pumps,):
-            raise InputError(f"controller.a has shape {np.shape(self.a)}: must be ({self.model.pumps},), one pole per pump")
+            raise InputError(
+                f"controller.a has shape {np.shape(self.a)}: must be ({self.model.pumps},), one"
+                " pole per pump"
+            )
         if self.rows > self.Np:
-            raise InputError(f"controller.rows = {self.rows}: must be at most controller.Np = {self.Np}")
+            raise InputError(
+                f"controller.rows = {self.rows}: must be at most controller.Np = {self.Np}"
+            )

@@ -4,7 +4,13 @@ from collections.abc import Sequence
 from typing import Any
 
 from jaxtank.controllers.base import Controller
-from jaxtank.controllers.feedback_linearisation import check_state_coupled, coefficients, decouple, floored_roots, input_metric
+from jaxtank.controllers.feedback_linearisation import (
+    check_state_coupled,
+    coefficients,
+    decouple,
+    floored_roots,
+    input_metric,
+)
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.base import Plant
@@ -15,15 +21,19 @@ from jaxtank.signals.base import Signal
 class NGPC(Controller):
     """Closed-form predictive law of gouta2015, eq. (28), for the state-coupled four-tank.
 
-        v_i = r''_i - K1 e_i - K2 e'_i + c_i z'_i / (2 sqrt(h_i)),   e = h - r,  K1 = 10/(3 Tp^2),  K2 = 5/(2 Tp)
+        v_i = r''_i - K1 e_i - K2 e'_i + c_i z'_i / (2 sqrt(h_i)),   e = h - r,  K1 = 10/(3 Tp^2),
+        K2 = 5/(2 Tp)
 
-    followed by the inversion of `decoupling.decouple`. z'_i is the level rate the model predicts (no differentiation). Without
-    saturation the loop is exactly e'' + K2 e' + K1 e = 0: damping 0.685, natural frequency 1.826/Tp.
+    followed by the inversion of `decoupling.decouple`. z'_i is the level rate the model predicts
+    (no differentiation). Without saturation the loop is exactly e'' + K2 e' + K1 e = 0: damping
+    0.685, natural frequency 1.826/Tp.
     """
 
     model: Plant
     Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
-    level_floor: float = leaf("cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True)
+    level_floor: float = leaf(
+        "cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True
+    )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)

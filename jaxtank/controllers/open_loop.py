@@ -12,9 +12,11 @@ from jaxtank.signals.base import Signal
 
 @component
 class OpenLoop(Controller):
-    """u(t_k) = s(t_k): the inputs are those of a signal, whatever the levels do (a recorded experiment, a constant flow).
+    """u(t_k) = s(t_k): the inputs are those of a signal, whatever the levels do (a recorded
+    experiment, a constant flow).
 
-    signal: one channel per pump, in the unit of the pumps' input; the signal's units are read as the input's.
+    signal: one channel per pump, in the unit of the pumps' input; the signal's units are read as
+        the input's.
     """
 
     signal: Signal

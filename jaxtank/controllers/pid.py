@@ -1,4 +1,6 @@
-"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4; gouta2022 notes S4.5)."""
+"""PI, PID and fractional PI, one loop per pump, with or without feed-forward (gouta2022, Table 4;
+gouta2022 notes S4.5).
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -29,45 +31,67 @@ class Memory(NamedTuple):
 
 
 def oustaloup(g):
-    """(direct gain, poles (2N+1), residues (2N+1)) of s^g on [1e-3, 1e2] rad/s: s^g ~ direct + sum residue/(s + pole).
+    """(direct gain, poles (2N+1), residues (2N+1)) of s^g on [1e-3, 1e2] rad/s: s^g ~ direct + sum
+    residue/(s + pole).
 
-    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g (Oustaloup 2000; gouta2022 notes S4.5). g [-].
+    Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g
+    (Oustaloup 2000; gouta2022 notes S4.5). g [-].
     """
     j = np.arange(2 * SECTIONS + 1)
-    at = lambda shift: LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))
+    at = lambda shift: (
+        LOWEST * (HIGHEST / LOWEST) ** ((j + 0.5 * (1.0 + shift)) / (2 * SECTIONS + 1))
+    )
     zeros, poles, gain = at(-g), at(g), HIGHEST**g
     apart = jnp.where(np.eye(j.size, dtype=bool), 1.0, poles[None, :] - poles[:, None])
-    return gain, poles, gain * jnp.prod(zeros[None, :] - poles[:, None], axis=1) / jnp.prod(apart, axis=1)
+    return (
+        gain,
+        poles,
+        gain * jnp.prod(zeros[None, :] - poles[:, None], axis=1) / jnp.prod(apart, axis=1),
+    )
 
 
 @component
 class PID(Controller):
     """One PI(D) loop per pump, output i to pump i:
 
-        v = base + Kc (r - y) + I - Kc Td y'_f,    I' = Kc/Ti^order D^(1-order) [(r - y) + Ti (u - v)/(Tt Kc)]
+        v = base + Kc (r - y) + I - Kc Td y'_f,    I' = Kc/Ti^order D^(1-order) [(r - y) + Ti (u -
+        v)/(Tt Kc)]
 
-    with u what the limits leave of v (back-calculation, tracking time Tt), and the derivative of the measurement behind a lag of Td/8. Without
-    Td there is no derivative; without `order` the integral is an ordinary one, with it s^-order = (1/s) s^(1-order), where the second factor is
-    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the input that the model needs on the reference,
-    (r' - f(r))/c2.
+    with u what the limits leave of v (back-calculation, tracking time Tt), and the derivative of
+    the measurement behind a lag of Td/8. Without Td there is no derivative; without `order` the
+    integral is an ordinary one, with it s^-order = (1/s) s^(1-order), where the second factor is
+    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the input
+    that the model needs on the reference, (r' - f(r))/c2.
     """
 
     model: Plant
     Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc", low=0.0, strict=True)
     Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
-    Td: np.ndarray | None = leaf("s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None)
+    Td: np.ndarray | None = leaf(
+        "s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None
+    )
     order: np.ndarray | None = leaf(
-        "-", "(m,) order of the integral (lambda)", low=0.0, high=1.0, strict=True, like="Kc", default=None
+        "-",
+        "(m,) order of the integral (lambda)",
+        low=0.0,
+        high=1.0,
+        strict=True,
+        like="Kc",
+        default=None,
     )
     Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
     bias: np.ndarray = leaf("V", "(m,) input added where there is no feed-forward")
-    feed_forward: bool = static("-", "add the model's input on the reference", choices=(False, True), default=False)
+    feed_forward: bool = static(
+        "-", "add the model's input on the reference", choices=(False, True), default=False
+    )
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         if not self.feed_forward:
             return ()
-        return tuple((rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model)))
+        return tuple(
+            (rate - f) / c for rate, f, c in zip(dr, drift(self.model, r), authority(self.model))
+        )
 
     @property
     def reads_model(self) -> bool:
@@ -78,7 +102,9 @@ class PID(Controller):
         return Memory(
             integral=(zero,) * len(u0),
             slow=() if self.Td is None else tuple(x0[i] for i in self.model.outputs),
-            sections=() if self.order is None else tuple((zero,) * (2 * SECTIONS + 1) for _ in loops),
+            sections=(
+                () if self.order is None else tuple((zero,) * (2 * SECTIONS + 1) for _ in loops)
+            ),
             error=(zero,) * len(u0),
         )
 
@@ -89,15 +115,21 @@ class PID(Controller):
         v = tuple(base[i] + self.Kc[i] * e[i] + state.integral[i] for i in range(len(e)))
         slow = state.slow
         if self.Td is not None:
-            # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the sample
+            # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the
+            # sample
             v = tuple(v[i] - (FILTER * self.Kc[i]) * (y[i] - slow[i]) for i in range(len(v)))
-            slow = tuple(slow[i] + (1.0 - jnp.exp(-tick.dt * FILTER / self.Td[i])) * (y[i] - slow[i]) for i in range(len(v)))
+            slow = tuple(
+                slow[i] + (1.0 - jnp.exp(-tick.dt * FILTER / self.Td[i])) * (y[i] - slow[i])
+                for i in range(len(v))
+            )
         return v, state._replace(slow=slow, error=e)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         loops, integral, sections = range(len(command)), [], []
         for i in loops:
-            w = state.error[i] + (self.Ti[i] / (self.Tt[i] * self.Kc[i])) * (applied[i] - command[i])
+            w = state.error[i] + (self.Ti[i] / (self.Tt[i] * self.Kc[i])) * (
+                applied[i] - command[i]
+            )
             if self.order is None:
                 integral.append(state.integral[i] + (tick.dt * self.Kc[i] / self.Ti[i]) * w)
                 continue
@@ -105,12 +137,19 @@ class PID(Controller):
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
             rate = gain * w + sum(state.sections[i])
-            integral.append(state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -self.order[i] * rate)
-            sections.append(tuple(keep[j] * s + enter[j] * w for j, s in enumerate(state.sections[i])))
+            integral.append(
+                state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -self.order[i] * rate
+            )
+            sections.append(
+                tuple(keep[j] * s + enter[j] * w for j, s in enumerate(state.sections[i]))
+            )
         return state._replace(integral=tuple(integral), sections=tuple(sections))
 
     def check(self, reference: Signal) -> None:
         if len(self.model.outputs) != self.model.pumps:
-            raise InputError(f"PID needs one pump per output: the model has {self.model.pumps} and {len(self.model.outputs)}")
+            raise InputError(
+                f"PID needs one pump per output: the model has {self.model.pumps} and"
+                f" {len(self.model.outputs)}"
+            )
         if self.feed_forward:
             check_own_pumps(self.model)

@@ -1,4 +1,6 @@
-"""Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and in a form that can work."""
+"""Sliding-mode control of the quadruple tank (mirakhorli sec. 4.1), as printed and in a form that
+can work.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,7 +19,9 @@ from jaxtank.signals.base import Signal
 
 SWITCHES = {"tanh": jnp.tanh, "clip": lambda x: clip(x, -1.0, 1.0), "sign": jnp.sign}
 FORMS = ("corrected", "printed")
-SMALLEST = 1e-3  # least size of the determinant, as a share of its antidiagonal part: at the design -0.83 (mirakhorli notes S4.3)
+# least size of the determinant, as a share of its antidiagonal part: at the design -0.83
+# (mirakhorli notes S4.3)
+SMALLEST = 1e-3
 
 
 class LowerTanks(NamedTuple):
@@ -28,14 +32,17 @@ class LowerTanks(NamedTuple):
     cross: tuple  # how it rises with the level of the tank above [1/s]
     above: tuple  # rate at which the tank above would fall without its pump [cm/s]
     own: tuple  # gamma_i k_i / A_i: rate that the tank's own pump gives it [cm/(s V)]
-    upper: tuple  # rate that the other pump gives the tank above: (1 - gamma2) k2 / A3, (1 - gamma1) k1 / A4 [cm/(s V)]
+    # rate that the other pump gives the tank above: (1 - gamma2) k2 / A3, (1 - gamma1) k1 / A4
+    # [cm/(s V)]
+    upper: tuple
 
 
 def lower_tanks(model, x):
     """`LowerTanks` of a quadruple tank at levels x (4) [cm].
 
-    phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2) less the direct flow. The root is the
-    smooth one (numerics.signed_root): its slope, which the law needs, has no kink at an empty tank. It moves the rest at 12 cm by 6e-5 V.
+    phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
+    less the direct flow. The root is the smooth one (numerics.signed_root): its slope, which the
+    law needs, has no kink at an empty tank. It moves the rest at 12 cm by 6e-5 V.
     """
     w, area = jnp.sqrt(2.0 * model.gravity), [model.area[i] for i in range(4)]
     q = [w * signed_root(h, model.knee) for h in x]
@@ -61,8 +68,10 @@ class Acceleration(NamedTuple):
 
 
 def acceleration(tanks, damping):
-    """f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i. damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which are
-    right except that gamma_i k_i u_i'/A_i is missing from it (mirakhorli notes E2)."""
+    """f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i. damping: [1/s]; 0 gives f and G of
+    mirakhorli eq. (4), all terms of which are right except that gamma_i k_i u_i'/A_i is missing
+    from it (mirakhorli notes E2).
+    """
     net = tuple(damping - d for d in tanks.slope)
     return Acceleration(
         f=tuple(n * p - c * a for n, p, c, a in zip(net, tanks.drift, tanks.cross, tanks.above)),
@@ -72,17 +81,21 @@ def acceleration(tanks, damping):
 
 
 def slide(model, surface, ks, phi, switch, form, x, r, u0, previous) -> tuple[Any, Any]:
-    """(2) voltages [V] of the sliding-mode law, not limited; arguments as the fields of `SlidingMode`.
+    """(2) voltages [V] of the sliding-mode law, not limited; arguments as the fields of
+    `SlidingMode`.
 
-    x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2) voltages now at the pumps [V],
-    used by the printed form alone.
+    x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2)
+    voltages now at the pumps [V], used by the printed form alone.
     """
     printed = form == "printed"
     tanks = lower_tanks(model, x)
     rate = tuple(p + g * u for p, g, u in zip(tanks.drift, tanks.own, previous if printed else u0))
     s = tuple(surface * (h - target) + v for h, target, v in zip(x, r, rate))
     f, (m11, m22), (m12, m21) = acceleration(tanks, 0.0 if printed else surface)
-    v1, v2 = (-f_i - (surface * v if printed else 0.0) - ks * SWITCHES[switch](s_i / phi) for f_i, v, s_i in zip(f, rate, s))
+    v1, v2 = (
+        -f_i - (surface * v if printed else 0.0) - ks * SWITCHES[switch](s_i / phi)
+        for f_i, v, s_i in zip(f, rate, s)
+    )
     least, det = SMALLEST * m12 * m21, m11 * m22 - m12 * m21
     det = jnp.where(jnp.abs(det) < least, jnp.where(det > 0.0, least, -least), det)
     return (m22 * v1 - m12 * v2) / det, (m11 * v2 - m21 * v1) / det
@@ -102,17 +115,22 @@ def check_quadruple(model):
 
 @component
 class SlidingMode(Controller):
-    """Sliding-mode law for the quadruple tank: M u = -f - ks sw(s / phi), sw one of tanh, clip to [-1, 1], sign.
+    """Sliding-mode law for the quadruple tank: M u = -f - ks sw(s / phi), sw one of tanh, clip to
+    [-1, 1], sign.
 
-    "corrected" (mirakhorli notes S4.4): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i, whose rate f + M u is exact in u and needs no u'.
-    The surface is zero at the steady state of the setpoint. A sliding mode exists and is stable for surfaces between two bounds: 0.0088
-    and 0.088 1/s for the paper's rig at 12 cm (mirakhorli notes S4.3). Setpoints that are held: their rates are not used.
+    "corrected" (mirakhorli notes S4.4): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i,
+    whose rate f + M u is exact in u and needs no u'. The surface is zero at the steady state of the
+    setpoint. A sliding mode exists and is stable for surfaces between two bounds: 0.0088 and 0.088
+    1/s for the paper's rig at 12 cm (mirakhorli notes S4.3). Setpoints that are held: their rates
+    are not used.
 
-    "printed" (mirakhorli eq. 10): s_i = surface e_i + h_i', f and M without the surface, and surface h_i' subtracted; h_i' from the full
-    model with the voltages applied in the last sample (the paper does not say how h_i' is had: reading (a) of mirakhorli notes S4.2).
+    "printed" (mirakhorli eq. 10): s_i = surface e_i + h_i', f and M without the surface, and
+    surface h_i' subtracted; h_i' from the full model with the voltages applied in the last sample
+    (the paper does not say how h_i' is had: reading (a) of mirakhorli notes S4.2).
 
-    Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and they grow without bound (mirakhorli notes H2).
-    With sign, phi has no effect and the other derivatives miss the jumps.
+    Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and
+    they grow without bound (mirakhorli notes H2). With sign, phi has no effect and the other
+    derivatives miss the jumps.
     """
 
     model: Plant

@@ -1,4 +1,6 @@
-"""State feedback around the steady state of the setpoint (mirakhorli sec. 4.2), and the same with integral action."""
+"""State feedback around the steady state of the setpoint (mirakhorli sec. 4.2), and the same with
+integral action.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,26 +22,31 @@ from jaxtank.signals.base import Signal
 
 
 def feedback(K, x, h0, u0):
-    """u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and the steady state h0 (n) [cm], u0 (m) [V].
+    """u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and the
+    steady state h0 (n) [cm], u0 (m) [V].
 
-    mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and without u0 the pumps stand
-    (mirakhorli notes E11).
+    mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and
+    without u0 the pumps stand (mirakhorli notes E11).
     """
     away = [h - h_s for h, h_s in zip(x, h0)]
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
 
 
 def check_free_outlets(model):
-    """Raise InputError unless the steady state of every setpoint follows from `model` by a linear balance."""
+    """Raise InputError unless the steady state of every setpoint follows from `model` by a linear
+    balance.
+    """
     if getattr(model, "pipes", None) != () or model.pumps != len(model.outputs):
         raise InputError(
-            "controller.model must be a network without pipes and with as many pumps as outputs: this law needs its steady states"
+            "controller.model must be a network without pipes and with as many pumps as outputs:"
+            " this law needs its steady states"
         )
 
 
 @component
 class StateFeedback(Controller):
-    """u = u0(r) - K (h - h0(r)), with levels h0 and voltages u0 at which the model stands still at the setpoint (mirakhorli sec. 4.2).
+    """u = u0(r) - K (h - h0(r)), with levels h0 and voltages u0 at which the model stands still at
+    the setpoint (mirakhorli sec. 4.2).
 
     No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21).
     """
@@ -57,26 +64,37 @@ class StateFeedback(Controller):
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
         if np.shape(self.K)[-2:] != (self.model.pumps, self.model.tanks):
-            raise InputError(f"controller.K has shape {np.shape(self.K)}: must be ({self.model.pumps}, {self.model.tanks})")
+            raise InputError(
+                f"controller.K has shape {np.shape(self.K)}: must be ({self.model.pumps},"
+                f" {self.model.tanks})"
+            )
 
 
 @component
 class LQI(Controller):
-    """State feedback with integrals of the errors, whose gain is designed here (not in the paper: mirakhorli notes S4.6).
+    """State feedback with integrals of the errors, whose gain is designed here (not in the paper:
+    mirakhorli notes S4.6).
 
         u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r while no pump is at its limit
 
-    [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`, with z beneath its levels, for the
-    weights diag(Q) and diag(R). The gain follows its weights, its model and its operating point, derivatives included.
+    [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
+    with z beneath its levels, for the weights diag(Q) and diag(R). The gain follows its weights,
+    its model and its operating point, derivatives included.
     """
 
     model: TankNetwork
-    # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig counts in
+    # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig
+    # counts in
     Q: np.ndarray = leaf(
-        "-", "(tanks + outputs,) weight of each level, over its unit squared, then of each integral, over that times s^2", low=0.0
+        "-",
+        "(tanks + outputs,) weight of each level, over its unit squared, then of each integral,"
+        " over that times s^2",
+        low=0.0,
     )
     R: np.ndarray = leaf("1/V^2", "(pumps,) weight of each input", low=0.0, strict=True)
-    operating_point: np.ndarray = leaf("cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True)
+    operating_point: np.ndarray = leaf(
+        "cm", "(outputs,) setpoint at which the model is linearised", low=0.0, strict=True
+    )
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -91,7 +109,12 @@ class LQI(Controller):
         speeds, voltages = steady_flows(self.model, self.operating_point)
         A, B, C = linearise(self.model, speeds * speeds / (2.0 * self.model.gravity), voltages)
         n, p = A.shape[0], C.shape[0]
-        A = jnp.concatenate([jnp.concatenate([A, jnp.zeros((n, p))], axis=1), jnp.concatenate([C, jnp.zeros((p, p))], axis=1)])
+        A = jnp.concatenate(
+            [
+                jnp.concatenate([A, jnp.zeros((n, p))], axis=1),
+                jnp.concatenate([C, jnp.zeros((p, p))], axis=1),
+            ]
+        )
         B = jnp.concatenate([B, jnp.zeros((p, B.shape[1]))])
         return lqr(A, B, jnp.diag(jnp.asarray(self.Q)), jnp.diag(jnp.asarray(self.R)))
 
@@ -109,6 +132,13 @@ class LQI(Controller):
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
         states = self.model.tanks + len(self.model.outputs)
-        for name, size in (("Q", states), ("R", self.model.pumps), ("operating_point", len(self.model.outputs))):
+        for name, size in (
+            ("Q", states),
+            ("R", self.model.pumps),
+            ("operating_point", len(self.model.outputs)),
+        ):
             if np.shape(getattr(self, name))[-1:] != (size,):
-                raise InputError(f"controller.{name} has shape {np.shape(getattr(self, name))}: must be ({size},)")
+                raise InputError(
+                    f"controller.{name} has shape {np.shape(getattr(self, name))}: must be"
+                    f" ({size},)"
+                )

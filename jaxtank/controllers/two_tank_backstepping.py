@@ -19,34 +19,52 @@ from jaxtank.signals.base import Signal
 
 @component
 class TwoTankBackstepping(Controller):
-    """Backstepping law of calofir, eqs. (16)-(21) with the errata of calofir notes S5, for a pumped tank that drains through a second one.
+    """Backstepping law of calofir, eqs. (16)-(21) with the errata of calofir notes S5, for a pumped
+    tank that drains through a second one.
 
-    With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r = kappa h1r (calofir notes S4.2, where the
-    paper's z0 and Q0 cancel):
+    With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r =
+    kappa h1r (calofir notes S4.2, where the paper's z0 and Q0 cancel):
 
         Phi = (b s - K_phi e)/a,   Y = Z - Phi,   a = c1/A, b = c2/A
         Q = 2 A Z [ a - b s/(2 Z) + ((b/(2 s) - K_phi)/a) (a Z - b s) - a e - K_y Y ]
 
-    Without limits the loop is e' = -K_phi e + a Y, Y' = -a e - K_y Y. It is a feedback linearisation of h3, of which only
-    K_phi + K_y and K_phi K_y + a^2 matter: the two gains may be exchanged. a^2 carries a length, so the same gains are another law
-    where levels count in other units. The output h1 follows h3; there is no integral action. Units in this class are the rig's (m, m^3/s).
+    Without limits the loop is e' = -K_phi e + a Y, Y' = -a e - K_y Y. It is a feedback
+    linearisation of h3, of which only K_phi + K_y and K_phi K_y + a^2 matter: the two gains may be
+    exchanged. a^2 carries a length, so the same gains are another law where levels count in other
+    units. The output h1 follows h3; there is no integral action. Units in this class are the rig's
+    (m, m^3/s).
     """
 
     model: TankNetwork
     K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
     K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
-    level_floor: float = leaf("cm", "level h3 below which the law takes the second tank to hold this much", low=0.0, strict=True)
-    difference_floor: float = leaf("cm", "least h1 - h3 that the law reckons with", low=0.0, strict=True)
+    level_floor: float = leaf(
+        "cm",
+        "level h3 below which the law takes the second tank to hold this much",
+        low=0.0,
+        strict=True,
+    )
+    difference_floor: float = leaf(
+        "cm", "least h1 - h3 that the law reckons with", low=0.0, strict=True
+    )
 
     def coefficients(self) -> tuple:
-        """(a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3 = a in the paper, whose tanks are equal."""
+        """(a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3 = a in
+        the paper, whose tanks are equal.
+        """
         w = jnp.sqrt(2.0 * self.model.gravity)
         A1, A3 = self.model.area[0], self.model.area[1]
-        return self.model.pipe[0] * w / A1, self.model.pipe[0] * w / A3, self.model.drain[1] * w / A3
+        return (
+            self.model.pipe[0] * w / A1,
+            self.model.pipe[0] * w / A3,
+            self.model.drain[1] * w / A3,
+        )
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
-        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests at r (calofir notes S2.2) [cm, cm^3/s]."""
+        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests
+        at r (calofir notes S2.2) [cm, cm^3/s].
+        """
         c1, c2 = self.model.pipe[0], self.model.drain[1]
         h3r = c1**2 / (c1**2 + c2**2) * r[0]  # kappa h1r
         return h3r, c1 * jnp.sqrt(2.0 * self.model.gravity) * jnp.sqrt(r[0] - h3r)
@@ -62,11 +80,21 @@ class TwoTankBackstepping(Controller):
         return (flow / self.model.pump_gain[0],), state
 
     def check(self, reference: Signal) -> None:
-        check_topology(self.model, "two coupled tanks", pipes=COUPLED_PIPES, feeds=((0, None),), links=(), outputs=(0,))
+        check_topology(
+            self.model,
+            "two coupled tanks",
+            pipes=COUPLED_PIPES,
+            feeds=((0, None),),
+            links=(),
+            outputs=(0,),
+        )
         if float(self.model.drain[0]) != 0.0:
             raise InputError(
-                f"controller.model.drain[0] = {float(self.model.drain[0]):g}: this law takes the first tank to drain only into the second"
+                f"controller.model.drain[0] = {float(self.model.drain[0]):g}: this law takes the"
+                " first tank to drain only into the second"
             )
         for field in ("initial", "targets", "level"):
             if np.any(np.asarray(getattr(reference, field, 1.0), dtype=float) <= 0.0):
-                raise InputError(f"reference.{field}: must be above 0 (the law takes its square root)")
+                raise InputError(
+                    f"reference.{field}: must be above 0 (the law takes its square root)"
+                )

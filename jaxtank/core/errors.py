@@ -1,10 +1,14 @@
-"""Input validation errors: one line that names the thing, its value, what is allowed, and the nearest valid name."""
+"""Input validation errors: one line that names the thing, its value, what is allowed, and the
+nearest valid name.
+"""
 
 import difflib
 
 
 class InputError(ValueError):
-    """Something a user gave cannot be used. The message is one line; the command line ends with exit code 2."""
+    """Something a user gave cannot be used. The message is one line; the command line ends with
+    exit code 2.
+    """
 
 
 class EquilibriumError(InputError):
@@ -12,11 +16,15 @@ class EquilibriumError(InputError):
 
 
 class DataError(InputError):
-    """A log cannot be used. The message is one line and names file, line and column; the command line ends with exit code 5."""
+    """A log cannot be used. The message is one line and names file, line and column; the command
+    line ends with exit code 5.
+    """
 
 
 class NonFiniteError(ArithmeticError):
-    """A run produced NaN or infinity. The message gives the time, the tank and the parameters of the run."""
+    """A run produced NaN or infinity. The message gives the time, the tank and the parameters of
+    the run.
+    """
 
 
 def nearest(name, names, count=3):
@@ -24,7 +32,9 @@ def nearest(name, names, count=3):
     names = list(names)
     close = (
         difflib.get_close_matches(name, names, n=count, cutoff=0.3)
-        or sorted(names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio())[:count]
+        or sorted(names, key=lambda other: -difflib.SequenceMatcher(None, name, other).ratio())[
+            :count
+        ]
     )
     alike = [other for other in names if other.lower() == name.lower()]  # but for capitals
     close = [*alike, *(other for other in close if other not in alike)][:count]

@@ -24,14 +24,17 @@ def untouched(folder):
 
 
 def write_atomic(path, data):
-    """Write `data` (str or bytes) to `path` by way of a temporary file in the same folder; a link is not followed."""
+    """Write `data` (str or bytes) to `path` by way of a temporary file in the same folder; a link
+    is not followed.
+    """
     path = Path(path)
     write_together(path.parent, {path.name: data})
 
 
 def write_together(folder, files):
-    """Write {name: str or bytes} to `folder`: all of them are whole on the disk before the first takes its place, so that a disk that is
-    full leaves what was there as it was."""
+    """Write {name: str or bytes} to `folder`: all of them are whole on the disk before the first
+    takes its place, so that a disk that is full leaves what was there as it was.
+    """
     folder, aside = Path(folder), []
     try:
         for name, data in files.items():
@@ -73,24 +76,34 @@ def check_folder(path):
         raise InputError(f"--out {str(path)!r}: a name cannot hold the character NUL")
     if path.is_symlink() and not path.exists():
         raise InputError(
-            f"--out {str(path)!r} is a link to {os.readlink(path)!r}, which is not there: make that folder or give another"
+            f"--out {str(path)!r} is a link to {os.readlink(path)!r}, which is not there: make that"
+            " folder or give another"
         )
     if path.exists() and not path.is_dir():
         raise InputError(f"--out {str(path)!r} is a file: give a folder, new or existing")
-    parent = path if path.exists() else next((p for p in path.absolute().parents if p.exists()), None)
+    parent = (
+        path if path.exists() else next((p for p in path.absolute().parents if p.exists()), None)
+    )
     if parent is None or not parent.is_dir():
-        raise InputError(f"--out {str(path)!r}: {str(parent)!r} is a file, so no folder can be made there")
+        raise InputError(
+            f"--out {str(path)!r}: {str(parent)!r} is a file, so no folder can be made there"
+        )
     if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"--out {str(path)!r}: no permission to write to {str(parent)!r}")
 
 
 def refusal(path, largest):
-    """Why a file is not to be read, in words, or None: it is a folder, a device or a pipe, which may never end, or has more than `largest`
-    bytes. Raises OSError where there is none."""
+    """Why a file is not to be read, in words, or None: it is a folder, a device or a pipe, which
+    may never end, or has more than `largest` bytes. Raises OSError where there is none.
+    """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
         return "is not a file"
-    return f"has {found.st_size} bytes: at most {largest} are read" if found.st_size > largest else None
+    return (
+        f"has {found.st_size} bytes: at most {largest} are read"
+        if found.st_size > largest
+        else None
+    )
 
 
 def read_text(path, kind):

@@ -1,7 +1,9 @@
-"""Sums that do not lose what is added to them: float32 runs carry what rounding took (Kahan, Comm. ACM 8(1), 1965).
+"""Sums that do not lose what is added to them: float32 runs carry what rounding took (Kahan, Comm.
+ACM 8(1), 1965).
 
-A level of 10 cm changes by 1e-4 cm in a step of 0.01 s, of which float32 keeps two digits; a mean over 120,000 samples loses as much.
-In float64 a plain sum is good to 1e-12 and these functions are plain sums.
+A level of 10 cm changes by 1e-4 cm in a step of 0.01 s, of which float32 keeps two digits; a mean
+over 120,000 samples loses as much. In float64 a plain sum is good to 1e-12 and these functions are
+plain sums.
 """
 
 from typing import Any, NamedTuple
@@ -36,4 +38,6 @@ def added(value, excess, term):
 
 def totals(tree):
     """`tree` with the value of every Sum in its place."""
-    return jax.tree.map(lambda s: s.total if isinstance(s, Sum) else s, tree, is_leaf=lambda s: isinstance(s, Sum))
+    return jax.tree.map(
+        lambda s: s.total if isinstance(s, Sum) else s, tree, is_leaf=lambda s: isinstance(s, Sum)
+    )

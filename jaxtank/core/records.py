@@ -11,19 +11,27 @@ from jaxtank.core.errors import InputError
 
 
 def check_key(key):
-    """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the older one, a row of unsigned integers;
-    traced ones and placeholders too."""
+    """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the
+    older one, a row of unsigned integers; traced ones and placeholders too.
+    """
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
     typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
-    if (typed and ndim == 0) or (kind == np.uint32 and (ndim == 1 or isinstance(key, jax.ShapeDtypeStruct))):
+    if (typed and ndim == 0) or (
+        kind == np.uint32 and (ndim == 1 or isinstance(key, jax.ShapeDtypeStruct))
+    ):
         return
     if key is not None:
         told = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
-        raise InputError(f"key {told}: must be one random key, as jax.random.key(0), or None where there is no noise")
+        raise InputError(
+            f"key {told}: must be one random key, as jax.random.key(0), or None where there is no"
+            " noise"
+        )
 
 
 class Tick(NamedTuple):
-    """What a law and an observer are told at sample k besides measurements: tuples of scalars, one per output."""
+    """What a law and an observer are told at sample k besides measurements: tuples of scalars, one
+    per output.
+    """
 
     t: Any  # time [s]
     r: tuple  # setpoint r [cm]
@@ -38,7 +46,8 @@ class Estimate(NamedTuple):
     """What an observer hands to a law: tuples of scalars."""
 
     x: Sequence  # level estimate, one per tank [cm]
-    d: Sequence = ()  # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
+    # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
+    d: Sequence = ()
 
 
 class Sample(NamedTuple):
@@ -48,18 +57,22 @@ class Sample(NamedTuple):
     x: Sequence  # levels, one per tank [cm]
     y: Sequence  # measured levels, one per tank [cm]
     x_hat: Sequence  # estimated levels, one per tank [cm]
-    d_hat: Sequence  # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
+    # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
+    d_hat: Sequence
     r: tuple  # setpoint, one per output [cm]
     e: tuple  # tracking error of the true output, x - r, one per output [cm]
     command: Sequence  # what the law asked for, one per pump [V]
     applied: Sequence  # the command within the pumps' limits, one per pump [V]
     u: Sequence  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
     spilled: Sequence  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
-    shortfall: Sequence = ()  # volume that a negative inflow could not take from each tank in that time [cm^3]
+    # volume that a negative inflow could not take from each tank in that time [cm^3]
+    shortfall: Sequence = ()
 
 
 class Trajectory(NamedTuple):
-    """A run for people: arrays with one row per saved sample. Row k is the world at t_k before it moves."""
+    """A run for people: arrays with one row per saved sample. Row k is the world at t_k before it
+    moves.
+    """
 
     t: Any  # (rows,) [s]
     x: Any  # (rows, tanks) [cm]

@@ -1,7 +1,8 @@
 """Components, leaves and dotted names.
 
-A component is a frozen keyword-only dataclass that JAX sees as a pytree. Each field is a leaf (a number or an array that may be
-differentiated, with a unit and an allowed range), a static value (hashable: sizes, switching times, topologies), or another
+A component is a frozen keyword-only dataclass that JAX sees as a pytree. Each field is a leaf (a
+number or an array that may be differentiated, with a unit and an allowed range), a static value
+(hashable: sizes, switching times, topologies), or another
 component. Dotted names reach every leaf: "controller.k1", "plant.drain[0]".
 
 A constructor converts leaves given as lists and numbers. JAX rebuilds components without it, with
@@ -41,12 +42,21 @@ def leaf(
 ) -> Any:
     """A differentiable field: its unit, what it is, and the range in which it means something.
 
-    low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a sibling field: such a leaf may be
-    absent (None), which costs the loop nothing, and takes the shape of the sibling when it is set; type checkers see that it may be
-    left out where `default=None` is written beside it. default: function of {field: value} of the fields given, whose result a leaf
-    has that is left out.
+    low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a
+    sibling field: such a leaf may be absent (None), which costs the loop nothing, and takes the
+    shape of the sibling when it is set; type checkers see that it may be left out where
+    `default=None` is written beside it. default: function of {field: value} of the fields given,
+    whose result a leaf has that is left out.
     """
-    meta = {"kind": "leaf", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "like": like}
+    meta = {
+        "kind": "leaf",
+        "unit": unit,
+        "doc": doc,
+        "low": low,
+        "high": high,
+        "strict": strict,
+        "like": like,
+    }
     if callable(default):
         meta["default"] = default
     needed = like is None and default is dataclasses.MISSING
@@ -63,17 +73,30 @@ def static(
     choices: tuple | None = None,
     default: Any = dataclasses.MISSING,
 ) -> Any:
-    """A field that is part of the compiled program: hashable, never an array. Ranges and choices as in `leaf`."""
-    meta = {"kind": "static", "unit": unit, "doc": doc, "low": low, "high": high, "strict": strict, "choices": choices}
+    """A field that is part of the compiled program: hashable, never an array. Ranges and choices as
+    in `leaf`.
+    """
+    meta = {
+        "kind": "static",
+        "unit": unit,
+        "doc": doc,
+        "low": low,
+        "high": high,
+        "strict": strict,
+        "choices": choices,
+    }
     return dataclasses.field(metadata=meta, default=default)
 
 
-@dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(leaf, static))
+@dataclass_transform(
+    kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(leaf, static)
+)
 def component(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its metadata, the rest its data.
+    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its
+    metadata, the rest its data.
 
-    The constructor converts leaves given as numbers or lists and tuples of numbers to arrays (`number`), and gives those that are left out
-    their default.
+    The constructor converts leaves given as numbers or lists and tuples of numbers to arrays
+    (`number`), and gives those that are left out their default.
 
     >>> from jaxtank.instruments.actuators import PumpBank
     >>> PumpBank(low=[0.0], high=[12.0]).pulse
@@ -146,7 +169,9 @@ def number(value: Any) -> Any:
 
 
 def is_real(value: Any) -> bool:
-    """Whether a value, or every entry of a list or array, is a real number: no text, truth value, complex number, random key or None."""
+    """Whether a value, or every entry of a list or array, is a real number: no text, truth value,
+    complex number, random key or None.
+    """
     if isinstance(value, list | tuple):
         return all(is_real(v) for v in value)
     kind = getattr(value, "dtype", None)
@@ -154,16 +179,19 @@ def is_real(value: Any) -> bool:
         return isinstance(value, numbers.Real) and not isinstance(value, bool)
     if kind == np.dtype(object):  # whole numbers of 2^64 and more, or anything
         return all(is_real(v) for v in np.ravel(value).tolist())
-    return jnp.issubdtype(kind, np.integer) or jnp.issubdtype(kind, np.floating)  # jnp: its own short floats too
+    # jnp: its own short floats too
+    return jnp.issubdtype(kind, np.integer) or jnp.issubdtype(kind, np.floating)
 
 
 def walk(
     tree: Any, prefix: str = "", kind: str = "leaf", units: tuple[str, str] = DEFAULT
 ) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below `tree`, units as the rig counts.
+    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below
+    `tree`, units as the rig counts.
 
-    A component whose fields mean what another one's do (the gains in `controllers.Scheduled`) has a method `metadata_of(field)` that returns
-    what to change of the class's metadata; "rows" in it is the metadata of each row of an array.
+    A component whose fields mean what another one's do (the gains in `controllers.Scheduled`) has a
+    method `metadata_of(field)` that returns what to change of the class's metadata; "rows" in it is
+    the metadata of each row of an array.
     """
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
@@ -176,12 +204,16 @@ def walk(
 
 
 def parameters(tree: Any) -> dict[str, Any]:
-    """{dotted name: value} of every leaf of a component (a loop, a plant, a law). Absent optional leaves are left out."""
+    """{dotted name: value} of every leaf of a component (a loop, a plant, a law). Absent optional
+    leaves are left out.
+    """
     return {name: value for name, value, _ in walk(tree) if value is not None}
 
 
 def describe(tree: Any, name: str) -> dict[str, Any]:
-    """The metadata (unit, doc, low, high, strict) of the leaf or static field `name`; InputError if there is none."""
+    """The metadata (unit, doc, low, high, strict) of the leaf or static field `name`; InputError if
+    there is none.
+    """
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
         for other, _, meta in walk(tree, kind=kind):
@@ -192,22 +224,28 @@ def describe(tree: Any, name: str) -> dict[str, Any]:
 
 
 def get_value(tree: Any, name: str) -> Any:
-    """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if there is none."""
+    """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if
+    there is none.
+    """
     base, index = split_index(name)
     values = parameters(tree)
     if base in values:
         return _entry(values[base], index, name)
     if describe(tree, name)["kind"] == "leaf":
-        raise InputError(f"{base} is not in use: give it a value first, with --set {base}=VALUE or with_values")
+        raise InputError(
+            f"{base} is not in use: give it a value first, with --set {base}=VALUE or with_values"
+        )
     raise unknown("parameter", name, values)
 
 
 def with_values(tree: T, values: Mapping[str, Any]) -> T:
     """A copy of `tree` with the leaves named in `values` replaced.
 
-    values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf fills it.
-    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name (with the three closest), for a
-    value that is no real number (a text, a truth value, a complex number, None) and for one of the wrong shape.
+    values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf
+        fills it.
+    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name
+    (with the three closest), for a value that is no real number (a text, a truth value, a complex
+    number, None) and for one of the wrong shape.
     """
     for name, value in values.items():
         base, index = split_index(name)
@@ -217,30 +255,43 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
         except LookupError:
             if base in [other for other, _, _ in walk(tree, kind="static")]:
                 raise InputError(
-                    f"{base} is no number of the loop but a part of its structure: set it with rig.set_values"
+                    f"{base} is no number of the loop but a part of its structure: set it with"
+                    " rig.set_values"
                 ) from None
             raise unknown("parameter", name, _all_names(tree)) from None
     return tree
 
 
 def split_index(name: str) -> tuple[str, tuple[int, ...]]:
-    """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError for a malformed name."""
+    """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError
+    for a malformed name.
+    """
     parts = name.split(".")
     last = _STEP.fullmatch(parts[-1])
-    if last is None or not all(_STEP.fullmatch(p) for p in parts) or any("[" in p for p in parts[:-1]):
-        raise InputError(f"{name!r} is not a parameter name: write component.field or component.field[i]")
+    if (
+        last is None
+        or not all(_STEP.fullmatch(p) for p in parts)
+        or any("[" in p for p in parts[:-1])
+    ):
+        raise InputError(
+            f"{name!r} is not a parameter name: write component.field or component.field[i]"
+        )
     base, bracket = last.groups()
     index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()
     return ".".join([*parts[:-1], base]), index
 
 
 def check_leaves(tree, names=None, vacant=()):
-    """Raise InputError if a concrete leaf is no real number, not finite or out of its range. Traced leaves are passed over, and so is
-    None of an optional leaf and of the names in `vacant`, which a schedule fills."""
+    """Raise InputError if a concrete leaf is no real number, not finite or out of its range. Traced
+    leaves are passed over, and so is None of an optional leaf and of the names in `vacant`, which a
+    schedule fills.
+    """
     for name, value, meta in walk(tree):
         if names is not None and name not in names:
             continue
-        if isinstance(value, Tracer) or (value is None and (meta.get("like") is not None or name in vacant)):
+        if isinstance(value, Tracer) or (
+            value is None and (meta.get("like") is not None or name in vacant)
+        ):
             continue
         check_value(name, value, meta)
 
@@ -248,11 +299,16 @@ def check_leaves(tree, names=None, vacant=()):
 def check_value(name, value, meta):
     """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
     if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
-        raise InputError(f"{name} = {shortened(value)}: must be a number or an array, np.array(...)")
+        raise InputError(
+            f"{name} = {shortened(value)}: must be a number or an array, np.array(...)"
+        )
     if not is_real(value):
-        raise InputError(f"{name} = {shortened(value)}: must be a real number or an array of real numbers")
+        raise InputError(
+            f"{name} = {shortened(value)}: must be a real number or an array of real numbers"
+        )
     array, low, high = np.asarray(value), meta["low"], meta["high"]
-    array = number(value) if array.dtype == object else array  # whole numbers of 2^64 and more are no numbers to numpy
+    # whole numbers of 2^64 and more are no numbers to numpy
+    array = number(value) if array.dtype == object else array
     good = np.isfinite(array)
     if low is not None:
         good = good & ((array > low) if meta["strict"] else (array >= low))
@@ -267,14 +323,18 @@ def check_value(name, value, meta):
         raise InputError(f"{label} = {entry}{unit}: must be a finite number")
     if high is not None and entry > high:
         raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
-    raise InputError(f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'} {low:g}{unit}")
+    raise InputError(
+        f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'}"
+        f" {low:g}{unit}"
+    )
 
 
 def shortened(value):
     """`value` for a message, cut where it would fill the screen."""
     try:
         text = repr(value)
-    except (ValueError, RecursionError):  # an int of thousands of digits, or a list in a list in a list ...
+    # an int of thousands of digits, or a list in a list in a list ...
+    except (ValueError, RecursionError):
         return f"a {type(value).__name__} too large to print"
     text = text.replace("\n", " ")  # of an array
     return text if len(text) <= 80 else f"{text[:77]}..."
@@ -293,7 +353,9 @@ def _entry(value, index, name):
     if not index:
         return value
     if len(index) != np.ndim(value) or any(i >= n for i, n in zip(index, np.shape(value))):
-        raise InputError(f"{name!r} does not exist: {split_index(name)[0]} has shape {np.shape(value)}")
+        raise InputError(
+            f"{name!r} does not exist: {split_index(name)[0]} has shape {np.shape(value)}"
+        )
     return value[index]
 
 
@@ -330,7 +392,8 @@ def _fitted(old, index, value, name):
         _entry(old, index, name)
         if np.ndim(value) != 0:
             raise InputError(f"{name} takes one number, not shape {np.shape(value)}")
-        # `where` with a constant mask, not `.at[].set`: a scatter inside the time loop would break its compilation to one function
+        # `where` with a constant mask, not `.at[].set`: a scatter inside the time loop would break
+        # its compilation to one function
         mask = np.zeros(shape, dtype=bool)
         mask[index] = True
         return jnp.where(mask, value, old) if on_device else np.where(mask, value, old)
@@ -338,5 +401,9 @@ def _fitted(old, index, value, name):
         return value
     if np.ndim(value) == 0:
         return jnp.broadcast_to(value, shape) if on_device else np.full(shape, value)
-    wanted = f"must be a number or shape {shape}" if shape else "must be one number, its decimals after a point"
+    wanted = (
+        f"must be a number or shape {shape}"
+        if shape
+        else "must be one number, its decimals after a point"
+    )
     raise InputError(f"{name} has shape {np.shape(value)}: {wanted}")

@@ -1,6 +1,8 @@
-"""Units of a rig. Metadata is written for centimetres and volts; a rig in other units says so, and every printed unit follows.
+"""Units of a rig. Metadata is written for centimetres and volts; a rig in other units says so, and
+every printed unit follows.
 
-`plant.units` is (length, pump input): ("cm", "V") unless its paper counts otherwise, as in ("m", "m^3/s").
+`plant.units` is (length, pump input): ("cm", "V") unless its paper counts otherwise, as in ("m",
+"m^3/s").
 """
 
 import re
@@ -17,8 +19,8 @@ def check_unit(where, text):
     """Return `text` if it is a unit, such as "cm", "L/min", "m^3/s" or "cm^3/(s V)".
 
     A unit is names joined by *, / or a space, each with ^ and a number where it has an exponent; a
-    product may stand in brackets. A name is letters, digits and _, and begins with a letter; "%", "1"
-    and "-" are units too. Raises InputError, with `where` for its name, for any other text.
+    product may stand in brackets. A name is letters, digits and _, and begins with a letter; "%",
+    "1" and "-" are units too. Raises InputError, with `where` for its name, for any other text.
     """
     name = r"(?:[^\W\d_]\w*|°[CF]|%|1)"
     factor = rf"{name}(?:\^-?\d+(?:\.\d+)?)?"
@@ -28,23 +30,27 @@ def check_unit(where, text):
     if len(text) > LONGEST or not re.fullmatch(rf"-|{term}(?:{joint}{term})*", text):
         shown = text if len(text) <= LONGEST else text[:LONGEST] + "..."
         raise InputError(
-            f"{where} = {shown!r}: must be a unit of at most {LONGEST} characters, such as cm, L/min, m^3/s or "
-            "cm^3/(s V): names joined by *, / or a space, ^ before an exponent"
+            f"{where} = {shown!r}: must be a unit of at most {LONGEST} characters, such as cm,"
+            " L/min, m^3/s or cm^3/(s V): names joined by *, / or a space, ^ before an exponent"
         )
     return text
 
 
 def local(unit, units=DEFAULT):
-    """`unit`, written with "cm" for the length, "V" for the pump input and "volt" for a sensor's volt, in the units of a rig.
+    """`unit`, written with "cm" for the length, "V" for the pump input and "volt" for a sensor's
+    volt, in the units of a rig.
 
-    A unit of several factors is put in brackets where it is one of several itself: V^2 of ("m", "m^3/s") is (m^3/s)^2.
+    A unit of several factors is put in brackets where it is one of several itself: V^2 of ("m",
+    "m^3/s") is (m^3/s)^2.
     """
     length, drive = units
     if drive == f"{length}^3/s" and unit == "cm^3/(s V)":  # the input is the flow itself
         return "-"
     meant = {"cm": length, "V": drive, "volt": "V"}
     # all in one pass: what stands for one of them may hold another
-    return re.sub(r"\b(cm|V|volt)\b", lambda found: _factor(meant[found[0]], alone=found[0] == unit), unit)
+    return re.sub(
+        r"\b(cm|V|volt)\b", lambda found: _factor(meant[found[0]], alone=found[0] == unit), unit
+    )
 
 
 def _factor(unit, alone):

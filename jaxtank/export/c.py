@@ -43,7 +43,13 @@ class C:
     def value(self, e):
         """A number or a Ref."""
         if isinstance(e, cg.Ref):
-            return self.inputs(e.index) if e.name == "x" else e.name if e.index is None else f"{e.name}[{e.index}]"
+            return (
+                self.inputs(e.index)
+                if e.name == "x"
+                else e.name
+                if e.index is None
+                else f"{e.name}[{e.index}]"
+            )
         if isinstance(e, bool):
             return str(int(e))
         if isinstance(e, int):
@@ -82,23 +88,41 @@ class C:
         out = []
         for s in statements:
             if isinstance(s, cg.Define):
-                out.append(f"{indent}const {C_TYPES[s.kind]} {s.name} = {self.right(s.op, s.args)};")
+                out.append(
+                    f"{indent}const {C_TYPES[s.kind]} {s.name} = {self.right(s.op, s.args)};"
+                )
             elif isinstance(s, cg.Array):
-                fixed = "static const" if not any(isinstance(e, cg.Ref) for e in s.entries) else "const"
-                out += wrapped(f"{indent}{fixed} real {s.name}[{len(s.entries)}] = {{", map(self.value, s.entries), indent, "};")
+                fixed = (
+                    "static const" if not any(isinstance(e, cg.Ref) for e in s.entries) else "const"
+                )
+                out += wrapped(
+                    f"{indent}{fixed} real {s.name}[{len(s.entries)}] = {{",
+                    map(self.value, s.entries),
+                    indent,
+                    "};",
+                )
             elif isinstance(s, cg.Matrix):
-                size = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}.get(s.op, lambda n, k: n * k)(*s.sizes)
+                size = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}.get(
+                    s.op, lambda n, k: n * k
+                )(*s.sizes)
                 out.append(f"{indent}real {s.name}[{size}];")
-                out.append(f"{indent}{s.op}({', '.join([*map(str, s.sizes), *s.operands, s.name])});")
+                out.append(
+                    f"{indent}{s.op}({', '.join([*map(str, s.sizes), *s.operands, s.name])});"
+                )
             elif isinstance(s, cg.Until):
                 out.append(f"{indent}if (!({self.value(s.test)})) break;")
             else:
-                out += [f"{indent}{C_TYPES[kind]} {name} = {self.value(start)};" for kind, name, start in s.carried]
+                out += [
+                    f"{indent}{C_TYPES[kind]} {name} = {self.value(start)};"
+                    for kind, name, start in s.carried
+                ]
                 head = "for (;;)" if s.count is None else f"for (int i = 0; i < {s.count}; ++i)"
                 out += [f"{indent}{head} {{", *self.lines(s.body, indent + "    ")]
                 for (kind, name, _), new in zip(s.carried, s.new):
                     out.append(f"{indent}    const {C_TYPES[kind]} n{name} = {self.value(new)};")
-                out += [f"{indent}    {name} = n{name};" for _, name, _ in s.carried] + [f"{indent}}}"]
+                out += [f"{indent}    {name} = n{name};" for _, name, _ in s.carried] + [
+                    f"{indent}}}"
+                ]
         return out
 
 
@@ -161,27 +185,65 @@ def print_c(law, case, name, precision):
         return f"y[{k}]" if k < law.tanks else f"u[{k - law.tanks}]"
 
     head = [
-        *header(law, case, " *", name, f"{name}_init takes the levels and inputs before the first period."),
+        *header(
+            law,
+            case,
+            " *",
+            name,
+            f"{name}_init takes the levels and inputs before the first period.",
+        )
     ]
-    lines = ["/*", *head, " */", "#include <math.h>", "", f"typedef {precision} real;", "#define R(x) ((real)(x))"]
+    lines = [
+        "/*",
+        *head,
+        " */",
+        "#include <math.h>",
+        "",
+        f"typedef {precision} real;",
+        "#define R(x) ((real)(x))",
+    ]
     lines += [f"#define {m.upper()} {m}{short}" for m in MATHS]
-    lines += ["#define MAX(a, b) ((a) > (b) ? (a) : (b))", "#define MIN(a, b) ((a) < (b) ? (a) : (b))", ""]
-    lines += [f"#define {upper}_DT {case.clock.dt!r}", *(f"#define {upper}_{n.upper()} {max(v, 1)}" for n, v in sizes.items())]
+    lines += [
+        "#define MAX(a, b) ((a) > (b) ? (a) : (b))",
+        "#define MIN(a, b) ((a) < (b) ? (a) : (b))",
+        "",
+    ]
+    lines += [
+        f"#define {upper}_DT {case.clock.dt!r}",
+        *(f"#define {upper}_{n.upper()} {max(v, 1)}" for n, v in sizes.items()),
+    ]
     lines += ["", f"typedef struct {{ real s[{upper}_STATE]; }} {name}_state;"]
     if has(law.step, cg.Matrix):
         used = {s.op for s in every(law.step) if isinstance(s, cg.Matrix)}
-        lines += [b for b in MATRIX_C.strip("\n").split("\n\n") if used & set(re.findall(r"void (\w+)", b)[:1])]
+        lines += [
+            b
+            for b in MATRIX_C.strip("\n").split("\n\n")
+            if used & set(re.findall(r"void (\w+)", b)[:1])
+        ]
     printer = C(begun)
-    lines += ["", f"void {name}_init({name}_state *state, const real *y, const real *u)", "{", "    (void)y; (void)u;"]
-    lines += printer.lines(law.begin) + [f"    state->s[{i}] = {as_real(printer, e)};" for i, e in enumerate(law.begun)]
+    lines += [
+        "",
+        f"void {name}_init({name}_state *state, const real *y, const real *u)",
+        "{",
+        "    (void)y; (void)u;",
+    ]
+    lines += printer.lines(law.begin) + [
+        f"    state->s[{i}] = {as_real(printer, e)};" for i, e in enumerate(law.begun)
+    ]
     lines += ["}" if law.state else "    state->s[0] = R(0.0);\n}"]
     printer = C(stepped)
     lines += [
         "",
-        f"void {name}_step({name}_state *state, real t, const real *y, const real *r, const real *dr, const real *ddr, real *u)",
+        (
+            f"void {name}_step({name}_state *state, real t, const real *y, const real *r, const"
+            " real *dr, const real *ddr, real *u)"
+        ),
         "{",
     ]
-    lines += ["    (void)t; (void)y; (void)r; (void)dr; (void)ddr; (void)state;", *printer.lines(law.step)]
+    lines += [
+        "    (void)t; (void)y; (void)r; (void)dr; (void)ddr; (void)state;",
+        *printer.lines(law.step),
+    ]
     # a state that is only handed on must be read before it is written
     lines += [f"    const real next{i} = {as_real(printer, e)};" for i, e in enumerate(law.after)]
     lines += [f"    u[{j}] = {printer.value(e)};" for j, e in enumerate(law.u)]

@@ -1,8 +1,10 @@
-"""From a traced function to straight-line statements on scalars, which a printer turns into C or MATLAB.
+"""From a traced function to straight-line statements on scalars, which a printer turns into C or
+MATLAB.
 
-Every element of every array becomes a `Ref` or a number; what only moves elements about (slices, transposes, broadcasts) costs nothing, what
-depends on constants alone is computed here, and what nobody uses is left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) stay loops,
-products of large matrices too.
+Every element of every array becomes a `Ref` or a number; what only moves elements about (slices,
+transposes, broadcasts) costs nothing, what depends on constants alone is computed here, and what
+nobody uses is left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) stay loops, products of large
+matrices too.
 """
 
 import math
@@ -44,8 +46,9 @@ class Array(NamedTuple):
 
 
 class Matrix(NamedTuple):
-    """out = op(operands), arrays by name, sizes as the operation needs them: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
-    "forward" and "backward" (n, k): L x = b and L' x = b."""
+    """out = op(operands), arrays by name, sizes as the operation needs them: "product" (m, k, n) of
+    A (m, k) and B (k, n); "cholesky" (n,); "forward" and "backward" (n, k): L x = b and L' x = b.
+    """
 
     name: str
     op: str
@@ -60,7 +63,9 @@ class Until(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """`count` times (None: until it ends by itself): body, then every carried variable takes its new value, all at once."""
+    """`count` times (None: until it ends by itself): body, then every carried variable takes its
+    new value, all at once.
+    """
 
     count: int | None
     carried: tuple  # ((kind, name, start), ...)
@@ -270,8 +275,9 @@ def _compute(op, args):
 def function(f, *shapes):
     """(statements, inputs, outputs) of f(*arguments), a function of trees of arrays.
 
-    shapes: trees of jax.ShapeDtypeStruct. inputs: Refs "x", index, in the order of all elements of all arguments; outputs: list of arrays of
-    elements, one for each leaf of what f returns. Raises InputError for an operation that has no counterpart here.
+    shapes: trees of jax.ShapeDtypeStruct. inputs: Refs "x", index, in the order of all elements of
+    all arguments; outputs: list of arrays of elements, one for each leaf of what f returns. Raises
+    InputError for an operation that has no counterpart here.
     """
     closed = jax.make_jaxpr(f)(*shapes)
     writer, inputs, count = Writer(), [], 0
@@ -284,7 +290,9 @@ def function(f, *shapes):
         inputs.append(elements.reshape(leaf.shape))
         count += size
     outputs = _run(writer, closed.jaxpr, closed.consts, inputs)
-    statements = _used(writer.scopes[0], {e.name for out in outputs for e in out.ravel() if isinstance(e, Ref)})
+    statements = _used(
+        writer.scopes[0], {e.name for out in outputs for e in out.ravel() if isinstance(e, Ref)}
+    )
     return statements, count, outputs
 
 
@@ -316,7 +324,10 @@ def _equation(writer, eqn, operands):
     name, params = eqn.primitive.name, eqn.params
     if name in ("jit", "pjit") and params["name"] in NAMED:
         return [NAMED[params["name"]](writer, *operands)]
-    inner = next((params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in params and name != "scan"), None)
+    inner = next(
+        (params[k] for k in ("jaxpr", "call_jaxpr", "fun_jaxpr") if k in params and name != "scan"),
+        None,
+    )
     if inner is not None and name != "custom_linear_solve":
         return _run(writer, getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
     if all(_number(e) for o in operands for e in o.ravel()):
@@ -330,32 +341,72 @@ def _equation(writer, eqn, operands):
         source = kind_of(eqn.invars[0].aval.dtype)
         return [_each(lambda a: a if source == kind else writer.define(kind, kind, a), operands[0])]
     if name == "xor" and kind == TRUTH:
-        return [_each(lambda a, b: writer.define(TRUTH, "ne", a, b), *np.broadcast_arrays(*operands))]
+        return [
+            _each(lambda a, b: writer.define(TRUTH, "ne", a, b), *np.broadcast_arrays(*operands))
+        ]
     if kind == WHOLE and name in WHOLES:
-        return [_each(lambda a, b: writer.define(WHOLE, WHOLES[name], a, b), *np.broadcast_arrays(*operands))]
+        return [
+            _each(
+                lambda a, b: writer.define(WHOLE, WHOLES[name], a, b),
+                *np.broadcast_arrays(*operands),
+            )
+        ]
     if name in PLAIN:
         out = TRUTH if PLAIN[name] in TRUTHS else kind
-        return [_each(lambda *a: writer.define(out, PLAIN[name], *a), *np.broadcast_arrays(*operands))]
+        return [
+            _each(lambda *a: writer.define(out, PLAIN[name], *a), *np.broadcast_arrays(*operands))
+        ]
     if name == "integer_pow":
         return [_each(lambda a: _power(writer, a, params["y"]), operands[0])]
     if name == "clamp":
         low, x, high = np.broadcast_arrays(*operands)
-        return [_each(lambda a, b, c: writer.define(REAL, "min", writer.define(REAL, "max", b, a), c), low, x, high)]
+        return [
+            _each(
+                lambda a, b, c: writer.define(REAL, "min", writer.define(REAL, "max", b, a), c),
+                low,
+                x,
+                high,
+            )
+        ]
     if name == "select_n" and len(operands) == 3:
-        return [_each(lambda c, no, yes: writer.define(kind, "select", c, no, yes), *np.broadcast_arrays(*operands))]
+        return [
+            _each(
+                lambda c, no, yes: writer.define(kind, "select", c, no, yes),
+                *np.broadcast_arrays(*operands),
+            )
+        ]
     if name == "select_n":
         index, *values = np.broadcast_arrays(*operands)
         return [_chosen(writer, index, values, kind)]
     if name == "cond":  # every branch is computed: none has an effect
         branches = [_run(writer, b.jaxpr, b.consts, operands[1:]) for b in params["branches"]]
         chosen = zip(*branches), (kind_of(v.aval.dtype) for v in eqn.outvars)
-        return [_chosen(writer, np.broadcast_to(operands[0], v[0].shape), v, k) for v, k in zip(*chosen)]
+        return [
+            _chosen(writer, np.broadcast_to(operands[0], v[0].shape), v, k) for v, k in zip(*chosen)
+        ]
     if name in ("reduce_sum", "reduce_prod", "reduce_max", "reduce_min", "reduce_and", "reduce_or"):
         return [_reduced(writer, operands[0], params["axes"], SUMS.get(name[7:], name[7:]), kind)]
     if name in ("argmax", "argmin"):
-        return [_place(writer, operands[0], params["axes"][0], name == "argmax", kind_of(eqn.invars[0].aval.dtype))]
+        return [
+            _place(
+                writer,
+                operands[0],
+                params["axes"][0],
+                name == "argmax",
+                kind_of(eqn.invars[0].aval.dtype),
+            )
+        ]
     if name in ("cumsum", "cumprod", "cummax", "cummin"):
-        return [_running(writer, operands[0], params["axis"], params["reverse"], SUMS.get(name[3:], name[3:]), kind)]
+        return [
+            _running(
+                writer,
+                operands[0],
+                params["axis"],
+                params["reverse"],
+                SUMS.get(name[3:], name[3:]),
+                kind,
+            )
+        ]
     if name == "dot_general":
         return [_product(writer, *operands, dimensions=params["dimension_numbers"])]
     if name == "scan":
@@ -370,7 +421,10 @@ def _equation(writer, eqn, operands):
     if name == "custom_linear_solve" and all(_number(e) and e == 0 for e in operands[-1].ravel()):
         return [operands[-1]]  # nothing to solve for: a term that carries derivatives alone
     if name == "lu":  # of a matrix whose equations have a right side of zero: see above
-        return [_each(lambda a: a, operands[0]), *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:])]
+        return [
+            _each(lambda a: a, operands[0]),
+            *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:]),
+        ]
     raise InputError(f"this law cannot be written as code: it uses the operation {name}")
 
 
@@ -383,7 +437,10 @@ def _each(f, *arrays):
 
 def _constant(eqn, operands):
     """What an operation on numbers gives, computed by jax."""
-    values = [np.array(o.tolist(), dtype=v.aval.dtype).reshape(v.aval.shape) for o, v in zip(operands, eqn.invars)]
+    values = [
+        np.array(o.tolist(), dtype=v.aval.dtype).reshape(v.aval.shape)
+        for o, v in zip(operands, eqn.invars)
+    ]
     bound = eqn.primitive.get_bind_params(eqn.params)
     functions, params = bound if isinstance(bound, tuple) else ((), bound)
     with jax.ensure_compile_time_eval():
@@ -398,13 +455,18 @@ def _moved(eqn, operands):
         whole = eqn.primitive.name in ("gather", "dynamic_slice") and o is not operands[0]
         if whole:  # indices, which must be numbers
             if not all(_number(e) for e in o.ravel()):
-                raise InputError("this law cannot be written as code: it looks something up by a number that it computes")
+                raise InputError(
+                    "this law cannot be written as code: it looks something up by a number that it"
+                    " computes"
+                )
             ids.append(np.array(o.tolist(), dtype=v.aval.dtype).reshape(v.aval.shape))
             continue
         ids.append(np.arange(len(table), len(table) + o.size, dtype=np.int64).reshape(o.shape))
         table += list(o.ravel())
     with jax.ensure_compile_time_eval():
-        out = eqn.primitive.bind(*map(jnp.asarray, ids), **eqn.primitive.get_bind_params(eqn.params))
+        out = eqn.primitive.bind(
+            *map(jnp.asarray, ids), **eqn.primitive.get_bind_params(eqn.params)
+        )
     outs = out if eqn.primitive.multiple_results else [out]
     return [_each(lambda i: table[int(i)], np.asarray(v)) for v in outs]
 
@@ -436,7 +498,12 @@ def _chosen(writer, index, values, kind):
     out = values[0]
     for i, value in enumerate(values[1:], start=1):
         out = _each(
-            lambda n, no, yes, i=i: writer.define(kind, "select", writer.define(TRUTH, "ge", n, i), no, yes), index, out, value
+            lambda n, no, yes, i=i: writer.define(
+                kind, "select", writer.define(TRUTH, "ge", n, i), no, yes
+            ),
+            index,
+            out,
+            value,
         )
     return out
 
@@ -493,7 +560,9 @@ def _triangular(writer, a, b, params):
     if params["unit_diagonal"] or params["conjugate_a"] or not params["left_side"]:
         # x A = b is A' x' = b'
         if params["unit_diagonal"] or params["conjugate_a"]:
-            raise InputError("this law cannot be written as code: a triangular solve of an unusual kind")
+            raise InputError(
+                "this law cannot be written as code: a triangular solve of an unusual kind"
+            )
         turned = {**params, "left_side": True, "transpose_a": not params["transpose_a"]}
         return _triangular(writer, a, b.T, turned).T
     lower = a if params["lower"] else a.T
@@ -514,12 +583,16 @@ def _cholesky_solve(writer, upper, b):
 
 
 def _weighted(writer, g, weight):
-    scaled = _each(lambda a, w: writer.define(REAL, "mul", a, w), g, np.broadcast_to(weight[:, None], g.shape))
+    scaled = _each(
+        lambda a, w: writer.define(REAL, "mul", a, w), g, np.broadcast_to(weight[:, None], g.shape)
+    )
     return _product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
 
 
 NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, _weighted)}
-"""Functions of `jaxtank.analysis.qp` whose loops go through arrays by an index: written as matrix operations."""
+"""Functions of `jaxtank.analysis.qp` whose loops go through arrays by an index: written as matrix
+operations.
+"""
 
 
 def _scan(writer, eqn, operands):
@@ -530,15 +603,26 @@ def _scan(writer, eqn, operands):
         operands[p["num_consts"] + p["num_carry"] :],
     )
     if xs or len(eqn.outvars) > p["num_carry"]:
-        raise InputError("this law cannot be written as code: a loop in it reads or writes a sequence")
+        raise InputError(
+            "this law cannot be written as code: a loop in it reads or writes a sequence"
+        )
     closed = p["jaxpr"]
-    return _loop(writer, eqn, carry, p["length"], lambda names: _run(writer, closed.jaxpr, closed.consts, [*consts, *names]))
+    return _loop(
+        writer,
+        eqn,
+        carry,
+        p["length"],
+        lambda names: _run(writer, closed.jaxpr, closed.consts, [*consts, *names]),
+    )
 
 
 def _while(writer, eqn, operands):
     p = eqn.params
     test, body = p["cond_jaxpr"], p["body_jaxpr"]
-    first, second = operands[: p["cond_nconsts"]], operands[p["cond_nconsts"] : p["cond_nconsts"] + p["body_nconsts"]]
+    first, second = (
+        operands[: p["cond_nconsts"]],
+        operands[p["cond_nconsts"] : p["cond_nconsts"] + p["body_nconsts"]],
+    )
 
     def once(names):
         (on,) = _run(writer, test.jaxpr, test.consts, [*first, *names])
@@ -580,7 +664,9 @@ def _used(statements, wanted):
                 continue
             body = _used(s.body, _names(s.new))
             s = s._replace(body=body)
-            wanted = wanted | _names(start for _, _, start in s.carried) | _inside(body) | _names(s.new)
+            wanted = (
+                wanted | _names(start for _, _, start in s.carried) | _inside(body) | _names(s.new)
+            )
         elif isinstance(s, Until):
             wanted = wanted | _names([s.test])
         elif s.name not in wanted:

@@ -16,9 +16,10 @@ from jaxtank.loop.step import decide
 def law_of(case):
     """(step, begin): functions of one sample, of arrays.
 
-    step(state, t, y, r, dr, ddr) -> (u, state): t [s]; y: (tanks,) readings; r, dr, ddr: (outputs,) setpoints with their first and second
-    derivatives by time; u: (pumps,) inputs within the pumps' limits. begin(y, u) -> state, for readings and inputs before the first sample. The
-    order is that of `jaxtank.loop.step.decide`, which is called.
+    step(state, t, y, r, dr, ddr) -> (u, state): t [s]; y: (tanks,) readings; r, dr, ddr: (outputs,)
+    setpoints with their first and second derivatives by time; u: (pumps,) inputs within the pumps'
+    limits. begin(y, u) -> state, for readings and inputs before the first sample. The order is that
+    of `jaxtank.loop.step.decide`, which is called.
     """
     loop, dt = case.loop, case.clock.dt
 
@@ -46,10 +47,11 @@ def function_name(case):
 
 
 def comment(text):
-    """`text` as what may stand in a comment of C and of MATLAB, on one line that ends nothing and goes on nowhere.
+    """`text` as what may stand in a comment of C and of MATLAB, on one line that ends nothing and
+    goes on nowhere.
 
-    Characters that do not print, line breaks of every script among them, are spaces; a backslash is a slash; the ends of comments and the
-    trigraphs of C are taken apart.
+    Characters that do not print, line breaks of every script among them, are spaces; a backslash is
+    a slash; the ends of comments and the trigraphs of C are taken apart.
     """
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
     return re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
@@ -61,19 +63,32 @@ class Code:
     def __init__(self, case):
         loop = case.loop
         step, begin = law_of(case)
-        self.tanks, self.outputs, self.pumps = loop.plant.tanks, len(loop.plant.outputs), loop.plant.pumps
+        self.tanks, self.outputs, self.pumps = (
+            loop.plant.tanks,
+            len(loop.plant.outputs),
+            loop.plant.pumps,
+        )
         real = functools.partial(jax.ShapeDtypeStruct, dtype=jax.numpy.result_type(float))
         y, r, u = real((self.tanks,)), real((self.outputs,)), real((self.pumps,))
-        # what a state begins with need not have the type it goes on with: a number from the law, an array from the run
+        # what a state begins with need not have the type it goes on with: a number from the law, an
+        # array from the run
         ran = initial(loop, case.clock)
-        state = jax.tree.map(lambda a: jax.ShapeDtypeStruct(np.shape(a), jax.numpy.result_type(a)), (ran.observer, ran.controller))
+        state = jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct(np.shape(a), jax.numpy.result_type(a)),
+            (ran.observer, ran.controller),
+        )
         self.state = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(state))
         self.begin, _, first = cg.function(begin, y, u)
         self.step, _, after = cg.function(step, state, real(()), y, r, r, r)
         self.begun = [e for leaf in first for e in np.ravel(leaf)]
-        self.u, self.after = list(after[0].ravel()), [e for leaf in after[1:] for e in np.ravel(leaf)]
+        self.u, self.after = (
+            list(after[0].ravel()),
+            [e for leaf in after[1:] for e in np.ravel(leaf)],
+        )
         if not len(self.begun) == len(self.after) == self.state:
-            raise InputError(f"{case.name}: its law begins with a state of another size than it goes on with")
+            raise InputError(
+                f"{case.name}: its law begins with a state of another size than it goes on with"
+            )
 
 
 SAME_NAME = (
@@ -106,7 +121,22 @@ def wrapped(head, items, indent, tail, width=130, more=""):
     return [*rows, line.rstrip(", ") + tail]
 
 
-MATHS = ("sqrt", "fabs", "exp", "log", "tanh", "sin", "cos", "floor", "pow", "rint", "fmod", "cbrt", "exp2", *SAME_NAME)
+MATHS = (
+    "sqrt",
+    "fabs",
+    "exp",
+    "log",
+    "tanh",
+    "sin",
+    "cos",
+    "floor",
+    "pow",
+    "rint",
+    "fmod",
+    "cbrt",
+    "exp2",
+    *SAME_NAME,
+)
 
 
 def header(law, case, mark, name, begin):
@@ -115,13 +145,27 @@ def header(law, case, mark, name, begin):
     gains = [(n, v) for n, v in sorted(_shown(case).items())]
     lines = [
         f"{case.name}: {case.title}",
-        "Made by `jaxtank export` from the law and observer that jaxtank simulates; not to be edited.",
+        (
+            "Made by `jaxtank export` from the law and observer that jaxtank simulates; not to be"
+            " edited."
+        ),
         "",
-        f"Sampling period {case.clock.dt:g} s: call {name}{'_step' if mark != '%' else ''} once each period.",
-        f"t: time [s]; y: {law.tanks} measured levels [{length}], of every tank in the order of the rig;",
-        f"r, dr, ddr: {law.outputs} setpoint{'s' if law.outputs > 1 else ''} [{length}], with first [{length}/s] and second [{length}/s^2] "
-        "derivative;",
-        f"u: {law.pumps} pump input{'s' if law.pumps > 1 else ''} [{drive}], within the limits of the pumps. {begin}",
+        (
+            f"Sampling period {case.clock.dt:g} s: call {name}{'_step' if mark != '%' else ''} once"
+            " each period."
+        ),
+        (
+            f"t: time [s]; y: {law.tanks} measured levels [{length}], of every tank in the order of"
+            " the rig;"
+        ),
+        (
+            f"r, dr, ddr: {law.outputs} setpoint{'s' if law.outputs > 1 else ''} [{length}], with"
+            f" first [{length}/s] and second [{length}/s^2] derivative;"
+        ),
+        (
+            f"u: {law.pumps} pump input{'s' if law.pumps > 1 else ''} [{drive}], within the limits"
+            f" of the pumps. {begin}"
+        ),
         "",
         *(f"{n} = {v}" for n, v in gains),
     ]

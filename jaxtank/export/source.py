@@ -1,4 +1,6 @@
-"""A law and its observer as one file without dependencies: C99, or a MATLAB function, made from the same step function that is simulated."""
+"""A law and its observer as one file without dependencies: C99, or a MATLAB function, made from the
+same step function that is simulated.
+"""
 
 import re
 
@@ -15,8 +17,9 @@ PRECISIONS = ("double", "float")
 def export(case, language="c", precision="double", name=None):
     """The law of a Case as source code.
 
-    language: "c" (C99) or "m" (MATLAB); precision: "double" or "float" (of C); name: of the functions, made from the case's where None.
-    Returns the text of one file. Raises InputError for a law that plays a signal back, and one that uses an operation without a counterpart.
+    language: "c" (C99) or "m" (MATLAB); precision: "double" or "float" (of C); name: of the
+    functions, made from the case's where None. Returns the text of one file. Raises InputError for
+    a law that plays a signal back, and one that uses an operation without a counterpart.
     """
     if language not in LANGUAGES:
         raise InputError(f"--lang {language!r}: must be one of {', '.join(LANGUAGES)}")
@@ -25,15 +28,30 @@ def export(case, language="c", precision="double", name=None):
     if language == "m" and precision == "float":
         raise InputError("--precision float: is for C; MATLAB computes in double")
     if isinstance(case.loop.controller, OpenLoop):
-        raise InputError(f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to export")
+        raise InputError(
+            f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to"
+            " export"
+        )
     if case.loop.controller.inputs(case.clock) != ():
-        raise InputError(f"{case.name}: its law plays a signal of its own back, which code without a run cannot have")
+        raise InputError(
+            f"{case.name}: its law plays a signal of its own back, which code without a run cannot"
+            " have"
+        )
     given, name = name, name or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
-        whose = f"--name {given!r}" if given else f"{case.name!r} gives no name for the function; --name NAME"
-        raise InputError(f"{whose}: must be a name in the language: letters, digits and _, beginning with a letter, at most 51")
+        whose = (
+            f"--name {given!r}"
+            if given
+            else f"{case.name!r} gives no name for the function; --name NAME"
+        )
+        raise InputError(
+            f"{whose}: must be a name in the language: letters, digits and _, beginning with a"
+            " letter, at most 51"
+        )
     if language == "m" and name in TAKEN_M.split():
-        raise InputError(f"--name {name!r}: MATLAB, or the file itself, has this name already; give another")
+        raise InputError(
+            f"--name {name!r}: MATLAB, or the file itself, has this name already; give another"
+        )
     law = Code(case)
     return (print_c if language == "c" else print_matlab)(law, case, name, precision)
 

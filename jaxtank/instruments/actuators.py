@@ -1,4 +1,6 @@
-"""What the pumps make of a command: saturation or allocation, dead zone, lag, transport delay, in this order."""
+"""What the pumps make of a command: saturation or allocation, dead zone, lag, transport delay, in
+this order.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -35,23 +37,28 @@ def _largest(high):
 class PumpBank:
     """m pumps: what reaches the plant for a command u. `PumpBank(low=[0.0], high=[12.0])` suffices.
 
-    1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the voltages in the box that are
-       best by the law's own cost (see `allocate`), which removes the wrong-way latch-up of clipping a decoupling law.
-    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset": the flow grows from zero at the dead
-       zone, as that of u - dead_zone (gouta2022 notes S2.3). "hysteresis": a pump that turns stops
-       below `stop`, and starts again above `dead_zone`. "pulse": voltages that would not turn the pump are saved up as
-       volt-seconds and paid out in samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
-    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. What the plant is given over a sample is the
-       mean of v over it, so that the volume delivered is that of the lag itself, whatever the sampling period.
+    1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the
+       voltages in the box that are best by the law's own cost (see `allocate`), which removes the
+       wrong-way latch-up of clipping a decoupling law.
+    2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset":
+       the flow grows from zero at the dead zone, as that of u - dead_zone (gouta2022 notes S2.3).
+       "hysteresis": a pump that turns stops below `stop`, and starts again above `dead_zone`.
+       "pulse": voltages that would not turn the pump are saved up as volt-seconds and paid out in
+       samples at `pulse` volts, so that the mean flow is the one asked for (sigma-delta).
+    3. Lag, if given: first order with time constant `lag` [s], lag v' = u - v, solved exactly. What
+       the plant is given over a sample is the mean of v over it, so that the volume delivered is
+       that of the lag itself, whatever the sampling period.
     4. Transport delay: `delay` [s], whole samples.
 
-    The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its edge, and through "pulse" it is
-    that of the mean flow, 1.
+    The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its
+    edge, and through "pulse" it is that of the mean flow, 1.
     """
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
-    dead_zone: Any = leaf("V", "(m,) input at or below which a pump stands still", low=0.0, like="low", default=None)
+    dead_zone: Any = leaf(
+        "V", "(m,) input at or below which a pump stands still", low=0.0, like="low", default=None
+    )
     stop: np.ndarray = leaf(
         "V",
         "(m,) input below which a turning pump stops (hysteresis)",
@@ -71,9 +78,15 @@ class PumpBank:
         "(m,) input at which the pumps ran before t = 0",
         default=lambda own: np.zeros(np.shape(own["low"])),
     )
-    delay: float = static("s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0)
-    saturation: str = static("-", "what saturation does to a command", choices=SATURATIONS, default="clip")
-    dead_zone_kind: str = static("-", "what the dead zone does", choices=DEAD_ZONES, default="plain")
+    delay: float = static(
+        "s", "transport delay from pump to tank", low=0.0, high=1000.0, default=0.0
+    )
+    saturation: str = static(
+        "-", "what saturation does to a command", choices=SATURATIONS, default="clip"
+    )
+    dead_zone_kind: str = static(
+        "-", "what the dead zone does", choices=DEAD_ZONES, default="plain"
+    )
 
     @property
     def pumps(self) -> int:
@@ -86,7 +99,11 @@ class PumpBank:
         start = tuple(self.initial[i] for i in pumps)
         zero = tuple(0.0 * s for s in start)
         return ActuatorState(
-            running=tuple(z + 1.0 for z in zero) if self.dead_zone is not None and self.dead_zone_kind == "hysteresis" else (),
+            running=(
+                tuple(z + 1.0 for z in zero)
+                if self.dead_zone is not None and self.dead_zone_kind == "hysteresis"
+                else ()
+            ),
             owed=zero if self.dead_zone is not None and self.dead_zone_kind == "pulse" else (),
             lagged=self._turning(start) if self.lag is not None else (),
             line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
@@ -94,49 +111,66 @@ class PumpBank:
         )
 
     def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
-        """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for "boxqp", or None."""
+        """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for
+        "boxqp", or None.
+        """
         if self.saturation == "boxqp":
             return allocate(command, metric, self.low, self.high)
         return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
 
     def step(
-        self,
-        state: ActuatorState,
-        command: Sequence,
-        metric: tuple | None,
-        dt: Any,
+        self, state: ActuatorState, command: Sequence, metric: tuple | None, dt: Any
     ) -> tuple[tuple, ActuatorState]:
-        """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then `deliver`."""
+        """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then
+        `deliver`.
+        """
         return self.deliver(state, self.limit(command, metric), dt)
 
     def deliver(self, state: ActuatorState, u: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
-        """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead zone, lag, delay."""
+        """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead
+        zone, lag, delay.
+        """
         if self.dead_zone is not None and self.dead_zone_kind != "offset":
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
             u = self._turning(u)
             # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
             slow = [self.lag[i] > 0 for i in range(self.pumps)]
-            keep = [jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0) for i, s in enumerate(slow)]
-            short = [v - u[i] for i, v in enumerate(state.lagged)]  # v at the start of the sample, from where it is drawn to
+            keep = [
+                jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0)
+                for i, s in enumerate(slow)
+            ]
+            # v at the start of the sample, from where it is drawn to
+            short = [v - u[i] for i, v in enumerate(state.lagged)]
             state = state._replace(lagged=tuple(u[i] + keep[i] * s for i, s in enumerate(short)))
             u = tuple(u[i] + self.lag[i] / dt * (1.0 - keep[i]) * s for i, s in enumerate(short))
         if state.line:
             head = state.head
-            out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)
-            line = tuple(jax.lax.dynamic_update_index_in_dim(line, v, head, 0) for line, v in zip(state.line, u))
-            state = state._replace(line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1))
+            out = tuple(
+                jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line
+            )
+            line = tuple(
+                jax.lax.dynamic_update_index_in_dim(line, v, head, 0)
+                for line, v in zip(state.line, u)
+            )
+            state = state._replace(
+                line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1)
+            )
             u = out
         return u, state
 
     def _turning(self, u):
-        """What a lag sees: with an "offset" dead zone nothing below it, so that noise is rectified before the lag and not after."""
+        """What a lag sees: with an "offset" dead zone nothing below it, so that noise is rectified
+        before the lag and not after.
+        """
         if self.dead_zone is None or self.dead_zone_kind != "offset":
             return u
         return tuple(at_least(v, self.dead_zone[i]) for i, v in enumerate(u))
 
     def driving(self, u: tuple) -> tuple:
-        """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead zone, else u itself."""
+        """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead
+        zone, else u itself.
+        """
         if self.dead_zone is None or self.dead_zone_kind != "offset":
             return u
         return tuple(at_least(v - self.dead_zone[i], 0.0) for i, v in enumerate(u))
@@ -147,25 +181,31 @@ class PumpBank:
                 jnp.where(jnp.where(r > 0.5, v >= self.stop[i], v > self.dead_zone[i]), 1.0, 0.0)
                 for i, (v, r) in enumerate(zip(u, state.running))
             )
-            return tuple(jnp.where(r > 0.5, v, 0.0) for v, r in zip(u, running)), state._replace(running=running)
+            return tuple(jnp.where(r > 0.5, v, 0.0) for v, r in zip(u, running)), state._replace(
+                running=running
+            )
         if self.dead_zone_kind == "pulse":
             paid, owed = [], []
             for i, v in enumerate(u):
                 due = v + state.owed[i] / dt
                 turning = v > self.dead_zone[i]
                 pay = jnp.where(turning, v, jnp.where(due >= self.pulse[i], self.pulse[i], 0.0))
-                owed.append(jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt)))
+                owed.append(
+                    jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt))
+                )
                 paid.append(v + jax.lax.stop_gradient(pay - v))
             return tuple(paid), state._replace(owed=tuple(owed))
         return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
 
 
 def allocate(command, metric, low, high):
-    """The voltages in the box that are best by the law's cost: argmin over w in [low, high]^2 of (w - u)' G (w - u).
+    """The voltages in the box that are best by the law's cost: argmin over w in [low, high]^2 of (w
+    - u)' G (w - u).
 
-    command: u (2) [V]; metric: (g11, g12, g22), G positive definite; low, high: (2,) [V]. For the predictive law of gouta2015
-    G = b'b makes this the exact constrained minimiser of its cost (eq. 21; gouta2015 notes S4.5). Solved by trying the four faces of the
-    box and keeping the cheapest; a command inside the box is kept. Raises ValueError for other than two pumps.
+    command: u (2) [V]; metric: (g11, g12, g22), G positive definite; low, high: (2,) [V]. For the
+    predictive law of gouta2015 G = b'b makes this the exact constrained minimiser of its cost (eq.
+    21; gouta2015 notes S4.5). Solved by trying the four faces of the box and keeping the cheapest;
+    a command inside the box is kept. Raises ValueError for other than two pumps.
     """
     if len(command) != 2:
         raise ValueError(f"allocation by box QP is for two pumps, not {len(command)}")
@@ -178,5 +218,9 @@ def allocate(command, metric, low, high):
         p, q = x - a, y - b
         cost = g11 * p * p + 2.0 * g12 * p * q + g22 * q * q
         better = cost < best
-        best_x, best_y, best = jnp.where(better, x, best_x), jnp.where(better, y, best_y), jnp.where(better, cost, best)
+        best_x, best_y, best = (
+            jnp.where(better, x, best_x),
+            jnp.where(better, y, best_y),
+            jnp.where(better, cost, best),
+        )
     return jnp.where(inside, a, best_x), jnp.where(inside, b, best_y)

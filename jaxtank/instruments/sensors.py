@@ -22,10 +22,11 @@ def _without_adc(own, value):
 
 @component
 class LevelSensor:
-    """One level sensor per tank: noise, then an ADC where `bits` is not 0. `LevelSensor(noise=[0.1])`
-    suffices where there is no ADC.
+    """One level sensor per tank: noise, then an ADC where `bits` is not 0.
+    `LevelSensor(noise=[0.1])` suffices where there is no ADC.
 
-        y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale], rounded to full_scale / 2^bits
+        y = h + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to [0, full_scale],
+        rounded to full_scale / 2^bits
 
     The ADC's slope is that of the line through its staircase (numerics.quantise).
     """
@@ -38,28 +39,27 @@ class LevelSensor:
         default=lambda own: _without_adc(own, np.ones(np.shape(own["noise"]))),
     )
     noise: np.ndarray = leaf("cm", "(n,) standard deviation of the noise on each level", low=0.0)
-    offset: np.ndarray | None = leaf("cm", "(n,) what each sensor reads of an empty tank", like="gain", default=None)
+    offset: np.ndarray | None = leaf(
+        "cm", "(n,) what each sensor reads of an empty tank", like="gain", default=None
+    )
     full_scale: np.ndarray = leaf(
-        "volt",
-        "range of the ADC",
-        low=0.0,
-        strict=True,
-        default=lambda own: _without_adc(own, 5.0),
+        "volt", "range of the ADC", low=0.0, strict=True, default=lambda own: _without_adc(own, 5.0)
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
     def draw(
-        self,
-        key: jax.Array | None,
-        samples: int,
-        piece: ArrayLike | None = None,
+        self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
     ) -> tuple | None:
-        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key. piece: the number of a long run's piece,
-        whose samples they are; each has a key of its own, and the run's deviates are those of its pieces, end to end."""
+        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key.
+        piece: the number of a long run's piece, whose samples they are; each has a key of its own,
+        and the run's deviates are those of its pieces, end to end.
+        """
         if key is None:
             return None
         tanks = np.shape(self.noise)[-1]
-        drawn = lambda key, count: jax.random.normal(key, (tanks, count), dtype=jnp.result_type(float))
+        drawn = lambda key, count: jax.random.normal(
+            key, (tanks, count), dtype=jnp.result_type(float)
+        )
         if piece is not None:
             deviates = drawn(jax.random.fold_in(key, piece), samples)
         elif samples <= PIECE:
@@ -68,14 +68,21 @@ class LevelSensor:
             whole, rest = divmod(samples, PIECE)
             pieces = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), PIECE))(jnp.arange(whole))
             last = drawn(jax.random.fold_in(key, whole), rest)
-            deviates = jnp.concatenate([jnp.moveaxis(pieces, 1, 0).reshape(tanks, -1), last], axis=1)
+            deviates = jnp.concatenate(
+                [jnp.moveaxis(pieces, 1, 0).reshape(tanks, -1), last], axis=1
+            )
         return tuple(deviates[i] for i in range(tanks))
 
     def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
-        """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or None."""
+        """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or
+        None.
+        """
         y = x if self.offset is None else tuple(h + self.offset[i] for i, h in enumerate(x))
         y = y if xi is None else tuple(y[i] + self.noise[i] * xi[i] for i in range(len(x)))
         if self.bits == 0:
             return y
         step = self.full_scale / 2**self.bits
-        return tuple(quantise(clip(y[i] / self.gain[i], 0.0, self.full_scale), step) * self.gain[i] for i in range(len(y)))
+        return tuple(
+            quantise(clip(y[i] / self.gain[i], 0.0, self.full_scale), step) * self.gain[i]
+            for i in range(len(y))
+        )

@@ -1,11 +1,15 @@
-"""A rig as a Gymnasium environment, for those who would rather learn a controller than tune one (pip install ".[gym]")."""
+"""A rig as a Gymnasium environment, for those who would rather learn a controller than tune one
+(pip install ".[gym]").
+"""
 
 import functools
 
 try:
     import gymnasium
 except ImportError:
-    raise ImportError('jaxtank.environment needs gymnasium: pip install gymnasium, or "jaxtank[gym]"') from None
+    raise ImportError(
+        'jaxtank.environment needs gymnasium: pip install gymnasium, or "jaxtank[gym]"'
+    ) from None
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,16 +23,20 @@ PENALTY = 100.0
 
 
 class TankEnv(gymnasium.Env):
-    """One episode is one run of a case, without its controller: the action is what the pumps are given.
+    """One episode is one run of a case, without its controller: the action is what the pumps are
+    given.
 
-    action: (pumps,) inputs scaled to [-1, 1] over the pumps' limits; observation: readings, setpoints and their rates, each as a share of
-    the highest rim (rates per 100 s); reward: minus the mean squared error of the outputs over the rim's square, less 100 times the squared
-    rise past the rims as the same share. Truncated at the end of the clock; terminated where a level is not finite. info: {"t" [s],
-    "x" (tanks,), "y" (tanks,), "u" (pumps,), "e" (outputs,), "spilled" (tanks,) [cm^3]} in the rig's units: levels, readings, inputs at the
-    plant, errors, and the volume lost over each rim so far.
+    action: (pumps,) inputs scaled to [-1, 1] over the pumps' limits; observation: readings,
+    setpoints and their rates, each as a share of the highest rim (rates per 100 s); reward: minus
+    the mean squared error of the outputs over the rim's square, less 100 times the squared rise
+    past the rims as the same share. Truncated at the end of the clock; terminated where a level is
+    not finite. info: {"t" [s], "x" (tanks,), "y" (tanks,), "u" (pumps,), "e" (outputs,), "spilled"
+    (tanks,) [cm^3]} in the rig's units: levels, readings, inputs at the plant, errors, and the
+    volume lost over each rim so far.
 
-    Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise, offset, ADC) and reference are the case's own:
-    with the inputs of `jaxtank.simulate(case.loop, case.clock, key=jax.random.key(seed))` (its `applied`) as actions, the episode after
+    Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise, offset,
+    ADC) and reference are the case's own: with the inputs of `jaxtank.simulate(case.loop,
+    case.clock, key=jax.random.key(seed))` (its `applied`) as actions, the episode after
     reset(seed=seed) is that run, to rounding. Raises InputError for a case that cannot be run.
     """
 
@@ -40,18 +48,25 @@ class TankEnv(gymnasium.Env):
         check(loop, self.clock, jax.random.key(0))
         plant = loop.plant
         self.size = float(np.max(np.asarray(plant.rim)))
-        self.low, self.high = (np.asarray(getattr(loop.actuator, n), dtype=float) for n in ("low", "high"))
+        self.low, self.high = (
+            np.asarray(getattr(loop.actuator, n), dtype=float) for n in ("low", "high")
+        )
         count = plant.tanks + 2 * len(plant.outputs)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (count,), np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (plant.pumps,), np.float64)
 
     def reset(self, *, seed=None, options=None):
-        """(observation, info) at the beginning of an episode; without a seed its noise is the next of the last seed's."""
+        """(observation, info) at the beginning of an episode; without a seed its noise is the next
+        of the last seed's.
+        """
         super().reset(seed=seed)
         loop = self.case.loop
         number = int(self.np_random.integers(2**31)) if seed is None else seed
         self.inputs, self.state = _begin(loop, self.clock, jax.random.key(number))
-        self.r, self.rate = (np.stack([np.asarray(v) for v in part], axis=1) for part in (self.inputs.r, self.inputs.dr))
+        self.r, self.rate = (
+            np.stack([np.asarray(v) for v in part], axis=1)
+            for part in (self.inputs.r, self.inputs.dr)
+        )
         self.k, self.x = 0, _array(self.state.x)
         self.y = _array(_readings(loop, self.inputs, self.state))
         self.u = np.asarray(loop.actuator.initial, dtype=float)
@@ -61,8 +76,12 @@ class TankEnv(gymnasium.Env):
     def step(self, action):
         """(observation, reward, terminated, truncated, info) a sample later."""
         loop = self.case.loop
-        asked = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (self.high - self.low)
-        self.state, y, u, spilled = _advance(loop, self.clock, self.inputs, self.state, tuple(asked))
+        asked = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
+            self.high - self.low
+        )
+        self.state, y, u, spilled = _advance(
+            loop, self.clock, self.inputs, self.state, tuple(asked)
+        )
         self.x, self.y, self.u = map(_array, (self.state.x, y, u))
         self.spilled = self.spilled + _array(spilled)
         self.k = min(self.k + 1, self.clock.samples - 1)

@@ -35,17 +35,27 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
     outputs = plant.outputs if outputs is None else outputs
     if not all(isinstance(i, (int, np.integer)) and 0 <= i < plant.tanks for i in outputs):
         raise InputError(
-            f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to {plant.tanks - 1}; "
-            "steady levels are given as setpoints=(...)"
+            f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to"
+            f" {plant.tanks - 1}; steady levels are given as setpoints=(...)"
         )
     if (setpoints is None) == (levels is None) or (levels is None) != (inputs is None):
-        raise InputError("to_control: give setpoints=(...), steady levels of the controlled tanks, or both levels and inputs")
+        raise InputError(
+            "to_control: give setpoints=(...), steady levels of the controlled tanks, or both"
+            " levels and inputs"
+        )
     if setpoints is not None:
         if np.shape(setpoints) != (len(plant.outputs),):
-            raise InputError(f"to_control: setpoints = {setpoints!r}: must be {len(plant.outputs)} levels [{plant.units[0]}]")
+            raise InputError(
+                f"to_control: setpoints = {setpoints!r}: must be {len(plant.outputs)} levels"
+                f" [{plant.units[0]}]"
+            )
         levels, inputs = equilibrium(plant, setpoints)
     for name, value, size in (("levels", levels, plant.tanks), ("inputs", inputs, plant.pumps)):
-        if value is None or np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
+        if (
+            value is None
+            or np.shape(value) != (size,)
+            or not np.all(np.isfinite(np.asarray(value, dtype=float)))
+        ):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")
     A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
     return control.ss(
@@ -93,7 +103,12 @@ def columns(run, units=("cm", "V"), dimension=None) -> dict[str, Any]:
     found = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
         values = np.asarray(getattr(run, field))
-        found |= {(f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])}
+        found |= {
+            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
+        }
     if dimension is None:
         return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
-    return {dimension if name == "t" else name: (dimension, values, {"units": unit}) for (name, unit), values in found.items()}
+    return {
+        dimension if name == "t" else name: (dimension, values, {"units": unit})
+        for (name, unit), values in found.items()
+    }

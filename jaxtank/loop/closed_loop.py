@@ -1,4 +1,6 @@
-"""One sample of the closed loop, and what it needs: the loop itself, its state, and what is known of every sample beforehand."""
+"""One sample of the closed loop, and what it needs: the loop itself, its state, and what is known
+of every sample beforehand.
+"""
 
 import dataclasses
 import functools
@@ -45,7 +47,9 @@ class ClosedLoop:
 
 
 def inputs(loop, clock, names, key, piece=None, samples=0):
-    """The samples of references, disturbances, noise and windows; of a long run's `piece`, a number, its `samples` alone."""
+    """The samples of references, disturbances, noise and windows; of a long run's `piece`, a
+    number, its `samples` alone.
+    """
     if piece is not None:
         clock = Piece(first=piece * PIECE, samples=samples, dt=clock.dt)
     r, dr, ddr = loop.reference.sample(clock)
@@ -53,14 +57,18 @@ def inputs(loop, clock, names, key, piece=None, samples=0):
     window = None
     if ms.wants_windows(names):
         if not hasattr(loop.reference, "windows"):
-            raise InputError("overshoot, rise and settling need a reference that changes (signals.Ramps)")
+            raise InputError(
+                "overshoot, rise and settling need a reference that changes (signals.Ramps)"
+            )
         window = loop.reference.windows(clock)
     since = cast(Any, loop.disturbance).since(clock) if hasattr(loop.disturbance, "since") else None
     if since is None and ms.wants_pours(names):
         raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
     if since is not None and window is not None:
         # while a tank recovers from a pour, it is not settling on its setpoint
-        window = tuple(tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window)
+        window = tuple(
+            tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window
+        )
     return Inputs(
         r=r,
         dr=dr,
@@ -87,7 +95,9 @@ def initial(loop, clock):
     zero = zero_of(loop)
 
     def typed(tree):
-        return jax.tree.map(lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, tree)
+        return jax.tree.map(
+            lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, tree
+        )
 
     x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks))
     u0 = tuple(loop.actuator.initial[i] + zero for i in range(loop.plant.pumps))
@@ -102,12 +112,15 @@ def initial(loop, clock):
 
 
 def keyed(loop, key):
-    """`loop`, if its noise can be drawn: without a key its levels are NaN from the start where `sensor.noise` is above 0. A traced noise is
-    not seen by input validation, and a run without it, whose slope by it is 0, would look like an answer."""
+    """`loop`, if its noise can be drawn: without a key its levels are NaN from the start where
+    `sensor.noise` is above 0. A traced noise is not seen by input validation, and a run without it,
+    whose slope by it is 0, would look like an answer.
+    """
     if key is not None:
         return loop
     noise = jnp.asarray(loop.sensor.noise)
-    missing = jnp.sum(jnp.where(noise > 0, noise, 0.0) * jnp.where(noise > 0, jnp.nan, 0.0))  # its slope by the noise is NaN too
+    # its slope by the noise is NaN too
+    missing = jnp.sum(jnp.where(noise > 0, noise, 0.0) * jnp.where(noise > 0, jnp.nan, 0.0))
     return dataclasses.replace(loop, x0=loop.x0 + missing.astype(zero_of(loop).dtype))
 
 
@@ -127,8 +140,14 @@ def run_of(loop, clock):
 
 
 def zero_of(loop):
-    """0.0 of the type in which the run is done: that of the most precise of the loop's leaves. float32 is named, and what it costs."""
-    leaves = [leaf for leaf in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+    """0.0 of the type in which the run is done: that of the most precise of the loop's leaves.
+    float32 is named, and what it costs.
+    """
+    leaves = [
+        leaf
+        for leaf in jax.tree.leaves(loop)
+        if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    ]
     dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
     if dtype == jnp.float32:
         _warn_float32()
@@ -138,13 +157,17 @@ def zero_of(loop):
 @functools.cache
 def _warn_float32():
     warnings.warn(
-        "this run is in float32. Levels and running sums keep what rounding takes from them, so levels are right to about 1e-5 cm (2e-3 cm "
-        "under gouta2022's laws, which amplify rounding; 0.1 to 3 % of input_travel is rounding). Call "
-        "jax.config.update('jax_enable_x64', True) first for float64, which one run is no slower in.",
+        "this run is in float32. Levels and running sums keep what rounding takes from them, so"
+        " levels are right to about 1e-5 cm (2e-3 cm under gouta2022's laws, which amplify"
+        " rounding; 0.1 to 3 % of input_travel is rounding). Call"
+        " jax.config.update('jax_enable_x64', True) first for float64, which one run is no"
+        " slower in.",
         stacklevel=6,
     )
 
 
 def is_broken(state):
-    """True if the run left the numbers: a level that is not finite stays so, so the last state tells and the loop need not look."""
+    """True if the run left the numbers: a level that is not finite stays so, so the last state
+    tells and the loop need not look.
+    """
     return ~jnp.isfinite(sum(state.x))

@@ -1,8 +1,9 @@
 """The closed loop: plant, sensor, observer, law and actuator, compiled to one function.
 
-Row k of a run is the world at t_k before it moves: y_k is read, u_k is decided, and u_k is held over [t_k, t_k + dt).
-`simulate` keeps a trajectory for people; `evaluate` keeps running measures for tuning and ensembles; `sensitivities` carries exact
-derivatives of the measures along with the run. All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
+Row k of a run is the world at t_k before it moves: y_k is read, u_k is decided, and u_k is held
+over [t_k, t_k + dt). `simulate` keeps a trajectory for people; `evaluate` keeps running measures
+for tuning and ensembles; `sensitivities` carries exact derivatives of the measures along with the
+run. All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
 """
 
 import functools
@@ -28,35 +29,33 @@ from jaxtank.xla.hoist import scan
 
 
 def simulate(
-    loop: ClosedLoop,
-    clock: Clock,
-    key: jax.Array | None = None,
-    save_every: int = 1,
+    loop: ClosedLoop, clock: Clock, key: jax.Array | None = None, save_every: int = 1
 ) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
 
-    loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a Trajectory.
-    Raises InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace).
+    loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a
+    Trajectory. Raises InputError for invalid input and NonFiniteError if a level stops being finite
+    (outside a trace).
     """
     check(loop, clock, key)
     if not isinstance(save_every, int) or save_every < 1:
-        raise InputError(f"save_every = {save_every!r}: must be a whole number of at least 1 sample")
+        raise InputError(
+            f"save_every = {save_every!r}: must be a whole number of at least 1 sample"
+        )
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
     return trajectory
 
 
 def evaluate(
-    loop: ClosedLoop,
-    clock: Clock,
-    measures: Sequence[str],
-    key: jax.Array | None = None,
+    loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
 ) -> dict[str, jax.Array]:
     """Run the loop and keep only running measures.
 
-    measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or None; returns {name: scalar, or array with one
-    entry per output, tank or pump}. Raises InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace; inside
-    one, the values of such a run are NaN, and so are those of a run with noise and no key).
+    measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or
+    None; returns {name: scalar, or array with one entry per output, tank or pump}. Raises
+    InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace;
+    inside one, the values of such a run are NaN, and so are those of a run with noise and no key).
     """
     names = _names(measures)
     check(loop, clock, key)
@@ -66,12 +65,15 @@ def evaluate(
 
 
 def evaluate_and_flag(loop, clock, measures, key=None):
-    """(`evaluate`'s values, True if the run stopped being finite); checks nothing, raises nothing: for batches and searches."""
+    """(`evaluate`'s values, True if the run stopped being finite); checks nothing, raises nothing:
+    for batches and searches.
+    """
     return evaluate_compiled(loop, clock, _names(measures), key, False)
 
 
 def evaluate_for_reverse(loop, clock, measures, key=None):
-    """`evaluate` with the run cut into about sqrt(samples) pieces that are recomputed on the way back, for reverse mode.
+    """`evaluate` with the run cut into about sqrt(samples) pieces that are recomputed on the way
+    back, for reverse mode.
 
     Same values, but never NonFiniteError; memory of a gradient grows with the root of the
     samples. Best above about ten parameters.
@@ -91,12 +93,14 @@ def sensitivities(
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
     """Measures, their exact derivatives, and a Gauss-Newton matrix, in one run.
 
-    values: {dotted name: number or array} of P numbers in all, the point and the parameters to differentiate by (forward mode: worth
-    it to about ten). squares: {measure: weight} of measures that are sums of squares, sum_k w_k v_k^2: the matrix is
-    2 sum_k w_k grad(v_k) grad(v_k)', the second derivative of their weighted sum but for the residuals' own curvature; None: the mean
-    square tracking error of all outputs. Returns (measures {name: value}, derivatives {name: value.shape + (P,)}, (P, P) matrix, True if
-    the run stopped being finite), P in the order of `values`. key as in `evaluate`. Raises InputError for invalid input; a run that is not
-    finite is told by the flag.
+    values: {dotted name: number or array} of P numbers in all, the point and the parameters to
+    differentiate by (forward mode: worth it to about ten). squares: {measure: weight} of measures
+    that are sums of squares, sum_k w_k v_k^2: the matrix is 2 sum_k w_k grad(v_k) grad(v_k)', the
+    second derivative of their weighted sum but for the residuals' own curvature; None: the mean
+    square tracking error of all outputs. Returns (measures {name: value}, derivatives {name:
+    value.shape + (P,)}, (P, P) matrix, True if the run stopped being finite), P in the order of
+    `values`. key as in `evaluate`. Raises InputError for invalid input; a run that is not finite is
+    told by the flag.
     """
     if not values:
         raise InputError("sensitivities needs at least one parameter: values is empty")
@@ -104,9 +108,13 @@ def sensitivities(
     squares = {"mean_square_error": 1.0} if squares is None else squares
     for name in _names(squares):
         if not ms.MEASURES[name].residual:
-            raise InputError(f"squares: {name} is not a sum of squares; those are {', '.join(ms.SQUARES)}")
+            raise InputError(
+                f"squares: {name} is not a sum of squares; those are {', '.join(ms.SQUARES)}"
+            )
     chosen = tuple((m, float(w)) for m, w in squares.items())
-    return sensitivities_compiled(loop, clock, _names(measures), tuple(values), tuple(values.values()), key, chosen)
+    return sensitivities_compiled(
+        loop, clock, _names(measures), tuple(values), tuple(values.values()), key, chosen
+    )
 
 
 def _names(measures):
@@ -130,7 +138,10 @@ def evaluate_compiled(loop, clock, names, key, checkpoint):
         state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
     elif clock.samples > PIECE and is_pointwise(loop):
         whole, rest = divmod(clock.samples, PIECE)
-        piece = lambda c, number, samples=PIECE: (scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0], None)
+        piece = lambda c, number, samples=PIECE: (
+            scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0],
+            None,
+        )
         carry = jax.lax.scan(piece, carry, jnp.arange(whole))[0]
         state, acc = piece(carry, whole, rest)[0] if rest else carry
     else:
@@ -155,7 +166,12 @@ def simulate_compiled(loop, clock, key, save_every):
     rows = (clock.samples - 1) // save_every + 1
     xs = inputs(loop, clock, (), key)
     spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
-    xs = jax.tree.map(lambda a: jnp.pad(a, (0, max(spare, 0)), mode="edge")[: rows * save_every].reshape(rows, save_every), xs)
+    xs = jax.tree.map(
+        lambda a: jnp.pad(a, (0, max(spare, 0)), mode="edge")[: rows * save_every].reshape(
+            rows, save_every
+        ),
+        xs,
+    )
 
     def one(carry, now):
         state, spilled = carry
@@ -171,7 +187,9 @@ def simulate_compiled(loop, clock, key, save_every):
         return carry, sample._replace(spilled=spilled)
 
     zero = zero_of(loop)
-    (state, _), saved = scan(row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows)
+    (state, _), saved = scan(
+        row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows
+    )
     columns = {
         name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value
         for name, value in saved._asdict().items()
@@ -181,7 +199,9 @@ def simulate_compiled(loop, clock, key, save_every):
 
 
 def _report_broken(broken, loop, clock, key):
-    """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set. Nothing inside a trace."""
+    """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set.
+    Nothing inside a trace.
+    """
     if isinstance(broken, Tracer) or np.ndim(broken) or not broken:
         return
     loop = jax.lax.stop_gradient(loop)  # under grad its leaves are known, and traced all the same
@@ -193,9 +213,23 @@ def _report_broken(broken, loop, clock, key):
     if first == 0 and key is None:  # `keyed` saw to it
         raise InputError("sensor.noise is above 0: give a key, or set it to 0")
     tanks = ", ".join(str(i + 1) for i in np.flatnonzero(bad[first]))
-    shown = {n: v for n, v in parameters(loop).items() if n.startswith("controller.") and not n.startswith("controller.model.")}
+    shown = {
+        n: v
+        for n, v in parameters(loop).items()
+        if n.startswith("controller.") and not n.startswith("controller.model.")
+    }
     text = ", ".join(f"{n} = {np.asarray(v)}" for n, v in shown.items())
-    raise NonFiniteError(f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}")
+    raise NonFiniteError(
+        f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}"
+    )
 
 
-__all__ = ["Clock", "ClosedLoop", "check", "evaluate", "evaluate_for_reverse", "sensitivities", "simulate"]
+__all__ = [
+    "Clock",
+    "ClosedLoop",
+    "check",
+    "evaluate",
+    "evaluate_for_reverse",
+    "sensitivities",
+    "simulate",
+]

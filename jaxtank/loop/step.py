@@ -103,14 +103,26 @@ def decide(loop, observer, controller, tick, y):
 
 
 def move(loop, clock, state, applied, now):
-    """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim [cm^3], (n) volume that a negative
-    inflow could not take [cm^3]) for inputs `applied` (m) [V] within the limits: pumps, faults and plant. Observer and controller
-    of the state stay as they are."""
+    """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim
+    [cm^3], (n) volume that a negative inflow could not take [cm^3]) for inputs `applied` (m) [V]
+    within the limits: pumps, faults and plant. Observer and controller of the state stay as they
+    are.
+    """
     t = time_of(state, clock)
     u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
     driving = materialised(loop.actuator.driving(u))
-    found = advance(plant, clock.integrator, t, state.x, driving, now.d, clock.dt, clock.substeps, excess=state.excess)
+    found = advance(
+        plant,
+        clock.integrator,
+        t,
+        state.x,
+        driving,
+        now.d,
+        clock.dt,
+        clock.substeps,
+        excess=state.excess,
+    )
     moved = state._replace(k=state.k + 1, x=found.x, actuator=actuator, excess=found.excess)
     return moved, u, found.spilled, found.shortfall
 
@@ -123,8 +135,8 @@ def time_of(state, clock):
 def commanded(loop, state, tick, estimate):
     """Return the controller's ((m,) inputs before their limits, new state).
 
-    Raises InputError, while the loop is traced, for a number of inputs that is not that of the pumps,
-    and for an input that is no single real number.
+    Raises InputError, while the loop is traced, for a number of inputs that is not that of the
+    pumps, and for an input that is no single real number.
     """
     command, state = loop.controller.step(state, tick, estimate)
     pumps = loop.plant.pumps
@@ -133,14 +145,20 @@ def commanded(loop, state, tick, estimate):
         law = type(loop.controller).__name__
         found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
         raise InputError(
-            f"controller {law}: its step returns {found} for {pumps} pump{'' if pumps == 1 else 's'}: "
-            "must return (inputs, state), a tuple with one input for each pump"
+            f"controller {law}: its step returns {found} for {pumps}"
+            f" pump{'' if pumps == 1 else 's'}: must return (inputs, state), a tuple with one input"
+            " for each pump"
         )
-    parts = [(np.shape(v), v) for v in command] if isinstance(command, tuple | list) else [(np.shape(command)[1:], command)]
+    parts = (
+        [(np.shape(v), v) for v in command]
+        if isinstance(command, tuple | list)
+        else [(np.shape(command)[1:], command)]
+    )
     switch = np.dtype(bool)  # on or off: 1 or 0
     if any(shape or not (is_real(v) or getattr(v, "dtype", None) == switch) for shape, v in parts):
         raise InputError(
-            f"controller {type(loop.controller).__name__}: its step returns an input that is no single real number: "
-            "must return (inputs, state), a tuple with one number for each pump"
+            f"controller {type(loop.controller).__name__}: its step returns an input that is no"
+            " single real number: must return (inputs, state), a tuple with one number for each"
+            " pump"
         )
     return command, state

@@ -1,7 +1,9 @@
-"""What is said of a run in numbers, folded into the time loop: memory does not grow with the number of samples.
+"""What is said of a run in numbers, folded into the time loop: memory does not grow with the number
+of samples.
 
-A measure reads accumulators at the end of a run. An accumulator starts from a state, is updated at every sample, and holds tuples of
-scalars. Only the accumulators that the requested measures need are carried.
+A measure reads accumulators at the end of a run. An accumulator starts from a state, is updated at
+every sample, and holds tuples of scalars. Only the accumulators that the requested measures need
+are carried.
 """
 
 from collections.abc import Callable
@@ -13,7 +15,15 @@ from jaxtank.core.errors import unknown
 from jaxtank.core.kahan import totals
 from jaxtank.core.numerics import at_least, root_of_mean
 from jaxtank.core.units import DEFAULT, local
-from jaxtank.measures.accumulators import ACCUMULATORS, RESIDUALS, as_list, mean, recovery, root_mean, settled
+from jaxtank.measures.accumulators import (
+    ACCUMULATORS,
+    RESIDUALS,
+    as_list,
+    mean,
+    recovery,
+    root_mean,
+    settled,
+)
 
 
 class Measure(NamedTuple):
@@ -51,7 +61,9 @@ def _per_run(name, scale):
 
 
 def _settling(run, acc):
-    worst = as_list([jnp.maximum(worst, settled(last, outside)) for _, last, outside, worst in acc["settling"]])
+    worst = as_list(
+        [jnp.maximum(worst, settled(last, outside)) for _, last, outside, worst in acc["settling"]]
+    )
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
@@ -285,7 +297,10 @@ MEASURES = {
         counts=True,
         shown=70,
         summary=50,
-        undefined="an output was still outside the band when its setpoint changed again or the run ended, or its setpoint never changes",
+        undefined=(
+            "an output was still outside the band when its setpoint changed again or the run ended,"
+            " or its setpoint never changes"
+        ),
         unserved="the reference has no changes that end",
         nan_holds="the output never left its band",
     ),
@@ -294,13 +309,20 @@ MEASURES = {
         "output",
         ("recovery",),
         recovery,
-        "longest time from the start of a pour to the last sample outside +-5 % of the setpoint; none: never recovered",
+        "longest time from the start of a pour to the last sample outside +-5 % of the setpoint;"
+        " none: never recovered",
         pours=True,
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",
     ),
-    "estimation_rms": Measure("cm", "tank", ("estimate2",), root_mean("estimate2"), "root mean square error of the level estimate"),
+    "estimation_rms": Measure(
+        "cm",
+        "tank",
+        ("estimate2",),
+        root_mean("estimate2"),
+        "root mean square error of the level estimate",
+    ),
     "time_of_max_level": Measure(
         "s",
         "tank",
@@ -346,7 +368,9 @@ def unit(name, units=DEFAULT):
 
 def entries(name, plant):
     """Number of entries of measure `name` for a plant: 1, or one per output, tank or pump."""
-    return {"run": 1, "output": len(plant.outputs), "tank": plant.tanks, "pump": plant.pumps}[MEASURES[name].per]
+    return {"run": 1, "output": len(plant.outputs), "tank": plant.tanks, "pump": plant.pumps}[
+        MEASURES[name].per
+    ]
 
 
 def needs(names):
@@ -371,14 +395,19 @@ def wants_rests(names):
 
 
 def serves(name, loop):
-    """True if the measure `name` means something for this loop: its reference changes, its tanks are poured into, its steady inputs
-    are known in closed form, its levels have a lower clip."""
+    """True if the measure `name` means something for this loop: its reference changes, its tanks
+    are poured into, its steady inputs are known in closed form, its levels have a lower clip.
+    """
     spec = MEASURES[name]
-    if spec.rests and (getattr(loop.plant, "pipes", None) != () or loop.plant.pumps != len(loop.plant.outputs)):
+    if spec.rests and (
+        getattr(loop.plant, "pipes", None) != () or loop.plant.pumps != len(loop.plant.outputs)
+    ):
         return False
     if "shortfall" in spec.needs and not loop.plant.bottom:
         return False
-    return (not spec.windows or hasattr(loop.reference, "windows")) and (not spec.pours or hasattr(loop.disturbance, "since"))
+    return (not spec.windows or hasattr(loop.reference, "windows")) and (
+        not spec.pours or hasattr(loop.disturbance, "since")
+    )
 
 
 def start(run, names):
@@ -389,12 +418,22 @@ def start(run, names):
 def update(run, states, sample, window, since=None, rest=None):
     """{accumulator: state} after `sample`."""
     known = {"recovery": since, "deviation2": rest}
-    return {a: ACCUMULATORS[a].update(run, state, sample, known.get(a, window)) for a, state in states.items()}
+    return {
+        a: ACCUMULATORS[a].update(run, state, sample, known.get(a, window))
+        for a, state in states.items()
+    }
 
 
 def residuals(run, states, sample, window, rest, squares):
-    """The residuals of one sample, a flat tuple. squares: ((measure, weight), ...), each a sum of squares (`Measure.residual`)."""
-    return tuple(v for m, _ in squares for a in [MEASURES[m].residual] for v in RESIDUALS[a](run, states[a], sample, window, rest))
+    """The residuals of one sample, a flat tuple. squares: ((measure, weight), ...), each a sum of
+    squares (`Measure.residual`).
+    """
+    return tuple(
+        v
+        for m, _ in squares
+        for a in [MEASURES[m].residual]
+        for v in RESIDUALS[a](run, states[a], sample, window, rest)
+    )
 
 
 def _scale(measure) -> Any:

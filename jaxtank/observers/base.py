@@ -10,7 +10,9 @@ from jaxtank.plants.base import Plant
 
 
 class Observer(abc.ABC):
-    """Turns measurements into an estimate: corrected by what is measured, carried on by what is applied. State is handed in and out."""
+    """Turns measurements into an estimate: corrected by what is measured, carried on by what is
+    applied. State is handed in and out.
+    """
 
     def init(self, x0: tuple) -> Any:
         """State before the first sample, for levels x0 (n) [cm] at t = 0."""
@@ -21,7 +23,8 @@ class Observer(abc.ABC):
         """(Estimate, new state) for measured levels y (n) [cm] at `tick`."""
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        """State at the next sample, for the law's command (m) and what the pumps were told after their limits, `applied` (m) [V].
+        """State at the next sample, for the law's command (m) and what the pumps were told after
+        their limits, `applied` (m) [V].
 
         `applied` is known to the computer; dead zone, lag and delay of the pumps are not in it.
         """

@@ -17,21 +17,26 @@ FED = ("applied", "command")
 class DisturbanceObserver(Observer):
     """Estimates what moves each level besides the model, one number per tank:
 
-        d^ = z + l h,   z' = -l z - l (l h + f(h) + c2 u)      (gouta2022 eqs. 23-24), so that d^' = l (d - d^)
+        d^ = z + l h,   z' = -l z - l (l h + f(h) + c2 u)      (gouta2022 eqs. 23-24), so that d^' =
+        l (d - d^)
 
-    by forward Euler, carried as d^ and the level that the model expects next (the same numbers as with z, and good in float32):
-    d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are measured; x_hat = y.
+    by forward Euler, carried as d^ and the level that the model expects next (the same numbers as
+    with z, and good in float32): d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are
+    measured; x_hat = y.
 
-    u is what the pumps were told after their limits: with `fed` = "command", the unlimited command, the observer winds up while a pump
-    is saturated (gouta2022 notes S4.2). `before_compensation` feeds it the input before eq. (28) subtracts the estimate again,
-    u + d^/c2, as eq. (23) prints it (gouta2022 notes S4.3): the loop
-    is then that of a single compensation with 2 l, and d^ reads half the disturbance.
+    u is what the pumps were told after their limits: with `fed` = "command", the unlimited command,
+    the observer winds up while a pump is saturated (gouta2022 notes S4.2). `before_compensation`
+    feeds it the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23) prints
+    it (gouta2022 notes S4.3): the loop is then that of a single compensation with 2 l, and d^ reads
+    half the disturbance.
     """
 
     model: Plant
     l: Any = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
     fed: str = static("-", "input that the observer is told", choices=FED, default="applied")
-    before_compensation: bool = static("-", "as printed: told the input before eq. (28)", choices=(False, True), default=False)
+    before_compensation: bool = static(
+        "-", "as printed: told the input before eq. (28)", choices=(False, True), default=False
+    )
 
     def init(self, x0: tuple) -> Any:
         return tuple(0.0 * h for h in x0), x0
@@ -45,11 +50,15 @@ class DisturbanceObserver(Observer):
         d, y = state
         f, c2 = drift(self.model, y), authority(self.model)
         u = applied if self.fed == "applied" else command
-        rate = tuple(f[i] + c2[i] * u[i] + (d[i] if self.before_compensation else 0.0) for i in range(len(y)))
+        rate = tuple(
+            f[i] + c2[i] * u[i] + (d[i] if self.before_compensation else 0.0) for i in range(len(y))
+        )
         held = tuple((1.0 - self.l[i] * tick.dt) * d[i] for i in range(len(y)))
         return held, tuple(y[i] + tick.dt * rate[i] for i in range(len(y)))
 
     def check(self, plant: Plant) -> None:
         check_own_pumps(self.model)
         if self.model.tanks != plant.tanks:
-            raise InputError(f"observer.model has {self.model.tanks} tanks, the plant {plant.tanks}")
+            raise InputError(
+                f"observer.model has {self.model.tanks} tanks, the plant {plant.tanks}"
+            )

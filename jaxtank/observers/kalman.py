@@ -26,32 +26,51 @@ class Belief(NamedTuple):
 
 @component
 class ExtendedKalman(Observer):
-    """Extended Kalman filter (Jazwinski 1970): the model is carried on by an integrator step, its covariance by that step's Jacobian.
+    """Extended Kalman filter (Jazwinski 1970): the model is carried on by an integrator step, its
+    covariance by that step's Jacobian.
 
-        correct, for each measured tank i in turn:  K = P e_i / (P_ii + r_i),  x += K (y_i - x_i),  P -= K e_i' P
+        correct, for each measured tank i in turn:  K = P e_i / (P_ii + r_i),  x += K (y_i - x_i),
+        P -= K e_i' P
         carry on:  x = Phi(x, u),  P = F P F' + Q dt,   F = d Phi / d x
 
-    Phi is one or more steps of "rk4" or "midpoint" with u, the input after the pumps' limits, held. The noises of the sensors are independent, so
-    that correcting by one after the other is the joint correction and no matrix is inverted.
+    Phi is one or more steps of "rk4" or "midpoint" with u, the input after the pumps' limits, held.
+    The noises of the sensors are independent, so that correcting by one after the other is the
+    joint correction and no matrix is inverted.
     """
 
     model: Plant
-    process: np.ndarray = leaf("cm^2/s", "(n,) variance that each level's own disturbance gains per second (Q)", low=0.0)
+    process: np.ndarray = leaf(
+        "cm^2/s", "(n,) variance that each level's own disturbance gains per second (Q)", low=0.0
+    )
     measurement: np.ndarray = leaf(
-        "cm^2", "(n,) variance of each sensor's noise (r); of unmeasured tanks not used", low=0.0, strict=True
+        "cm^2",
+        "(n,) variance of each sensor's noise (r); of unmeasured tanks not used",
+        low=0.0,
+        strict=True,
     )
     spread: np.ndarray = leaf("cm^2", "(n,) variance of the levels believed at t = 0", low=0.0)
     start: np.ndarray | None = leaf(
-        "cm", "(n,) levels believed at t = 0; absent: the true ones", low=0.0, like="spread", default=None
+        "cm",
+        "(n,) levels believed at t = 0; absent: the true ones",
+        low=0.0,
+        like="spread",
+        default=None,
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
-    integrator: str = static(doc="how the model is carried on", choices=("rk4", "midpoint"), default="rk4")
+    integrator: str = static(
+        doc="how the model is carried on", choices=("rk4", "midpoint"), default="rk4"
+    )
 
     def init(self, x0: tuple) -> Any:
         n = range(len(x0))
         x = x0 if self.start is None else tuple(self.start[i] + 0.0 * x0[i] for i in n)
-        return Belief(x=x, P=tuple(tuple(self.spread[i] + 0.0 * x0[i] if i == j else 0.0 * x0[i] for j in n) for i in n))
+        return Belief(
+            x=x,
+            P=tuple(
+                tuple(self.spread[i] + 0.0 * x0[i] if i == j else 0.0 * x0[i] for j in n) for i in n
+            ),
+        )
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         x, P = state
@@ -66,12 +85,24 @@ class ExtendedKalman(Observer):
         n = range(len(state.x))
 
         def onward(x):
-            return advance(self.model, self.integrator, tick.t, x, applied, None, tick.dt, self.substeps).x
+            return advance(
+                self.model, self.integrator, tick.t, x, applied, None, tick.dt, self.substeps
+            ).x
 
         one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
-        columns = [jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in n),))[1] for j in n]  # columns[j][i] = F_ij
+        # columns[j][i] = F_ij
+        columns = [
+            jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in n),))[1] for j in n
+        ]
         FP = [[sum(columns[k][i] * state.P[k][j] for k in n) for j in n] for i in n]
-        P = [[sum(FP[i][k] * columns[k][j] for k in n) + (self.process[i] * tick.dt if i == j else 0.0) for j in n] for i in n]
+        P = [
+            [
+                sum(FP[i][k] * columns[k][j] for k in n)
+                + (self.process[i] * tick.dt if i == j else 0.0)
+                for j in n
+            ]
+            for i in n
+        ]
         return Belief(onward(state.x), _symmetric(P))
 
     def check(self, plant: Plant) -> None:
@@ -85,29 +116,44 @@ def _symmetric(P):
 
 @component
 class Kalman(Observer):
-    """Linear Kalman filter in current form, with the gain it settles at, on the model linearised at (levels, inputs).
+    """Linear Kalman filter in current form, with the gain it settles at, on the model linearised at
+    (levels, inputs).
 
         x_hat = x_prior + L (y - C x_prior),      L = P C' (C P C' + R)^-1
-        x_prior(k+1) = xo + Ad (x_hat - xo) + Bd (u - uo) + drift,   (Ad, Bd) sampled with the input held
+        x_prior(k+1) = xo + Ad (x_hat - xo) + Bd (u - uo) + drift,   (Ad, Bd) sampled with the input
+        held
 
-    P is the prior covariance of the steady filter (Kalman 1960; discrete Riccati equation), Q = process * dt, R = measurement. The drift is
-    the model's rate at (xo, uo), 0 where it rests there. u is the input after the pumps' limits. Levels that are not in `measured` are
-    estimated from the rest.
+    P is the prior covariance of the steady filter (Kalman 1960; discrete Riccati equation), Q =
+    process * dt, R = measurement. The drift is the model's rate at (xo, uo), 0 where it rests
+    there. u is the input after the pumps' limits. Levels that are not in `measured` are estimated
+    from the rest.
     """
 
     model: Plant
     levels: np.ndarray = leaf("cm", "(n,) operating levels xo", low=0.0)
     inputs: np.ndarray = leaf("V", "(m,) operating inputs uo")
-    process: np.ndarray = leaf("cm^2/s", "(n,) variance that each level's own disturbance gains per second", low=0.0, strict=True)
+    process: np.ndarray = leaf(
+        "cm^2/s",
+        "(n,) variance that each level's own disturbance gains per second",
+        low=0.0,
+        strict=True,
+    )
     measurement: np.ndarray = leaf(
-        "cm^2", "(n,) variance of each sensor's noise; of unmeasured tanks not used", low=0.0, strict=True
+        "cm^2",
+        "(n,) variance of each sensor's noise; of unmeasured tanks not used",
+        low=0.0,
+        strict=True,
     )
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
 
     def design(self, dt: float) -> tuple:
         """(Ad (n, n), Bd (n, m), drift (n,) [cm], L (n, measured)) for sampling every dt [s]."""
         A, B, _ = linearise(self.model, self.levels, self.inputs)
-        rest = jnp.stack(self.model.derivative(0.0, tuple(jnp.asarray(self.levels)), tuple(jnp.asarray(self.inputs)), None))
+        rest = jnp.stack(
+            self.model.derivative(
+                0.0, tuple(jnp.asarray(self.levels)), tuple(jnp.asarray(self.inputs)), None
+            )
+        )
         Ad, held = zero_order_hold(A, jnp.concatenate([B, rest[:, None]], axis=1), dt)
         C = jnp.eye(self.model.tanks)[np.array(self.measured)]
         R = jnp.diag(jnp.asarray(self.measurement)[np.array(self.measured)])
@@ -120,31 +166,54 @@ class Kalman(Observer):
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         L = self.design(tick.dt)[3]
         innovation = [y[i] - state[i] for i in self.measured]
-        x = tuple(state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(len(state)))
+        x = tuple(
+            state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(len(state))
+        )
         return Estimate(x=x), x
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         Ad, Bd, drift, _ = self.design(tick.dt)
         n, m = range(len(state)), range(len(applied))
-        away, more = [state[i] - self.levels[i] for i in n], [applied[j] - self.inputs[j] for j in m]
-        return tuple(self.levels[i] + drift[i] + sum(Ad[i, j] * away[j] for j in n) + sum(Bd[i, j] * more[j] for j in m) for i in n)
+        away, more = (
+            [state[i] - self.levels[i] for i in n],
+            [applied[j] - self.inputs[j] for j in m],
+        )
+        return tuple(
+            self.levels[i]
+            + drift[i]
+            + sum(Ad[i, j] * away[j] for j in n)
+            + sum(Bd[i, j] * more[j] for j in m)
+            for i in n
+        )
 
     def check(self, plant: Plant) -> None:
         check_measured(self, plant)
         if np.shape(self.inputs) != (plant.pumps,):
-            raise InputError(f"observer.inputs has shape {np.shape(self.inputs)}: must be ({plant.pumps},), one per pump")
+            raise InputError(
+                f"observer.inputs has shape {np.shape(self.inputs)}: must be ({plant.pumps},), one"
+                " per pump"
+            )
 
 
 def check_measured(observer, plant):
-    """Raise InputError unless the observer's model and leaves fit the plant and `measured` names its tanks, each once."""
+    """Raise InputError unless the observer's model and leaves fit the plant and `measured` names
+    its tanks, each once.
+    """
     n = plant.tanks
     if observer.model.tanks != n or observer.model.pumps != plant.pumps:
         raise InputError(
-            f"observer.model has {observer.model.tanks} tanks and {observer.model.pumps} pumps, the plant {n} and {plant.pumps}"
+            f"observer.model has {observer.model.tanks} tanks and {observer.model.pumps} pumps, the"
+            f" plant {n} and {plant.pumps}"
         )
     for name in ("levels", "process", "measurement"):
         if hasattr(observer, name) and np.shape(getattr(observer, name)) != (n,):
-            raise InputError(f"observer.{name} has shape {np.shape(getattr(observer, name))}: must be ({n},), one per tank")
+            raise InputError(
+                f"observer.{name} has shape {np.shape(getattr(observer, name))}: must be ({n},),"
+                " one per tank"
+            )
     tanks = observer.measured
     if not tanks or len(set(tanks)) != len(tanks) or not all(0 <= i < n for i in tanks):
-        raise InputError(f"observer.measured = {tanks}: must name at least one of the {n} tanks, counted from 0, each once")
+        raise InputError(
+            f"observer.measured = {tanks}: must name at least one of the {n} tanks, counted from 0,"
+            " each once"
+        )

@@ -12,9 +12,11 @@ from jaxtank.core.units import DEFAULT
 
 
 class Plant(abc.ABC):
-    """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of scalars.
+    """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of
+    scalars.
 
-    A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs no more than its vector field (notebook 10).
+    A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs
+    no more than its vector field (notebook 10).
     """
 
     outputs: tuple[int, ...]
@@ -44,11 +46,14 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
-        """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or None; returns (n) [cm/s]."""
+        """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or
+        None; returns (n) [cm/s].
+        """
 
     def limited(self, step: ArrayLike) -> Callable:
-        """Return the vector field of one integration step of `step` [s]: `derivative`, unless a plant
-        limits what may leave a tank in that time."""
+        """Return the vector field of one integration step of `step` [s]: `derivative`, unless a
+        plant limits what may leave a tank in that time.
+        """
         return self.derivative
 
     def shortfall(self, x: Sequence) -> tuple:
@@ -57,12 +62,15 @@ class Plant(abc.ABC):
         return (0.0,) * len(x)
 
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """`derivative` of arrays x (n) and u (m), without time and inflows, as an array (n); a plant of many tanks may have one that is
-        compiled in less time."""
+        """`derivative` of arrays x (n) and u (m), without time and inflows, as an array (n); a
+        plant of many tanks may have one that is compiled in less time.
+        """
         return jnp.stack(self.derivative(0.0, tuple(x), tuple(u), None))
 
     def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
-        """(levels held at their rims, volume lost over each rim [cm^3]); unchanged and zeros where rims are not physics."""
+        """(levels held at their rims, volume lost over each rim [cm^3]); unchanged and zeros where
+        rims are not physics.
+        """
         return x, (0.0,) * len(x)
 
     def output(self, x: Sequence) -> tuple:

@@ -1,4 +1,6 @@
-"""One physical law each. Scalars or arrays; lengths in the rig's unit (cm unless its paper is in m)."""
+"""One physical law each. Scalars or arrays; lengths in the rig's unit (cm unless its paper is in
+m).
+"""
 
 import math
 
@@ -10,13 +12,22 @@ from jaxtank.core.numerics import ROOT_KNEE, root
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
 
-PER_CENTIMETRE = {"mm": 10.0, "cm": 1.0, "dm": 0.1, "m": 0.01, "in": 1 / 2.54, "inch": 1 / 2.54, "ft": 1 / 30.48}
+PER_CENTIMETRE = {
+    "mm": 10.0,
+    "cm": 1.0,
+    "dm": 0.1,
+    "m": 0.01,
+    "in": 1 / 2.54,
+    "inch": 1 / 2.54,
+    "ft": 1 / 30.48,
+}
 """Units of length: how many are one centimetre."""
 
 
 def in_unit(centimetres, length):
-    """A number of `centimetres` [cm], or of one of them per s^2, in the unit `length` of a rig; as it is where that is no length: levels in
-    the volts of a sensor have no other scale."""
+    """A number of `centimetres` [cm], or of one of them per s^2, in the unit `length` of a rig; as
+    it is where that is no length: levels in the volts of a sensor have no other scale.
+    """
     return centimetres * PER_CENTIMETRE.get(length, 1.0)
 
 
@@ -34,7 +45,9 @@ def usual_gravity(length):
 
 
 def usual_knee(length):
-    """Level below which flow turns laminar unless a rig says otherwise: 0.01 cm, in the unit `length` of the rig."""
+    """Level below which flow turns laminar unless a rig says otherwise: 0.01 cm, in the unit
+    `length` of the rig.
+    """
     return in_unit(ROOT_KNEE, length)
 
 
@@ -44,5 +57,7 @@ def disc(diameter):
 
 
 def efflux(level, gravity, knee):
-    """Torricelli's speed of efflux v = sqrt(2 g h) [cm/s] under `level` h [cm]; C1 through zero (see numerics.root)."""
+    """Torricelli's speed of efflux v = sqrt(2 g h) [cm/s] under `level` h [cm]; C1 through zero
+    (see numerics.root).
+    """
     return jnp.sqrt(2.0 * gravity) * root(level, knee)

@@ -1,4 +1,6 @@
-"""The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws know them."""
+"""The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws
+know them.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,7 +11,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.plants.hydraulics import disc
 from jaxtank.plants.network import TankNetwork, network
 
-STATE_COUPLED_LINKS = ((2, 0), (2, 1), (3, 0), (3, 1))  # tank 3 to 1, 3 to 2, 4 to 1, 4 to 2 in the paper's count from 1
+# tank 3 to 1, 3 to 2, 4 to 1, 4 to 2 in the paper's count from 1
+STATE_COUPLED_LINKS = ((2, 0), (2, 1), (3, 0), (3, 1))
 STATE_COUPLED_FEEDS = ((2, None), (3, None))
 QUADRUPLE_LINKS = ((2, 0), (3, 1))  # tank 3 above 1, 4 above 2
 QUADRUPLE_FEEDS = ((0, 3), (1, 2))  # pump 1 to tanks 1 and 4, pump 2 to tanks 2 and 3
@@ -17,11 +20,12 @@ COUPLED_PIPES = ((0, 1),)
 
 
 def state_coupled_four_tank(area: float) -> TankNetwork:
-    """The state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1): pumps fill the upper tanks 3 and 4, each of which
-    pours into both lower tanks 1 and 2, whose levels are controlled.
+    """The state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1): pumps fill the upper
+    tanks 3 and 4, each of which pours into both lower tanks 1 and 2, whose levels are controlled.
 
-    area: cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2 (plant A, "table1"), with
-    which the paper's own gains fail; 15 sqrt(2) read as an area gives plant B, "fast", which reproduces the text (gouta2015 notes S1).
+    area: cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2
+    (plant A, "table1"), with which the paper's own gains fail; 15 sqrt(2) read as an area gives
+    plant B, "fast", which reproduces the text (gouta2015 notes S1).
     """
     inner, outer = disc(0.38), disc(0.31)  # d31 = d42, d32 = d41 [cm], Table 1
     return network(
@@ -45,10 +49,11 @@ def quadruple_tank(
     rim: ArrayLike,
     gravity: float = 981.0,
 ) -> TankNetwork:
-    """Johansson's quadruple tank: tank 3 pours into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4, pump 2 tanks 2 and 3 (mirakhorli eq. 2).
+    """Johansson's quadruple tank: tank 3 pours into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4,
+    pump 2 tanks 2 and 3 (mirakhorli eq. 2).
 
-    area, outlet: (4,) cross-sections A and outlet areas a [cm^2]; pump_gain: (2,) k [cm^3/(s V)]; split: (2,) share gamma of each
-    pump that goes to the lower tank [-]; rim: [cm].
+    area, outlet: (4,) cross-sections A and outlet areas a [cm^2]; pump_gain: (2,) k [cm^3/(s V)];
+    split: (2,) share gamma of each pump that goes to the lower tank [-]; rim: [cm].
     """
     a1, a2, a3, a4 = outlet
     return network(
@@ -65,22 +70,29 @@ def quadruple_tank(
     )
 
 
-JOHANSSON = {  # Johansson, IEEE Trans. CST 8(3), 2000, Table I and sec. II: (k [cm^3/(s V)], gamma, operating voltages [V])
+# Johansson, IEEE Trans. CST 8(3), 2000, Table I and sec. II: (k [cm^3/(s V)], gamma, operating
+# voltages [V])
+JOHANSSON = {
     "minimum": ((3.33, 3.35), (0.70, 0.60), (3.0, 3.0)),
     "non-minimum": ((3.14, 3.29), (0.43, 0.34), (3.15, 3.15)),
 }
 
 
 def johansson(phase):
-    """(rig, operating voltages (2) [V]) of Johansson's laboratory process (IEEE Trans. CST 8(3), 2000).
+    """(rig, operating voltages (2) [V]) of Johansson's laboratory process (IEEE Trans. CST 8(3),
+    2000).
 
-    phase: "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+). Raises InputError for another.
+    phase: "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+).
+        Raises InputError for another.
     """
     if phase not in JOHANSSON:
         raise InputError(f"phase = {phase!r}: must be one of {', '.join(JOHANSSON)}")
     pump_gain, split, voltages = JOHANSSON[phase]
     area, outlet = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057)
-    return quadruple_tank(area=area, outlet=outlet, pump_gain=pump_gain, split=split, rim=20.0), voltages
+    return (
+        quadruple_tank(area=area, outlet=outlet, pump_gain=pump_gain, split=split, rim=20.0),
+        voltages,
+    )
 
 
 def coupled_tanks(
@@ -94,9 +106,11 @@ def coupled_tanks(
     feeds: Sequence,
     **more: Any,
 ) -> TankNetwork:
-    """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none): gouta2022, calofir, khalid.
+    """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none):
+    gouta2022, calofir, khalid.
 
-    area, drain, rim: (2,) or a number; pipe: effective area; feeds: the tank that each pump fills; more: as in `network`.
+    area, drain, rim: (2,) or a number; pipe: effective area; feeds: the tank that each pump fills;
+        more: as in `network`.
     """
     return network(
         area=area,
@@ -112,7 +126,12 @@ def coupled_tanks(
 
 
 def check_topology(model, like, **wanted):
-    """Raise InputError unless the fields `wanted` of a law's model are those of the rig it inverts; `like`: that rig in words."""
+    """Raise InputError unless the fields `wanted` of a law's model are those of the rig it inverts;
+    `like`: that rig in words.
+    """
     for name, value in wanted.items():
         if getattr(model, name, None) != value:
-            raise InputError(f"controller.model must be {like}: this law inverts it, and its {name} are not {value}")
+            raise InputError(
+                f"controller.model must be {like}: this law inverts it, and its {name} are not"
+                f" {value}"
+            )

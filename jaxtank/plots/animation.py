@@ -1,4 +1,6 @@
-"""A run as a moving picture: the tanks of the rig filling and emptying, setpoints, what the pumps get, and the time."""
+"""A run as a moving picture: the tanks of the rig filling and emptying, setpoints, what the pumps
+get, and the time.
+"""
 
 import hashlib
 import re
@@ -26,8 +28,9 @@ LONGEST = 60.0
 def animate(loop, trajectory, path, seconds=6):
     """Write the run as a GIF of `seconds` [s] to `path`, whole or not at all; returns the path.
 
-    trajectory: of `jaxtank.simulate(loop, ...)`. Needs Pillow, which matplotlib brings along. Raises InputError for a length that is not
-    between 1 and 60 s, for a trajectory of another rig, and where `path` does not end in .gif.
+    trajectory: of `jaxtank.simulate(loop, ...)`. Needs Pillow, which matplotlib brings along.
+    Raises InputError for a length that is not between 1 and 60 s, for a trajectory of another rig,
+    and where `path` does not end in .gif.
     """
     path = Path(path)
     if path.suffix.lower() != ".gif":
@@ -41,21 +44,26 @@ def animate(loop, trajectory, path, seconds=6):
 
 
 def to_html(loop, trajectory, seconds=6):
-    """The run as an HTML fragment with buttons to play, stop and step, for a notebook: `IPython.display.HTML(to_html(...))`.
+    """The run as an HTML fragment with buttons to play, stop and step, for a notebook:
+    `IPython.display.HTML(to_html(...))`.
 
-    Everything is in it: no network is asked for fonts or scripts. Arguments and errors as in `animate`.
+    Everything is in it: no network is asked for fonts or scripts. Arguments and errors as in
+        `animate`.
     """
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
         film = _film(loop, trajectory, seconds)
         page = film.to_jshtml(fps=RATE)
         plt.close(film._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
-    page = re.sub(r"<link\b[^>]*>\s*", "", page)  # matplotlib takes the pictures on its buttons from the network
+    # matplotlib takes the pictures on its buttons from the network
+    page = re.sub(r"<link\b[^>]*>\s*", "", page)
     for name, sign in SIGNS.items():
         page = re.sub(rf'<i class="fa [^"]*{name}"></i>', sign, page)
     # ids by content and not by chance, so that the same run gives the same page
     for chance in sorted(set(re.findall(r"[0-9a-f]{32}", page))):
         if f"anim{chance}" in page:
-            page = page.replace(chance, hashlib.sha256(page.replace(chance, "").encode()).hexdigest()[:32])
+            page = page.replace(
+                chance, hashlib.sha256(page.replace(chance, "").encode()).hexdigest()[:32]
+            )
     return page
 
 
@@ -80,9 +88,12 @@ def _film(loop, trajectory, seconds):
     t, x, r, u = (np.asarray(v) for v in (trajectory.t, trajectory.x, trajectory.r, trajectory.u))
     if x.ndim != 2 or x.shape[1] != loop.plant.tanks or u.shape[1] != loop.plant.pumps:
         raise InputError(
-            f"the trajectory is one of {x.shape[-1]} tanks and {u.shape[-1]} pumps, the rig has {loop.plant.tanks} and {loop.plant.pumps}"
+            f"the trajectory is one of {x.shape[-1]} tanks and {u.shape[-1]} pumps, the rig has"
+            f" {loop.plant.tanks} and {loop.plant.pumps}"
         )
-    rows = np.unique(np.linspace(0, len(t) - 1, min(len(t), round(seconds * RATE))).round().astype(int))
+    rows = np.unique(
+        np.linspace(0, len(t) - 1, min(len(t), round(seconds * RATE))).round().astype(int)
+    )
     where = place(loop.plant)
     wide, high = where.right - where.left, where.top - where.bottom
     figure = plt.figure(figsize=(4.6, min(6.0, 4.6 * high / wide + 0.4)))
@@ -105,7 +116,9 @@ def _film(loop, trajectory, seconds):
         for j, bar in enumerate(bars):
             bar.set_height(BAR * float(np.clip((u[k, j] - low[j]) / (top[j] - low[j]), 0.0, 1.0)))
 
-    return FuncAnimation(figure, draw, frames=rows.tolist(), interval=1000 / RATE, cache_frame_data=False)
+    return FuncAnimation(
+        figure, draw, frames=rows.tolist(), interval=1000 / RATE, cache_frame_data=False
+    )
 
 
 BAR = 0.6
@@ -116,10 +129,30 @@ def _moving(ax, loop, where):
     """The artists that move: water in each tank, the marks of the setpoints, a bar for each pump."""
     water, bars = [], []
     for box in where.boxes:
-        water.append(ax.add_patch(Rectangle((box.x, box.y), box.width, 0.0, facecolor=WATER, edgecolor="none", zorder=1.6)))
+        water.append(
+            ax.add_patch(
+                Rectangle(
+                    (box.x, box.y), box.width, 0.0, facecolor=WATER, edgecolor="none", zorder=1.6
+                )
+            )
+        )
     marks = [mark(ax, where.boxes[i], 0.0) for i in loop.plant.outputs]
     for j, (x, y) in enumerate(where.pumps):
         left = x + (0.08 if x < 0 else -0.2)
-        ax.add_patch(Rectangle((left, y + 0.3), 0.12, BAR, facecolor="white", edgecolor="0.5", linewidth=0.8, zorder=3))
-        bars.append(ax.add_patch(Rectangle((left, y + 0.3), 0.12, 0.0, facecolor=PUMPS[j % len(PUMPS)], zorder=4)))
+        ax.add_patch(
+            Rectangle(
+                (left, y + 0.3),
+                0.12,
+                BAR,
+                facecolor="white",
+                edgecolor="0.5",
+                linewidth=0.8,
+                zorder=3,
+            )
+        )
+        bars.append(
+            ax.add_patch(
+                Rectangle((left, y + 0.3), 0.12, 0.0, facecolor=PUMPS[j % len(PUMPS)], zorder=4)
+            )
+        )
     return water, marks, bars

@@ -1,4 +1,6 @@
-"""Where the parts of a rig go in a drawing of it: tanks in rows by what pours into what, pumps below, pipework between."""
+"""Where the parts of a rig go in a drawing of it: tanks in rows by what pours into what, pumps
+below, pipework between.
+"""
 
 from typing import NamedTuple
 
@@ -26,8 +28,10 @@ class Box(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Places of everything: boxes one per tank, pumps one (x, y) each, risers one path ((x, y), ...) per pump and tank that it fills,
-    drawn from the pump to where the jet ends; left, right, bottom, top: what the drawing needs."""
+    """Places of everything: boxes one per tank, pumps one (x, y) each, risers one path ((x, y),
+    ...) per pump and tank that it fills, drawn from the pump to where the jet ends; left, right,
+    bottom, top: what the drawing needs.
+    """
 
     boxes: tuple
     pumps: tuple
@@ -39,7 +43,8 @@ class Layout(NamedTuple):
 
 
 def storeys(plant):
-    """(n,) which row each tank stands in, 0 the lowest: above every tank that it pours into, level with those that it is piped to.
+    """(n,) which row each tank stands in, 0 the lowest: above every tank that it pours into, level
+    with those that it is piped to.
 
     Tanks that pour in a circle, which no rig of bricks and gravity can do, stand as they come.
     """
@@ -54,7 +59,9 @@ def storeys(plant):
 
 
 def place(plant):
-    """The Layout of a `TankNetwork`. Heights are to scale within the rig; widths follow the roots of the areas, within limits."""
+    """The Layout of a `TankNetwork`. Heights are to scale within the rig; widths follow the roots
+    of the areas, within limits.
+    """
     rims, areas = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
     heights = np.clip(rims / rims.max(), 0.3, 1.0)
     widths = 0.95 * np.clip(np.sqrt(areas / areas.max()), 0.4, 1.0)
@@ -65,12 +72,20 @@ def place(plant):
         mine = [i for i in range(plant.tanks) if rows[i] == row]
         for k, i in enumerate(mine):
             x = PITCH * (k + (wide - len(mine)) / 2) + PITCH / 2
-            boxes[i] = Box(x - widths[i] / 2, row * STOREY, float(widths[i]), float(heights[i]), float(heights[i] / rims[i]))
+            boxes[i] = Box(
+                x - widths[i] / 2,
+                row * STOREY,
+                float(widths[i]),
+                float(heights[i]),
+                float(heights[i] / rims[i]),
+            )
     return _with_pumps(plant, boxes, rows, wide * PITCH)
 
 
 def _with_pumps(plant, boxes, rows, width):
-    """Pumps stand in the basin at the nearer side of the first tank that they fill; each has a riser and a height of its own above a row."""
+    """Pumps stand in the basin at the nearer side of the first tank that they fill; each has a
+    riser and a height of its own above a row.
+    """
     sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
     pumps, risers, above = [], [], {}
     for j, feed in enumerate(plant.feeds):
@@ -85,7 +100,9 @@ def _with_pumps(plant, boxes, rows, width):
             # jets of different pumps into one tank side by side, on the side that they come from
             share = 0.2 + 0.15 * min(order, 1) if sides[j] == "left" else 0.8 - 0.15 * min(order, 1)
             end = boxes[i].x + boxes[i].width * share
-            risers.append((j, i, ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))))
+            risers.append(
+                (j, i, ((x, -0.78), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93)))
+            )
     most = max((len([s for s in sides if s == side]) for side in ("left", "right")), default=0)
     edge = 0.75 + 0.5 * max(0, most - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3

@@ -1,4 +1,6 @@
-"""The rig drawn from its own topology: tanks, pumps and their splits, orifices, pipes, spills and the basin, on given matplotlib axes."""
+"""The rig drawn from its own topology: tanks, pumps and their splits, orifices, pipes, spills and
+the basin, on given matplotlib axes.
+"""
 
 import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
@@ -15,16 +17,20 @@ HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 
 
 def schematic(ax, plant, levels=None, setpoints=None):
-    """Draw the rig `plant` (TankNetwork): the tanks of each row beside each other, above those that they pour into, heights to scale.
+    """Draw the rig `plant` (TankNetwork): the tanks of each row beside each other, above those that
+    they pour into, heights to scale.
 
-    levels: (tanks,) [cm] to fill the tanks to, or None for empty ones; setpoints: (outputs,) [cm], marked on the controlled tanks, which
-    have a heavier outline. A closed orifice (area 0) is not drawn. Dashes fall freely, dots pass a rim, double lines lie below the
-    surface. Returns the axes.
+    levels: (tanks,) [cm] to fill the tanks to, or None for empty ones; setpoints: (outputs,) [cm],
+    marked on the controlled tanks, which have a heavier outline. A closed orifice (area 0) is not
+    drawn. Dashes fall freely, dots pass a rim, double lines lie below the surface. Returns the
+    axes.
     """
     where, unit = place(plant), plant.units[0]
     _basin(ax, where)
     for pump, _, path in where.risers:
-        ax.plot(*np.array(path).T, color=_colour(pump), linewidth=1.6, solid_joinstyle="round", zorder=1)
+        ax.plot(
+            *np.array(path).T, color=_colour(pump), linewidth=1.6, solid_joinstyle="round", zorder=1
+        )
         ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
     for k, (one, other) in enumerate(plant.pipes):
         if float(np.asarray(plant.pipe)[k]) > 0:
@@ -34,12 +40,34 @@ def schematic(ax, plant, levels=None, setpoints=None):
         _spill(ax, where.boxes[source], where.boxes[sink])
     for i, box in enumerate(where.boxes):
         held = i in plant.outputs
-        ax.add_patch(Rectangle((box.x, box.y), box.width, box.height, facecolor="white", edgecolor="none", zorder=1.5))
+        ax.add_patch(
+            Rectangle(
+                (box.x, box.y),
+                box.width,
+                box.height,
+                facecolor="white",
+                edgecolor="none",
+                zorder=1.5,
+            )
+        )
         if levels is not None:
-            ax.add_patch(Rectangle((box.x, box.y), box.width, depth(box, levels[i]), facecolor=WATER, edgecolor="none", zorder=1.6))
+            ax.add_patch(
+                Rectangle(
+                    (box.x, box.y),
+                    box.width,
+                    depth(box, levels[i]),
+                    facecolor=WATER,
+                    edgecolor="none",
+                    zorder=1.6,
+                )
+            )
         x, y = box.x + box.width, box.y + box.height
         ax.plot(
-            [box.x, box.x, x, x], [y, box.y, box.y, y], color=REFERENCE if held else GLASS, linewidth=2.2 if held else 1.4, zorder=3
+            [box.x, box.x, x, x],
+            [y, box.y, box.y, y],
+            color=REFERENCE if held else GLASS,
+            linewidth=2.2 if held else 1.4,
+            zorder=3,
         )
         _label(ax, plant, i, box, None if levels is None else float(levels[i]), unit)
     if setpoints is not None:
@@ -55,7 +83,9 @@ def schematic(ax, plant, levels=None, setpoints=None):
 
 
 def mark(ax, box, setpoint):
-    """The setpoint [cm] as a triangle and a short line at the right wall of a tank, clear of its name; returns the two artists."""
+    """The setpoint [cm] as a triangle and a short line at the right wall of a tank, clear of its
+    name; returns the two artists.
+    """
     y, x = mark_height(box, setpoint), box.x + box.width
     (line,) = ax.plot([x - 0.1 * box.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
     (triangle,) = ax.plot([x + 0.07], [y], marker="<", color=REFERENCE, markersize=5, zorder=4)
@@ -78,14 +108,45 @@ def _colour(pump):
 
 def _basin(ax, where):
     low, high = where.left + 0.06, where.right - 0.06
-    ax.add_patch(Rectangle((low, where.bottom + 0.06), high - low, 0.14, facecolor=WATER, alpha=0.5, edgecolor="none", zorder=0))
-    ax.plot([low, low, high, high], [-0.82, where.bottom + 0.06, where.bottom + 0.06, -0.82], color=GLASS, linewidth=1.4)
-    ax.text((low + high) / 2, where.bottom + 0.13, "basin", ha="center", va="center", fontsize=7, color="0.25")
+    ax.add_patch(
+        Rectangle(
+            (low, where.bottom + 0.06),
+            high - low,
+            0.14,
+            facecolor=WATER,
+            alpha=0.5,
+            edgecolor="none",
+            zorder=0,
+        )
+    )
+    ax.plot(
+        [low, low, high, high],
+        [-0.82, where.bottom + 0.06, where.bottom + 0.06, -0.82],
+        color=GLASS,
+        linewidth=1.4,
+    )
+    ax.text(
+        (low + high) / 2,
+        where.bottom + 0.13,
+        "basin",
+        ha="center",
+        va="center",
+        fontsize=7,
+        color="0.25",
+    )
 
 
 def _pump(ax, x, y, pump, words):
-    ax.add_patch(Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4))
-    ax.add_patch(Polygon([(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)], facecolor=_colour(pump), zorder=5))
+    ax.add_patch(
+        Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4)
+    )
+    ax.add_patch(
+        Polygon(
+            [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)],
+            facecolor=_colour(pump),
+            zorder=5,
+        )
+    )
     away, side = (-0.23, "right") if x > 0 else (0.23, "left")
     ax.text(x + away, y + 0.12, words, fontsize=8, ha=side, va="center", zorder=5)
 
@@ -113,10 +174,22 @@ def _shares(ax, plant, where):
 
 def _label(ax, plant, tank, box, level, unit):
     rim = float(np.asarray(plant.rim)[tank])
-    what = f"{level:.3g} {unit}" if level is not None else ("controlled" if tank in plant.outputs else "")
+    what = (
+        f"{level:.3g} {unit}"
+        if level is not None
+        else ("controlled" if tank in plant.outputs else "")
+    )
     words = "\n".join(w for w in (f"tank {tank + 1}", what) if w)
     small = box.width < 0.7
-    said = ax.text(box.middle, box.y + 0.5 * box.height, words, ha="center", va="center", fontsize=7 if small else 8, zorder=5)
+    said = ax.text(
+        box.middle,
+        box.y + 0.5 * box.height,
+        words,
+        ha="center",
+        va="center",
+        fontsize=7 if small else 8,
+        zorder=5,
+    )
     if level is not None:
         said.set_path_effects(HALO)
     ax.text(
@@ -155,14 +228,27 @@ def _jets(ax, plant, where):
 
 
 def _spout(ax, x, y):
-    ax.add_patch(Polygon([(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)], facecolor=GLASS, zorder=3))
+    ax.add_patch(
+        Polygon(
+            [(x - 0.06, y), (x + 0.06, y), (x + 0.025, y - 0.07), (x - 0.025, y - 0.07)],
+            facecolor=GLASS,
+            zorder=3,
+        )
+    )
 
 
 def _pipe(ax, one, other):
     left, right = sorted((one, other), key=lambda b: b.x)
     y = max(left.y, right.y) + 0.08
     for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
-        ax.plot([left.x + left.width, right.x], [y, y], color=colour, linewidth=wide, solid_capstyle="butt", zorder=layer)
+        ax.plot(
+            [left.x + left.width, right.x],
+            [y, y],
+            color=colour,
+            linewidth=wide,
+            solid_capstyle="butt",
+            zorder=layer,
+        )
 
 
 def _spill(ax, source, sink):
@@ -174,4 +260,13 @@ def _spill(ax, source, sink):
         (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97),
     ]
     ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
-    ax.text(x - 0.04, (path[1][1] + path[2][1]) / 2, "overflow", fontsize=6.5, color="0.25", rotation=90, ha="right", va="center")
+    ax.text(
+        x - 0.04,
+        (path[1][1] + path[2][1]) / 2,
+        "overflow",
+        fontsize=6.5,
+        color="0.25",
+        rotation=90,
+        ha="right",
+        va="center",
+    )

@@ -1,4 +1,5 @@
-"""The papers, one file each: rigs, cases, published numbers, what may be tuned, what is uncertain, departures.
+"""The papers, one file each: rigs, cases, published numbers, what may be tuned, what is uncertain,
+departures.
 
 preset = presets.load("gouta2015")
 case = preset.cases["backstepping"]     # .loop .clock .limits
@@ -16,11 +17,18 @@ from jaxtank.case import Case, Free, Mirror, Scenario
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.presets.paper import Claim, Preset, Published
 
-PAPERS = tuple(sorted(m.name for m in pkgutil.iter_modules(__path__) if m.name != "paper" and not m.name.startswith("_")))
+PAPERS = tuple(
+    sorted(
+        m.name
+        for m in pkgutil.iter_modules(__path__)
+        if m.name != "paper" and not m.name.startswith("_")
+    )
+)
 
 
 def load(paper: str) -> Preset:
-    """The Preset of `paper`, one of PAPERS; the Case of "paper/case", as `find`. Raises InputError for another name.
+    """The Preset of `paper`, one of PAPERS; the Case of "paper/case", as `find`. Raises InputError
+    for another name.
 
     >>> load("gouta2015/ngpc") is find("gouta2015/ngpc")
     True
@@ -41,7 +49,9 @@ def _load(paper):
 
 
 class Cases(dict):
-    """The cases of a paper by name; `cases[name]` raises InputError for an unknown one, with the nearest."""
+    """The cases of a paper by name; `cases[name]` raises InputError for an unknown one, with the
+    nearest.
+    """
 
     def __missing__(self, name):
         raise unknown("case", str(name), self)
@@ -64,4 +74,17 @@ def find(name: str) -> Case:
     return cases[case]
 
 
-__all__ = ["PAPERS", "Case", "Claim", "Free", "InputError", "Mirror", "Preset", "Published", "Scenario", "find", "load", "names"]
+__all__ = [
+    "PAPERS",
+    "Case",
+    "Claim",
+    "Free",
+    "InputError",
+    "Mirror",
+    "Preset",
+    "Published",
+    "Scenario",
+    "find",
+    "load",
+    "names",
+]

@@ -1,4 +1,6 @@
-"""Calofir and others: two coupled tanks in metres, backstepping. Derivation and labels: notes/calofir.md."""
+"""Calofir and others: two coupled tanks in metres, backstepping. Derivation and labels:
+notes/calofir.md.
+"""
 
 import dataclasses
 import functools
@@ -32,16 +34,35 @@ TUNABLE = {"controller.K_phi": Free(1e-3, 1.0), "controller.K_y": Free(1e-3, 1.0
 KS = tuple(TUNABLE)
 
 DEPARTURES = (
-    "Equations: the errata of the paper are mended (notes S5): signs of (12a), (14) and of the first term of f_a in (16); d phi/d z in "
-    "(4); (20) is v, not phi; in (21) a/z0 for z/z0, and the denominators of v_i and v_ii. As printed, the law does not rest at the "
-    "reference.",
-    "The law is computed in physical units (notes S4.2): z0 and Q0 cancel exactly, as long as z0 is one number.",
-    "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3).",
-    "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05, 0.05 kappa) m (notes A2).",
-    "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for 900-1050 s; the paper does not say what "
-    "its faults were (notes A3).",
-    "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it never starts from empty tanks (notes A4, H1).",
-    "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81 m/s^2.",
+    (
+        "Equations: the errata of the paper are mended (notes S5): signs of (12a), (14) and of the"
+        " first term of f_a in (16); d phi/d z in (4); (20) is v, not phi; in (21) a/z0 for z/z0,"
+        " and the denominators of v_i and v_ii. As printed, the law does not rest at the reference."
+    ),
+    (
+        "The law is computed in physical units (notes S4.2): z0 and Q0 cancel exactly, as long as"
+        " z0 is one number."
+    ),
+    (
+        "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is"
+        " below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3)."
+    ),
+    (
+        "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05,"
+        " 0.05 kappa) m (notes A2)."
+    ),
+    (
+        "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for"
+        " 900-1050 s; the paper does not say what its faults were (notes A3)."
+    ),
+    (
+        "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it"
+        " never starts from empty tanks (notes A4, H1)."
+    ),
+    (
+        "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81"
+        " m/s^2."
+    ),
     "Rims are physics: levels stop at 0.6 m and at 0 m.",
 )
 
@@ -53,12 +74,21 @@ PUBLISHED = {
     "plant.rim": Published(H0, "m", "sec. 3.1"),
     "clock.dt": Published(1.0, "s", "sec. 4"),
     "setpoints, share of h0": Published((0.8, 0.5), "-", "sec. 4", 1e-9),
-    "steady state follows very accurately": Published("level of the first tank, without perturbation", "", "sec. 4, Fig. 2"),
-    "reacts rapidly to faults": Published("in the direction to counteract them", "", "sec. 4, Fig. 3"),
-    "some steady state errors": Published(
-        "due to unmodelled dynamics", "", "sec. 5", reason="no integral action, and h3 rather than h1 is regulated"
+    "steady state follows very accurately": Published(
+        "level of the first tank, without perturbation", "", "sec. 4, Fig. 2"
     ),
-    "same performance in any operating point": Published("whatever the level", "", "sec. 5", reason="the pump's limits"),
+    "reacts rapidly to faults": Published(
+        "in the direction to counteract them", "", "sec. 4, Fig. 3"
+    ),
+    "some steady state errors": Published(
+        "due to unmodelled dynamics",
+        "",
+        "sec. 5",
+        reason="no integral action, and h3 rather than h1 is regulated",
+    ),
+    "same performance in any operating point": Published(
+        "whatever the level", "", "sec. 5", reason="the pump's limits"
+    ),
     "globally asymptotically stabilises": Published(
         "Proposition 2.1", "", "sec. 2", reason="needs h3 > 0, h1 > h3 and a pump without limits"
     ),
@@ -66,7 +96,9 @@ PUBLISHED = {
 
 
 def rig():
-    """The paper's tanks T1, T3 in m and m^3/s: T1 is pumped and its level is the output; T3 drains to the basin."""
+    """The paper's tanks T1, T3 in m and m^3/s: T1 is pumped and its level is the output; T3 drains
+    to the basin.
+    """
     return coupled_tanks(
         area=A,
         drain=[0.0, C2 / SPEED],
@@ -94,17 +126,29 @@ def build(perturbed=False):
         ),  # 10 V at 0.6 m; not printed
         observer=Direct(),
         controller=TwoTankBackstepping(
-            model=plant, K_phi=number(0.02), K_y=number(0.1), level_floor=number(1e-4), difference_floor=number(1e-4)
+            model=plant,
+            K_phi=number(0.02),
+            K_y=number(0.1),
+            level_floor=number(1e-4),
+            difference_floor=number(1e-4),
         ),
-        actuator=PumpBank(low=number([0.0]), high=number([Q0]), stop=number([0.0]), pulse=number([Q0]), initial=number([0.0])),
+        actuator=PumpBank(
+            low=number([0.0]),
+            high=number([Q0]),
+            stop=number([0.0]),
+            pulse=number([Q0]),
+            initial=number([0.0]),
+        ),
         reference=ramps([START], [(0.0, 0, 0.8 * H0), (600.0, 0, 0.5 * H0)], ramp=0.0, band=0.02),
         faults=faults(plant, events) if perturbed else None,
         x0=number([START, START * KAPPA]),
     )
 
 
-STEP = (0.10, 0.40)  # levels from which `same_everywhere` steps up by 0.1 m [m]; ours, the paper names none
-ACCURATE, SAME = 1e-3, 0.05  # what counts as accurate [m], and as the same decay [share of the step]; ours too
+# levels from which `same_everywhere` steps up by 0.1 m [m]; ours, the paper names none
+STEP = (0.10, 0.40)
+# what counts as accurate [m], and as the same decay [share of the step]; ours too
+ACCURATE, SAME = 1e-3, 0.05
 
 
 def verdict(holds):
@@ -113,62 +157,82 @@ def verdict(holds):
 
 
 def constant_flow(case):
-    """Error of h1 [m] (samples,) with the flow at which each setpoint rests in the law's place (u_s alone, notes S7.1)."""
+    """Error of h1 [m] (samples,) with the flow at which each setpoint rests in the law's place (u_s
+    alone, notes S7.1).
+    """
     up, down = (C1 * (h * (1 - KAPPA)) ** 0.5 for h in (0.8 * H0, 0.5 * H0))
     law = OpenLoop(signal=ramps([up], [(600.0, 0, down)], ramp=0.0))
     return np.asarray(simulate(dataclasses.replace(case.loop, controller=law), case.clock).e[:, 0])
 
 
 def same_everywhere(run, values):
-    """Largest difference between the decays of h3 - h3r after steps of h1r by 0.1 m from the levels STEP, as a share of the step."""
+    """Largest difference between the decays of h3 - h3r after steps of h1r by 0.1 m from the levels
+    STEP, as a share of the step.
+    """
     shares = []
     for level in STEP:
-        start = {"reference.initial": level, "reference.targets": [level, level + 0.1], "x0": [level, KAPPA * level]}
+        start = {
+            "reference.initial": level,
+            "reference.targets": [level, level + 0.1],
+            "x0": [level, KAPPA * level],
+        }
         t = run("backstepping", {**start, **values})[1]
         shares.append((t.x[600:, 1] - KAPPA * (level + 0.1)) / (KAPPA * 0.1))
     return float(np.abs(shares[0] - shares[1]).max())
 
 
 def measured(run):
-    """What can be measured of PUBLISHED (see presets.base.Preset). Verdicts follow from the numbers in their texts."""
+    """What can be measured of PUBLISHED (see presets.base.Preset). Verdicts follow from the numbers
+    in their texts.
+    """
     case, plain = run("backstepping")
     hurt_case, hurt = run("backstepping-perturbed")
     plant, ends, e = case.loop.plant, [449, 1049], plain.e[:, 0]
     w = float(np.sqrt(2 * plant.gravity))
     rest = np.abs(e[[599, 1199]]).max()
-    # what the faults do to h1 by their ends, with the law and with a constant flow; and what the law does to the flow
+    # what the faults do to h1 by their ends, with the law and with a constant flow; and what the
+    # law does to the flow
     shift, push = (hurt.e - plain.e)[ends, 0], (hurt.u - plain.u)[ends, 0]
     left = constant_flow(hurt_case)
     open_shift = (left - constant_flow(case))[ends]
     reacts = np.all(np.abs(shift) < 0.5 * np.abs(open_shift)) and np.all(push * open_shift < 0.0)
     offsets = hurt.e[ends, 0]
-    free, held = same_everywhere(run, {"actuator.low": -1.0, "actuator.high": 1.0}), same_everywhere(run, {})
+    free, held = (
+        same_everywhere(run, {"actuator.low": -1.0, "actuator.high": 1.0}),
+        same_everywhere(run, {}),
+    )
     dry = run("backstepping", {"x0": [0.0, 0.0], "controller.difference_floor": 1e-12})[1]
     return {
         "c1": float(plant.pipe[0]) * w,
         "c2": float(plant.drain[1]) * w,
         "setpoints, share of h0": (plain.r[0, 0] / H0, plain.r[-1, 0] / H0),
         "steady state follows very accurately": Claim(
-            verdict(rest < ACCURATE), f"error at the end of each plateau at most {rest:.1e} m (counts if below {ACCURATE:g} m)"
+            verdict(rest < ACCURATE),
+            f"error at the end of each plateau at most {rest:.1e} m (counts if below"
+            f" {ACCURATE:g} m)",
         ),
         "reacts rapidly to faults": Claim(
             verdict(reacts),
-            f"by its end, the partly closed outlet has moved h1 by {shift[0]:.5f} m and the leak by {shift[1]:.5f} m; with a constant "
-            f"flow {open_shift[0]:.4f} and {open_shift[1]:.4f} m. The law has changed the flow by {push[0]:.1e} and {push[1]:.1e} m^3/s "
-            "(counts if against the shift, and less than half of it is left)",
+            f"by its end, the partly closed outlet has moved h1 by {shift[0]:.5f} m and the leak by"
+            f" {shift[1]:.5f} m; with a constant flow {open_shift[0]:.4f} and {open_shift[1]:.4f}"
+            f" m. The law has changed the flow by {push[0]:.1e} and {push[1]:.1e} m^3/s (counts if"
+            " against the shift, and less than half of it is left)",
         ),
         "some steady state errors": Claim(
             verdict(np.abs(offsets).max() > ACCURATE),
-            f"{offsets[0]:.5f} and {offsets[1]:.5f} m at the ends of the faults (a constant flow: {left[449]:.4f} and {left[1049]:.4f} m)",
+            f"{offsets[0]:.5f} and {offsets[1]:.5f} m at the ends of the faults (a constant flow:"
+            f" {left[449]:.4f} and {left[1049]:.4f} m)",
         ),
         "same performance in any operating point": Claim(
             "partly" if free < SAME <= held else verdict(max(free, held) < SAME),
-            f"steps of 0.1 m from {STEP[0]:g} and {STEP[1]:g} m: the decays of h3 differ by {100 * free:.2g} % of the step without "
-            f"limits of the pump, by {100 * held:.2g} % with them (the same: below {100 * SAME:g} %)",
+            f"steps of 0.1 m from {STEP[0]:g} and {STEP[1]:g} m: the decays of h3 differ by"
+            f" {100 * free:.2g} % of the step without limits of the pump, by {100 * held:.2g} %"
+            f" with them (the same: below {100 * SAME:g} %)",
         ),
         "globally asymptotically stabilises": Claim(
             verdict(np.abs(dry.e[[599, 1199], 0]).max() < ACCURATE),
-            f"from empty tanks, without a floor under h1 - h3, h1 {f'stays below {top:.0e}' if (top := dry.x[:, 0].max()) else 'stays at 0'} m",
+            "from empty tanks, without a floor under h1 - h3, h1"
+            f" {f'stays below {top:.0e}' if (top := dry.x[:, 0].max()) else 'stays at 0'} m",
         ),
     }
 
@@ -176,7 +240,10 @@ def measured(run):
 @functools.cache
 def preset():
     """The Preset of this paper."""
-    words = {"backstepping": "backstepping", "backstepping-perturbed": "backstepping; outlet partly closed, then a leak"}
+    words = {
+        "backstepping": "backstepping",
+        "backstepping-perturbed": "backstepping; outlet partly closed, then a leak",
+    }
     cases = {
         name: Case(
             name=f"calofir/{name}",
@@ -185,20 +252,28 @@ def preset():
             clock=Clock(dt=1.0, duration=1199.0, substeps=4),
             limits={"max_level": "rim"},
             free=TUNABLE,
-            # the error alone ranks nothing, the pump's limit sets it (notes S10): overshoot counts a hundredfold, and 1e-6 m^3/s from
+            # the error alone ranks nothing, the pump's limit sets it (notes S10): overshoot counts
+            # a hundredfold, and 1e-6 m^3/s from
             # sample to sample, which noise of 1 mm makes felt, as 0.3 mm
-            objective={"mean_square_error": 1.0, "mean_square_overshoot": 100.0, "mean_square_travel": 1e5},
+            objective={
+                "mean_square_error": 1.0,
+                "mean_square_overshoot": 100.0,
+                "mean_square_travel": 1e5,
+            },
             scenarios=(Scenario("noise", {"sensor.noise": "0.001 if zero"}, seed=1),),
             mirror=Mirror(
-                "K_phi and K_y exchange roles", lambda v: {KS[0]: v[KS[1]], KS[1]: v[KS[0]]} if set(KS) <= set(v) else {}
+                "K_phi and K_y exchange roles",
+                lambda v: {KS[0]: v[KS[1]], KS[1]: v[KS[0]]} if set(KS) <= set(v) else {},
             ),
         )
         for name, title in words.items()
     }
     return Preset(
         paper="calofir",
-        citation="V. Calofir, V. Tanasa, I. Fagarasan, I. Stamatescu, N. Arghira, G. Stamatescu, A backstepping control method for a "
-        "nonlinear process - two coupled-tanks",
+        citation=(
+            "V. Calofir, V. Tanasa, I. Fagarasan, I. Stamatescu, N. Arghira, G. Stamatescu, A"
+            " backstepping control method for a nonlinear process - two coupled-tanks"
+        ),
         cases=cases,
         published=PUBLISHED,
         measured=measured,

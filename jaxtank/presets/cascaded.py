@@ -1,4 +1,6 @@
-"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016): two tanks, one pump, all in volts."""
+"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016): two
+tanks, one pump, all in volts.
+"""
 
 import functools
 
@@ -18,11 +20,15 @@ from jaxtank.signals.setpoints import ramps
 RIM = 10.0  # level sensor's volts at which either tank overflows
 PERIOD = 4.0  # of the record [s]
 
-# Fitted to the 1,024 samples of the estimation record by nonlinear least squares on the simulated lower level (RK4, four substeps of
-# 1 s, input held), all seven numbers below at once: RMS error 0.2536 V. Fitted again by another code from 12 random starts
-# (k from 0.01 to 0.2, share 0 to 1, offset -2 to 2 V, levels 1 to 9 V): ten end here, to all digits printed, and two in a worse
+# Fitted to the 1,024 samples of the estimation record by nonlinear least squares on the simulated
+# lower level (RK4, four substeps of
+# 1 s, input held), all seven numbers below at once: RMS error 0.2536 V. Fitted again by another
+# code from 12 random starts
+# (k from 0.01 to 0.2, share 0 to 1, offset -2 to 2 V, levels 1 to 9 V): ten end here, to all digits
+# printed, and two in a worse
 # optimum at 0.503 V. Without the offset of the pump the best fit leaves 0.450 V.
-K_UPPER, K_LOWER, K_PUMP = 0.038642, 0.040808, 0.046202  # x1' = -k1 sqrt(x1) + k4 u, x2' = k2 sqrt(x1) - k3 sqrt(x2); k2 = k1
+# x1' = -k1 sqrt(x1) + k4 u, x2' = k2 sqrt(x1) - k3 sqrt(x2); k2 = k1
+K_UPPER, K_LOWER, K_PUMP = 0.038642, 0.040808, 0.046202
 CAUGHT = 0.92814  # share of the upper tank's overflow that falls into the lower one
 OFFSET = -0.73380  # added to the pump's voltage [V]
 START = (5.38786, 5.23862)  # levels at t = 0 of the record [V]
@@ -37,14 +43,29 @@ TUNABLE = {
 }
 
 DEPARTURES = (
-    "Units: levels are the sensor's volts. Cross-sections are not known and only ratios show in the record: area = 1 for both, gravity = "
-    "0.5 (so that sqrt(2 g) = 1), and orifices and pump gain are then the benchmark's k in V^0.5/s and 1/s.",
-    "k1 = k2: what leaves the upper tank reaches the lower one, in tanks of equal cross-section; the benchmark leaves both free.",
+    (
+        "Units: levels are the sensor's volts. Cross-sections are not known and only ratios show in"
+        " the record: area = 1 for both, gravity = 0.5 (so that sqrt(2 g) = 1), and orifices and"
+        " pump gain are then the benchmark's k in V^0.5/s and 1/s."
+    ),
+    (
+        "k1 = k2: what leaves the upper tank reaches the lower one, in tanks of equal"
+        " cross-section; the benchmark leaves both free."
+    ),
     "The parameters are fitted here to the estimation record (RMS error 0.254 V); none is printed.",
-    "The pump delivers k4 (u - 0.734 V), which takes the fit from 0.450 to 0.254 V RMS. The constant part is a disturbing inflow of the "
-    "upper tank, so that below 0.734 V the model draws from it, where a real pump stands still (levels stop at 0).",
-    "Both setpoints and gains of `pi`, and the flow of `open-loop`, are ours: the benchmark is one of identification.",
-    "Level sensors of both tanks, as far as the laws go; in the record only that of the lower tank is kept.",
+    (
+        "The pump delivers k4 (u - 0.734 V), which takes the fit from 0.450 to 0.254 V RMS. The"
+        " constant part is a disturbing inflow of the upper tank, so that below 0.734 V the model"
+        " draws from it, where a real pump stands still (levels stop at 0)."
+    ),
+    (
+        "Both setpoints and gains of `pi`, and the flow of `open-loop`, are ours: the benchmark is"
+        " one of identification."
+    ),
+    (
+        "Level sensors of both tanks, as far as the laws go; in the record only that of the lower"
+        " tank is kept."
+    ),
 )
 
 PUBLISHED = {
@@ -54,14 +75,19 @@ PUBLISHED = {
         (0.18, 0.45),
         "V",
         "lowest and highest of the errors published on the benchmark's other record",
-        reason="no record is shipped with this package; `playback` gives 0.254 V on the estimation record, to which the model was "
-        "fitted, and the published errors are on the other one, which no fit has seen: not to be compared",
+        reason=(
+            "no record is shipped with this package; `playback` gives 0.254 V on the estimation"
+            " record, to which the model was fitted, and the published errors are on the other one,"
+            " which no fit has seen: not to be compared"
+        ),
     ),
 }
 
 
 def rig():
-    """The two tanks: the upper one (0) is pumped and drains into the lower one (1), whose level is the output."""
+    """The two tanks: the upper one (0) is pumped and drains into the lower one (1), whose level is
+    the output.
+    """
     return network(
         area=1.0,
         drain=[0.0, K_LOWER],
@@ -84,10 +110,18 @@ def loop(controller, reference, x0, u0=0.0):
     """The closed loop with `controller`; x0: (2,) levels [V], u0: pump before t = 0 [V]."""
     return ClosedLoop(
         plant=rig(),
-        sensor=LevelSensor(gain=number([1.0, 1.0]), noise=number([0.0, 0.0]), full_scale=number(RIM)),
+        sensor=LevelSensor(
+            gain=number([1.0, 1.0]), noise=number([0.0, 0.0]), full_scale=number(RIM)
+        ),
         observer=Direct(),
         controller=controller,
-        actuator=PumpBank(low=number([0.0]), high=number([10.0]), stop=number([0.0]), pulse=number([10.0]), initial=number([u0])),
+        actuator=PumpBank(
+            low=number([0.0]),
+            high=number([10.0]),
+            stop=number([0.0]),
+            pulse=number([10.0]),
+            initial=number([u0]),
+        ),
         reference=reference,
         disturbance=Constant(level=number([K_PUMP * OFFSET, 0.0])),
         x0=number(x0),
@@ -95,13 +129,16 @@ def loop(controller, reference, x0, u0=0.0):
 
 
 def playback(pump, level):
-    """(loop, clock) that runs the rig with a recorded pump voltage against the recorded lower level, both (samples,) every 4 s [V].
+    """(loop, clock) that runs the rig with a recorded pump voltage against the recorded lower
+    level, both (samples,) every 4 s [V].
 
     The tracking error is then the simulation error of the model.
     """
     law = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
     reference = Table(values=number([level]), period=PERIOD)
-    return loop(law, reference, START), Clock(dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4)
+    return loop(law, reference, START), Clock(
+        dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4
+    )
 
 
 def at_rest(level):
@@ -113,10 +150,12 @@ def at_rest(level):
 def measured(run):
     """What can be measured of PUBLISHED without a record (see presets.base.Preset).
 
-    The rim, by flooding both tanks; the period at which a record is played. The simulation error needs a record (`playback`), and
-    none is shipped.
+    The rim, by flooding both tanks; the period at which a record is played. The simulation error
+    needs a record (`playback`), and none is shipped.
     """
-    case, flood = run("open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0})
+    case, flood = run(
+        "open-loop", {"controller.signal.initial": 10.0, "controller.signal.targets": 10.0}
+    )
     return {"plant.rim": float(flood.x[-1].min()), "record, sampling period": float(case.clock.dt)}
 
 
@@ -125,11 +164,21 @@ def preset():
     """The Preset of this rig."""
     x0, u0 = at_rest(4.0)
     reference = ramps([4.0], [(400.0, 0, 7.0), (1200.0, 0, 3.0), (2000.0, 0, 5.0)], ramp=0.0)
-    pi = PID(model=rig(), Kc=number([1.0]), Ti=number([200.0]), Tt=number([100.0]), bias=number([u0]))
-    pump = ramps([u0], [(400.0, 0, at_rest(7.0)[1]), (1200.0, 0, at_rest(3.0)[1]), (2000.0, 0, at_rest(5.0)[1])], ramp=0.0)
+    pi = PID(
+        model=rig(), Kc=number([1.0]), Ti=number([200.0]), Tt=number([100.0]), bias=number([u0])
+    )
+    pump = ramps(
+        [u0],
+        [(400.0, 0, at_rest(7.0)[1]), (1200.0, 0, at_rest(3.0)[1]), (2000.0, 0, at_rest(5.0)[1])],
+        ramp=0.0,
+    )
     laws = {
         "pi": ("PI", pi, ("controller.Kc", "controller.Ti")),
-        "open-loop": ("the voltage of each setpoint played", OpenLoop(signal=pump), ("controller.signal.targets",)),
+        "open-loop": (
+            "the voltage of each setpoint played",
+            OpenLoop(signal=pump),
+            ("controller.signal.targets",),
+        ),
     }
     cases = {
         name: Case(
@@ -146,12 +195,18 @@ def preset():
     }
     return Preset(
         paper="cascaded",
-        citation="M. Schoukens, P. Mattsson, T. Wigren, J.-P. Noel, Cascaded tanks benchmark combining soft and hard nonlinearities, "
-        "Workshop on Nonlinear System Identification Benchmarks, 2016",
+        citation=(
+            "M. Schoukens, P. Mattsson, T. Wigren, J.-P. Noel, Cascaded tanks benchmark combining"
+            " soft and hard nonlinearities, Workshop on Nonlinear System Identification Benchmarks,"
+            " 2016"
+        ),
         cases=cases,
         published=PUBLISHED,
         measured=measured,
         tunable=TUNABLE,
-        uncertain={name: (0.05, "fitted to one record") for name in ("plant.drain", "plant.orifice", "plant.pump_gain")},
+        uncertain={
+            name: (0.05, "fitted to one record")
+            for name in ("plant.drain", "plant.orifice", "plant.pump_gain")
+        },
         departures=DEPARTURES,
     )

@@ -22,7 +22,14 @@ PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
 FAST_AREA = 15 * 2**0.5  # the same figure read as an area (notes A1) [cm^2]
 
 # Fig. 5 as told in sec. 5.3: (time [s], output counted from 0, setpoint [cm])
-BENCHMARK = ((20.0, 0, 8.0), (20.0, 1, 8.0), (270.0, 1, 14.0), (470.0, 0, 16.0), (760.0, 1, 10.0), (900.0, 0, 12.0))
+BENCHMARK = (
+    (20.0, 0, 8.0),
+    (20.0, 1, 8.0),
+    (270.0, 1, 14.0),
+    (470.0, 0, 16.0),
+    (760.0, 1, 10.0),
+    (900.0, 0, 12.0),
+)
 START = (3.0, 3.0)  # r(0) [cm]
 
 TUNABLE = {
@@ -34,7 +41,10 @@ TUNABLE = {
 LAWS = {
     "ngpc": ("nonlinear predictive control", ("controller.Tp",)),
     "backstepping": ("backstepping as printed", ("controller.k", "controller.k1")),
-    "backstepping-ff": ("backstepping with the reference's rates", ("controller.k", "controller.k1")),
+    "backstepping-ff": (
+        "backstepping with the reference's rates",
+        ("controller.k", "controller.k1"),
+    ),
 }
 VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
@@ -43,16 +53,34 @@ VARIANTS = {
 }
 
 DEPARTURES = (
-    "Areas: Table 1 as printed (D = 15 sqrt(2) cm, 353.4 cm^2) gives a plant about 17 times too slow for the printed gains. The default "
-    "plant reads 15 sqrt(2) as an area (21.2 cm^2), which reproduces most of the text; '-table1' keeps the printed one (notes S1, E13).",
-    "Reference: Fig. 5 is lost. Each change is a ramp that starts at the stated time and lasts 60 s; its second derivative is 0 (notes A2, A3).",
+    (
+        "Areas: Table 1 as printed (D = 15 sqrt(2) cm, 353.4 cm^2) gives a plant about 17 times too"
+        " slow for the printed gains. The default plant reads 15 sqrt(2) as an area (21.2 cm^2),"
+        " which reproduces most of the text; '-table1' keeps the printed one (notes S1, E13)."
+    ),
+    (
+        "Reference: Fig. 5 is lost. Each change is a ramp that starts at the stated time and lasts"
+        " 60 s; its second derivative is 0 (notes A2, A3)."
+    ),
     "Start: all tanks at the steady state of r(0) = (3, 3) cm (notes A4).",
-    "Dead zone: the benchmark's steady voltages go down to 1.05 V, below the 3 V of Remark 4; it is off by default, and on with "
-    "actuator.dead_zone = 3 the run fails as Remark 4 tells (notes S8.1).",
-    "Level floor in the laws: 0.01 cm, so that roots and gradients stay finite when a tank runs dry (notes A7).",
-    "Rims: levels may rise past 30 cm, so that the limit on max_level is felt; plant.overflow = true makes them physics.",
-    "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46) lacks (notes S4.4), the second takes the "
-    "exact constrained minimiser of the paper's cost instead of clipping (notes S4.5).",
+    (
+        "Dead zone: the benchmark's steady voltages go down to 1.05 V, below the 3 V of Remark 4;"
+        " it is off by default, and on with actuator.dead_zone = 3 the run fails as Remark 4 tells"
+        " (notes S8.1)."
+    ),
+    (
+        "Level floor in the laws: 0.01 cm, so that roots and gradients stay finite when a tank runs"
+        " dry (notes A7)."
+    ),
+    (
+        "Rims: levels may rise past 30 cm, so that the limit on max_level is felt; plant.overflow ="
+        " true makes them physics."
+    ),
+    (
+        "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46)"
+        " lacks (notes S4.4), the second takes the exact constrained minimiser of the paper's cost"
+        " instead of clipping (notes S4.5)."
+    ),
     "Kp is printed in cm^3/V; its dimension is cm^3/(s V) (E2).",
 )
 
@@ -64,7 +92,10 @@ PUBLISHED = {
     "actuator.high": Published(12.0, "V", "eq. (9)"),
     "plant.rim": Published(30.0, "cm", "sec. 5"),
     "tracking error": Published(
-        "'negligible' (NGPC), 'more important' (backstepping)", "", "sec. 5.1, 5.3, Table 2", reason="no numbers are printed"
+        "'negligible' (NGPC), 'more important' (backstepping)",
+        "",
+        "sec. 5.1, 5.3, Table 2",
+        reason="no numbers are printed",
     ),
     "levels below the rims": Published(
         "levels 'do not exceed 30 cm'",
@@ -93,7 +124,11 @@ def law(kind, model):
     if kind == "ngpc":
         return NGPC(model=model, Tp=number(11.0), level_floor=number(0.01))
     return Backstepping(
-        model=model, k=number(0.03), k1=number(0.088), level_floor=number(0.01), reference_rates=kind == "backstepping-ff"
+        model=model,
+        k=number(0.03),
+        k1=number(0.088),
+        level_floor=number(0.01),
+        reference_rates=kind == "backstepping-ff",
     )
 
 
@@ -146,9 +181,12 @@ def measured(run):
         ),
         "levels below the rims": Claim(
             "reproduced" if highest <= 30 else "not reproduced",
-            f"tank 4 rises to {a.x[:, 3].max():.1f} cm (NGPC), {b.x[:, 3].max():.1f} cm (backstepping)",
+            f"tank 4 rises to {a.x[:, 3].max():.1f} cm (NGPC), {b.x[:, 3].max():.1f} cm"
+            " (backstepping)",
         ),
-        "areas as printed": Claim("reproduced" if slow < 1 else "not reproduced", f"total RMS error {slow:.1f} cm (NGPC)"),
+        "areas as printed": Claim(
+            "reproduced" if slow < 1 else "not reproduced", f"total RMS error {slow:.1f} cm (NGPC)"
+        ),
         "dead zone of 3 V": Claim(
             "reproduced" if stuck > 10 * near and d.u.max() == 0 else "partly",
             f"total RMS error {stuck:.1f} cm: the pumps never start",
@@ -182,9 +220,12 @@ def preset():
                     )
     return Preset(
         paper="gouta2015",
-        citation="H. Gouta, S. Hadj Said, F. M'sahli, Model-based Predictive and Backstepping controllers for a state coupled four-tank "
-        "system with bounded control inputs: A comparative study, Journal of the Franklin Institute, 2015, "
-        "doi 10.1016/j.jfranklin.2015.08.004",
+        citation=(
+            "H. Gouta, S. Hadj Said, F. M'sahli, Model-based Predictive and Backstepping"
+            " controllers for a state coupled four-tank system with bounded control inputs: A"
+            " comparative study, Journal of the Franklin Institute, 2015, doi"
+            " 10.1016/j.jfranklin.2015.08.004"
+        ),
         cases=cases,
         published=PUBLISHED,
         measured=measured,

@@ -32,7 +32,12 @@ LAWS = {
     "laguerre": controllers.Laguerre,
     "open-loop": controllers.OpenLoop,
 }
-OBSERVERS = {"direct": Direct, "disturbance": DisturbanceObserver, "kalman": Kalman, "extended-kalman": ExtendedKalman}
+OBSERVERS = {
+    "direct": Direct,
+    "disturbance": DisturbanceObserver,
+    "kalman": Kalman,
+    "extended-kalman": ExtendedKalman,
+}
 REGISTERED = set()
 """Kinds that were added by `register`."""
 
@@ -140,7 +145,9 @@ SIZES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
 
 
 def law_of(table, plant, levels, initial):
-    """The law of a [law] table on `plant`; levels: outputs at t = 0, initial: (m,) inputs before it, what `bias` is where it is left out."""
+    """The law of a [law] table on `plant`; levels: outputs at t = 0, initial: (m,) inputs before
+    it, what `bias` is where it is left out.
+    """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         return _open_loop(table, plant, initial)
     return component("law", table, LAWS, plant, {"bias": _resting(plant, levels, initial)})
@@ -194,16 +201,25 @@ def _value(name, value, field, plant):
             raise InputError(f"{name} = {shortened(value)}: must be one number")
         return array
     if _type_of(field) is tuple:  # tanks, counted from 1 in a file
-        if not (isinstance(value, list) and all(isinstance(i, int) and not isinstance(i, bool) for i in value)):
-            raise InputError(f"{name} = {shortened(value)}: must be a list of tanks, counted from 1")
+        if not (
+            isinstance(value, list)
+            and all(isinstance(i, int) and not isinstance(i, bool) for i in value)
+        ):
+            raise InputError(
+                f"{name} = {shortened(value)}: must be a list of tanks, counted from 1"
+            )
         if not all(1 <= i <= plant.tanks for i in value):
-            raise InputError(f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}")
+            raise InputError(
+                f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}"
+            )
         return tuple(i - 1 for i in value)
     return static_value(name, value, field.metadata, _type_of(field))
 
 
 def _shaped(name, value, meta, plant):
-    """A leaf's value as an array; one number for an array of one entry per pump, tank or output fills it."""
+    """A leaf's value as an array; one number for an array of one entry per pump, tank or output
+    fills it.
+    """
     if not is_numeric(value):
         raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers")
     array = number(value)
@@ -212,10 +228,14 @@ def _shaped(name, value, meta, plant):
 
 
 def size_of(meta, plant):
-    """Number of entries of a leaf that has one per pump, tank or output, by the shape its metadata begins with; None of another."""
+    """Number of entries of a leaf that has one per pump, tank or output, by the shape its metadata
+    begins with; None of another.
+    """
     n, m, outputs = plant.tanks, plant.pumps, len(plant.outputs)
     sizes = dict(zip(SIZES, (m, n, outputs, m, 2, n + outputs)))
-    return next((size for start, size in sizes.items() if meta["doc"].split(")")[0].startswith(start)), None)
+    return next(
+        (size for start, size in sizes.items() if meta["doc"].split(")")[0].startswith(start)), None
+    )
 
 
 def _open_loop(table, plant, initial):
@@ -223,7 +243,11 @@ def _open_loop(table, plant, initial):
     for key in table:
         if key != "kind" and key not in keys:
             raise unknown("key of [law]", key, ["kind", *keys])
-    return controllers.OpenLoop(signal=ramps_of("law", table, ramps(np.asarray(initial).tolist(), [], ramp=0.0), ("pump", "input")))
+    return controllers.OpenLoop(
+        signal=ramps_of(
+            "law", table, ramps(np.asarray(initial).tolist(), [], ramp=0.0), ("pump", "input")
+        )
+    )
 
 
 def _resting(plant, levels, initial):
@@ -242,17 +266,26 @@ def kind_of(part, known):
 
 
 def keys_of(part, known):
-    """[(key, metadata, value)] of a [law] or [observer]; value None of an optional one that is not in use. InputError where it has no name."""
+    """[(key, metadata, value)] of a [law] or [observer]; value None of an optional one that is not
+    in use. InputError where it has no name.
+    """
     kind = kind_of(part, known)
     if kind is None:
         raise InputError(f"its {type(part).__name__} has no name in a rig file")
-    found: list[tuple[str, Any, Any]] = [("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)]
+    found: list[tuple[str, Any, Any]] = [
+        ("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)
+    ]
     if isinstance(part, controllers.OpenLoop):
         if not isinstance(part.signal, Ramps):
             raise InputError("its OpenLoop plays a signal that no rig file describes")
-        values = {k: np.asarray(getattr(part.signal, k)).tolist() for k in ("initial", "ramp", "shape")}
+        values = {
+            k: np.asarray(getattr(part.signal, k)).tolist() for k in ("initial", "ramp", "shape")
+        }
         values["changes"] = changes_of(part.signal)
-        docs = {"initial": PUMPS, "changes": {"unit": "-", "doc": "[time [s], pump (from 1), input] of each change"}}
+        docs = {
+            "initial": PUMPS,
+            "changes": {"unit": "-", "doc": "[time [s], pump (from 1), input] of each change"},
+        }
         return found + [(k, docs.get(k) or meta_of(Ramps, k), values[k]) for k in RAMP_KEYS[:-1]]
     for field in dataclasses.fields(part):
         value, meta = getattr(part, field.name), field.metadata
@@ -262,7 +295,9 @@ def keys_of(part, known):
             if isinstance(value, tuple) and not all(type(i) is int for i in value):
                 named = f"its {type(part).__name__}.{field.name}"
                 raise InputError(f"{named} = {shortened(value)} is no list of tanks")
-            found.append((field.name, meta, [i + 1 for i in value] if isinstance(value, tuple) else value))
+            found.append(
+                (field.name, meta, [i + 1 for i in value] if isinstance(value, tuple) else value)
+            )
     return found
 
 

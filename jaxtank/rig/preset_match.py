@@ -11,11 +11,13 @@ from jaxtank.rig import components, schedule, signals
 
 
 def origin_of(case):
-    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as its own), or (None, ()): of a rig whose
-    tanks have names too, which only a file that describes it tank by tank can say.
+    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as
+    its own), or (None, ()): of a rig whose tanks have names too, which only a file that describes
+    it tank by tank can say.
 
-    Of several, the one with the same law and observer, then of the same name, then with the most static fields in common: its title is
-    the one that the file will show. What a file can say in a table of its own (reference, disturbances, faults) may differ.
+    Of several, the one with the same law and observer, then of the same name, then with the most
+    static fields in common: its title is the one that the file will show. What a file can say in a
+    table of its own (reference, disturbances, faults) may differ.
     """
     if case.names:
         return None, ()
@@ -24,15 +26,21 @@ def origin_of(case):
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
             theirs = structures(other.loop)
-            if mine["rest"] != theirs["rest"] or not _optional(other.loop, ("plant", "sensor", "actuator")) <= _optional(loop):
+            if mine["rest"] != theirs["rest"] or not _optional(
+                other.loop, ("plant", "sensor", "actuator")
+            ) <= _optional(loop):
                 continue
             same = tuple(
                 word
                 for word, field in (("law", "controller"), ("observer", "observer"))
-                if mine[field] == theirs[field] and _optional(other.loop, (field,)) <= _optional(loop)
+                if mine[field] == theirs[field]
+                and _optional(other.loop, (field,)) <= _optional(loop)
             )
-            if ("law" not in same and components.kind_of(loop.controller, components.LAWS) is None) or (
-                "observer" not in same and components.kind_of(loop.observer, components.OBSERVERS) is None
+            if (
+                "law" not in same and components.kind_of(loop.controller, components.LAWS) is None
+            ) or (
+                "observer" not in same
+                and components.kind_of(loop.observer, components.OBSERVERS) is None
             ):
                 continue
             common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
@@ -43,7 +51,9 @@ def origin_of(case):
 
 
 def _statics(loop):
-    return [value for _, value, _ in walk(loop, kind="static")] + [np.asarray(getattr(loop.plant, "area", ())).tolist()]
+    return [value for _, value, _ in walk(loop, kind="static")] + [
+        np.asarray(getattr(loop.plant, "area", ())).tolist()
+    ]
 
 
 def _optional(loop, fields=None):
@@ -53,7 +63,9 @@ def _optional(loop, fields=None):
 
 
 def structures(loop):
-    """Pytree structures of law, observer and the rest, with what a rig file can set made alike: they compare by their components."""
+    """Pytree structures of law, observer and the rest, with what a rig file can set made alike:
+    they compare by their components.
+    """
 
     def settle(tree):
         changed = {}

@@ -22,7 +22,9 @@ class Key(NamedTuple):
 
 
 class Section(NamedTuple):
-    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above it; on: False: commented out as a whole."""
+    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above
+    it; on: False: commented out as a whole.
+    """
 
     title: str
     keys: list
@@ -31,9 +33,13 @@ class Section(NamedTuple):
 
 
 def lines_of(section):
-    """The lines of a Section in a terse file: its title, and "name = value  # [unit] what it is" of every key that is on."""
+    """The lines of a Section in a terse file: its title, and "name = value  # [unit] what it is" of
+    every key that is on.
+    """
     return [section.title] * bool(section.title) + [
-        f"{k.name} = {toml(k.value)}" + (f"  # {_note(k.meta)}" if _note(k.meta) else "") for k in section.keys if k.on
+        f"{k.name} = {toml(k.value)}" + (f"  # {_note(k.meta)}" if _note(k.meta) else "")
+        for k in section.keys
+        if k.on
     ]
 
 
@@ -43,7 +49,10 @@ def _note(meta):
 
 def keys_of(found, units, on=True):
     """Keys of [(name, metadata, value)], units as the rig counts."""
-    return [Key(name, value, {**meta, "unit": local(meta["unit"], units)}, on) for name, meta, value in found]
+    return [
+        Key(name, value, {**meta, "unit": local(meta["unit"], units)}, on)
+        for name, meta, value in found
+    ]
 
 
 SMALL_INT = (int, np.integer)
@@ -67,27 +76,39 @@ def toml(value: Any) -> str:
 
 
 def name_of(where, value):
-    """`value` if it can be a name: a text of one line without control characters, which a terminal would obey."""
+    """`value` if it can be a name: a text of one line without control characters, which a terminal
+    would obey.
+    """
     if not isinstance(value, str) or not value.isprintable():
-        raise InputError(f"{where} = {shortened(value)}: must be a text" + " of printable characters" * isinstance(value, str))
+        raise InputError(
+            f"{where} = {shortened(value)}: must be a text"
+            + " of printable characters" * isinstance(value, str)
+        )
     return value
 
 
 def is_numeric(value):
-    """True for a number that a float can hold, and for lists of such numbers and arrays of a regular shape."""
+    """True for a number that a float can hold, and for lists of such numbers and arrays of a
+    regular shape.
+    """
     if isinstance(value, (np.ndarray, np.generic)):
         return np.issubdtype(value.dtype, np.number)
     if isinstance(value, (list, tuple)):
         return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
     try:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and float(value) is not None
+        return (
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and float(value) is not None
+        )
     except OverflowError:
         return False
 
 
 def is_finite(value):
-    """True for what `is_numeric` is true for, if every number is finite. A whole number is taken as the float next to it: numpy's own
-    answer to one of 2^64 and more is a TypeError."""
+    """True for what `is_numeric` is true for, if every number is finite. A whole number is taken as
+    the float next to it: numpy's own answer to one of 2^64 and more is a TypeError.
+    """
     return is_numeric(value) and bool(np.all(np.isfinite(np.asarray(value, dtype=float))))
 
 
@@ -99,10 +120,18 @@ def plain(name, value):
 
 
 def static_value(name, value, meta, kind):
-    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is another, out of range, or no choice."""
+    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is
+    another, out of range, or no choice.
+    """
     if meta["choices"] is not None:
-        if isinstance(value, (list, dict)) or value not in meta["choices"] or isinstance(value, bool) != (kind is bool):
-            raise InputError(f"{name} = {shortened(value)}: must be one of {_choices(meta['choices'])}")
+        if (
+            isinstance(value, (list, dict))
+            or value not in meta["choices"]
+            or isinstance(value, bool) != (kind is bool)
+        ):
+            raise InputError(
+                f"{name} = {shortened(value)}: must be one of {_choices(meta['choices'])}"
+            )
         return value
     if kind is str:  # a text of which the component itself knows what it may be
         if not isinstance(value, str):
@@ -125,7 +154,9 @@ def unit(meta):
 
 
 def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another. Empty where all numbers are allowed."""
+    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another.
+    Empty where all numbers are allowed.
+    """
     if meta.get("choices") is not None:
         return " or ".join(toml(c) for c in meta["choices"])
     low, high = meta.get("low"), meta.get("high")

@@ -1,4 +1,6 @@
-"""What moves a rig besides its law, as tables: [reference], [reference.sine], [disturbance], [[pour]], [[fault]]; and a law's [[change]]s."""
+"""What moves a rig besides its law, as tables: [reference], [reference.sine], [disturbance],
+[[pour]], [[fault]]; and a law's [[change]]s.
+"""
 
 import dataclasses
 
@@ -25,8 +27,14 @@ def meta_of(cls, name):
 
 
 def steps(reference):
-    """The `Ramps` of a reference that [reference] can describe: itself, or what a sine is added to; None of another."""
-    if isinstance(reference, Sum) and isinstance(reference.first, Ramps) and isinstance(reference.second, Sine):
+    """The `Ramps` of a reference that [reference] can describe: itself, or what a sine is added to;
+    None of another.
+    """
+    if (
+        isinstance(reference, Sum)
+        and isinstance(reference.first, Ramps)
+        and isinstance(reference.second, Sine)
+    ):
         return reference.first
     return reference if isinstance(reference, Ramps) else None
 
@@ -46,32 +54,51 @@ def reference_of(table, old):
 
 
 def ramps_of(where, table, old, words):
-    """The Ramps of the keys of RAMP_KEYS in `table`, called `where` in errors; words: what a channel and its value are called."""
+    """The Ramps of the keys of RAMP_KEYS in `table`, called `where` in errors; words: what a
+    channel and its value are called.
+    """
     channels = np.size(old.initial)
     initial = table.get("initial", np.asarray(old.initial).tolist())
     if not (is_finite(initial) and np.shape(initial) == (channels,)):
-        raise InputError(f"{where}.initial = {shortened(initial)}: must be a list of {channels} finite {words[1]}s")
+        raise InputError(
+            f"{where}.initial = {shortened(initial)}: must be a list of {channels} finite"
+            f" {words[1]}s"
+        )
     changes = table.get("changes", changes_of(old))
     form = f"[time [s], {words[0]} from 1 to {channels}, {words[1]}]"
     if not isinstance(changes, list):
         raise InputError(f"{where}.changes = {shortened(changes)}: must be a list of {form}")
     for change in changes:
-        good = isinstance(change, list) and len(change) == 3 and all(np.ndim(v) == 0 and is_finite(v) for v in change)
+        good = (
+            isinstance(change, list)
+            and len(change) == 3
+            and all(np.ndim(v) == 0 and is_finite(v) for v in change)
+        )
         if not (good and isinstance(change[1], int) and 1 <= change[1] <= channels):
-            raise InputError(f"{where}.changes has {shortened(change)}: must be {form}, finite numbers")
+            raise InputError(
+                f"{where}.changes has {shortened(change)}: must be {form}, finite numbers"
+            )
     for before, after in zip(changes, changes[1:]):
         if after[0] < before[0]:
-            raise InputError(f"{where}.changes has {shortened(after)} after {shortened(before)}: must be in order of time")
+            raise InputError(
+                f"{where}.changes has {shortened(after)} after {shortened(before)}: must be in"
+                " order of time"
+            )
     taken = set()
     for time, channel, _ in changes:
         if (time, channel) in taken:
-            raise InputError(f"{where}.changes has two changes of {words[0]} {channel} at {time:g} s: must be one")
+            raise InputError(
+                f"{where}.changes has two changes of {words[0]} {channel} at {time:g} s: must"
+                " be one"
+            )
         taken.add((time, channel))
     ramp = plain(f"{where}.ramp", table.get("ramp", old.ramp))
     check_value(f"{where}.ramp", ramp, meta_of(Ramps, "ramp"))
     band = plain(f"{where}.band", table.get("band", old.band))
     check_value(f"{where}.band", band, meta_of(Ramps, "band"))
-    shape = static_value(f"{where}.shape", table.get("shape", old.shape), meta_of(Ramps, "shape"), str)
+    shape = static_value(
+        f"{where}.shape", table.get("shape", old.shape), meta_of(Ramps, "shape"), str
+    )
     return ramps(initial, [(float(t), i - 1, float(v)) for t, i, v in changes], ramp, shape, band)
 
 
@@ -96,7 +123,9 @@ def _sine(table, old, channels):
             raise InputError(f"[reference.sine] needs {key}")
     output = values.pop("output")
     if isinstance(output, bool) or not isinstance(output, int) or not 1 <= output <= channels:
-        raise InputError(f"reference.sine.output = {shortened(output)}: must be an output, from 1 to {channels}")
+        raise InputError(
+            f"reference.sine.output = {shortened(output)}: must be an output, from 1 to {channels}"
+        )
     for key, value in values.items():
         values[key] = plain(f"reference.sine.{key}", value)
         check_value(f"reference.sine.{key}", values[key], meta_of(Sine, key))
@@ -107,11 +136,16 @@ def _sine(table, old, channels):
 def sine_keys(sine):
     """[(key of [reference.sine], metadata, value)] of a Sine."""
     named = [(k, meta_of(Sine, k), np.asarray(getattr(sine, k)).tolist()) for k in SINE_KEYS[:-1]]
-    return [*named, ("output", {"unit": "-", "doc": "the output it moves, from 1"}, sine.channel + 1)]
+    return [
+        *named,
+        ("output", {"unit": "-", "doc": "the output it moves, from 1"}, sine.channel + 1),
+    ]
 
 
 def disturbance_of(table, loop, tank):
-    """What [disturbance] and [[pour]] of a rig file's `table` make of a loop's disturbance; tank: index of a tank's name or number."""
+    """What [disturbance] and [[pour]] of a rig file's `table` make of a loop's disturbance; tank:
+    index of a tank's name or number.
+    """
     old, plant = loop.disturbance, loop.plant
     more = table.get("disturbance", {})
     for key in more:
@@ -123,24 +157,42 @@ def disturbance_of(table, loop, tank):
         inflow = more["inflow"]
         if not (is_finite(inflow) and np.shape(inflow) == (plant.tanks,)):
             raise InputError(
-                f"disturbance.inflow = {shortened(inflow)}: must be a list of {plant.tanks} finite flows, one per tank"
+                f"disturbance.inflow = {shortened(inflow)}: must be a list of {plant.tanks} finite"
+                " flows, one per tank"
             )
         old = Constant(level=number(inflow))
     if "pour" in table:
         if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0) and table["pour"]:
-            raise InputError("[[pour]]: this rig has a steady inflow already, and a rig file can have one of the two")
+            raise InputError(
+                "[[pour]]: this rig has a steady inflow already, and a rig file can have one of"
+                " the two"
+            )
         entries = [_entry("pour", i, e, POUR, ("tank",)) for i, e in enumerate(table["pour"])]
-        events = [(e["time"], e["duration"], tank(e["tank"], f"pour {i + 1}: tank"), e["volume"]) for i, e in enumerate(entries)]
+        events = [
+            (e["time"], e["duration"], tank(e["tank"], f"pour {i + 1}: tank"), e["volume"])
+            for i, e in enumerate(entries)
+        ]
         for i, e in enumerate(entries):
             for key, meta, _ in pour_keys(None, None, None, None)[:2]:
-                check_value(f"pour {i + 1} into tank {shortened(e['tank'])}: {key}", e[key], {"high": None, **meta})
+                check_value(
+                    f"pour {i + 1} into tank {shortened(e['tank'])}: {key}",
+                    e[key],
+                    {"high": None, **meta},
+                )
         if entries or isinstance(old, Pours):
-            old = pours(plant.tanks, [(float(a), float(b), c, float(d)) for a, b, c, d in events]) if entries else None
+            old = (
+                pours(plant.tanks, [(float(a), float(b), c, float(d)) for a, b, c, d in events])
+                if entries
+                else None
+            )
     if "window" in more:
         window = plain("disturbance.window", more["window"])
         check_value("disturbance.window", window, meta_of(Pours, "window"))
         if not isinstance(old, Pours):
-            raise InputError("disturbance.window: is how long tanks are watched after a [[pour]], and there is none")
+            raise InputError(
+                "disturbance.window: is how long tanks are watched after a [[pour]], and there is"
+                " none"
+            )
         old = dataclasses.replace(old, window=window)
     return old
 
@@ -151,7 +203,10 @@ def faults_of(entries, plant):
     for i, e in enumerate(entries):
         e = _entry("fault", i, e, FAULT, ("of",))
         if not isinstance(e["of"], str):
-            raise InputError(f'fault {i + 1}: of = {shortened(e["of"])}: must name an entry of the plant, as "pump_gain[0]"')
+            raise InputError(
+                f"fault {i + 1}: of = {shortened(e['of'])}: must name an entry of the plant, as"
+                ' "pump_gain[0]"'
+            )
         check_value(f"fault {i + 1}: factor", float(e["factor"]), meta_of(Faults, "factor"))
         values = (float(e[k]) for k in ("start", "end", "factor", "extra"))
         try:
@@ -163,7 +218,9 @@ def faults_of(entries, plant):
 
 
 def _entry(kind, index, entry, fields, free):
-    """`entry` of [[kind]] with what it leaves out; InputError for an unknown key, one that is missing, and what is no number."""
+    """`entry` of [[kind]] with what it leaves out; InputError for an unknown key, one that is
+    missing, and what is no number.
+    """
     where = f"{kind} {index + 1}"
     if not isinstance(entry, dict):
         raise InputError(f"{where} = {shortened(entry)}: must be a table")
@@ -179,7 +236,9 @@ def _entry(kind, index, entry, fields, free):
 
 
 def disturbance_tables(disturbance):
-    """[(title, [(key, metadata, value)])] of a disturbance that a rig file can describe, None of another."""
+    """[(title, [(key, metadata, value)])] of a disturbance that a rig file can describe, None of
+    another.
+    """
     if disturbance is None:
         return []
     if isinstance(disturbance, Constant):
@@ -187,7 +246,9 @@ def disturbance_tables(disturbance):
     if not isinstance(disturbance, Pours):
         return None
     found = [("[disturbance]", [("window", meta_of(Pours, "window"), disturbance.window)])]
-    for (time, duration, tank), volume in zip(disturbance.events, np.asarray(disturbance.volume).tolist()):
+    for (time, duration, tank), volume in zip(
+        disturbance.events, np.asarray(disturbance.volume).tolist()
+    ):
         found.append(("[[pour]]", pour_keys(time, duration, tank + 1, volume)))
     return found
 
@@ -196,7 +257,11 @@ def pour_keys(time, duration, tank, volume):
     """[(key, metadata, value)] of a [[pour]]."""
     return [
         ("time", {"unit": "s", "doc": "when it begins", "low": 0.0, "strict": False}, time),
-        ("duration", {"unit": "s", "doc": "how long it lasts", "low": 0.0, "strict": True}, duration),
+        (
+            "duration",
+            {"unit": "s", "doc": "how long it lasts", "low": 0.0, "strict": True},
+            duration,
+        ),
         ("tank", {"unit": "-", "doc": "the tank, from 1"}, tank),
         ("volume", {"unit": "cm^3", "doc": "what is poured in all; negative: taken out"}, volume),
     ]
@@ -208,7 +273,11 @@ def fault_keys(of, start, end, factor, extra):
         ("of", {"unit": "-", "doc": "the entry of the plant that changes, counted from 0"}, of),
         ("start", {"unit": "s", "doc": "when it begins", "low": 0.0, "strict": False}, start),
         ("end", {"unit": "s", "doc": "when it is over"}, end),
-        ("factor", {"unit": "-", "doc": "what the entry is multiplied by", "low": 0.0, "strict": False}, factor),
+        (
+            "factor",
+            {"unit": "-", "doc": "what the entry is multiplied by", "low": 0.0, "strict": False},
+            factor,
+        ),
         ("extra", {"unit": "-", "doc": "what is added to it, in its own unit"}, extra),
     ]
 
@@ -218,7 +287,13 @@ def fault_tables(found):
     if found is None:
         return []
     rows = zip(found.windows, np.asarray(found.factor).tolist(), np.asarray(found.extra).tolist())
-    return [("[[fault]]", fault_keys(of, start, end, factor, extra)) for (of, start, end), factor, extra in rows]
+    return [
+        ("[[fault]]", fault_keys(of, start, end, factor, extra))
+        for (of, start, end), factor, extra in rows
+    ]
 
 
-INFLOW = {"unit": "cm^3/s", "doc": "(n,) steady inflow of each tank that no pump brings; negative: a leak"}
+INFLOW = {
+    "unit": "cm^3/s",
+    "doc": "(n,) steady inflow of each tank that no pump brings; negative: a leak",
+}

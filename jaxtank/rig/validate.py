@@ -1,4 +1,6 @@
-"""Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain, scenarios."""
+"""Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain,
+scenarios.
+"""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -11,7 +13,15 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import check_value, describe, get_value, is_component, shortened, split_index, walk
+from jaxtank.core.tree import (
+    check_value,
+    describe,
+    get_value,
+    is_component,
+    shortened,
+    split_index,
+    walk,
+)
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures.catalogue import check_names, entries
@@ -25,9 +35,11 @@ from jaxtank.signals.setpoints import Ramps
 
 
 def doubts(case: Case) -> list[str]:
-    """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours after the end of the run, changes
-    that overlap, levels and setpoints above the rim, pumps that start outside their limits, models
-    that differ from the plant. (Steps that are too long: `step_length`.)"""
+    """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours
+    after the end of the run, changes that overlap, levels and setpoints above the rim, pumps that
+    start outside their limits, models that differ from the plant. (Steps that are too long:
+    `step_length`.)
+    """
     loop, (length, drive) = case.loop, case.loop.units
     found, end, rim = clock_doubts(case.clock), case.clock.duration, np.asarray(loop.plant.rim)
     reference, bank = steps(loop.reference), loop.actuator
@@ -41,26 +53,42 @@ def doubts(case: Case) -> list[str]:
         over[i] = t + ramp
     if early:
         found.append(
-            f"reference: {len(early)} of {len(events)} changes begin before the one before is over (ramp {ramp:g} s), the first "
-            f"of output {early[0][0] + 1} at {early[0][1]:g} s: each starts from where that one has got to"
+            f"reference: {len(early)} of {len(events)} changes begin before the one before is over"
+            f" (ramp {ramp:g} s), the first of output {early[0][0] + 1} at {early[0][1]:g} s: each"
+            " starts from where that one has got to"
         )
-    lost = "what is above it is lost at once" if loop.plant.overflow else "rims are limits here and not physics"
+    lost = (
+        "what is above it is lost at once"
+        if loop.plant.overflow
+        else "rims are limits here and not physics"
+    )
     for i, level in enumerate(np.asarray(loop.x0)):
         if level > rim[i]:
-            found.append(f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g} {length}: {lost}")
+            found.append(
+                f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g}"
+                f" {length}: {lost}"
+            )
     never = "a level cannot get there" if loop.plant.overflow else lost
     for i, tank in enumerate(loop.plant.outputs):
         if reference is None:
             break
-        asked = [reference.initial[i], *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i)]
+        asked = [
+            reference.initial[i],
+            *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i),
+        ]
         if max(asked) > rim[tank]:
             found.append(
-                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of {_tank(case, tank)} at "
-                f"{rim[tank]:g} {length}: {never}"
+                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of"
+                f" {_tank(case, tank)} at {rim[tank]:g} {length}: {never}"
             )
-    for j, (low, volts, high) in enumerate(zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))):
+    for j, (low, volts, high) in enumerate(
+        zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))
+    ):
         if not low <= volts <= high:
-            found.append(f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of {low:g} and {high:g} {drive}")
+            found.append(
+                f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
+                f" {low:g} and {high:g} {drive}"
+            )
     return [*found, *model_doubts(case)]
 
 
@@ -69,8 +97,8 @@ def model_doubts(case: Case) -> list[str]:
     the plant's by more than its uncertainty.
 
     The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
-    but rounding where neither has the parameter. Rims count only in a model in which they are physics,
-    and no model that its law does not read (PID without feed-forward).
+    but rounding where neither has the parameter. Rims count only in a model in which they are
+    physics, and no model that its law does not read (PID without feed-forward).
     """
     found, plant = [], case.loop.plant
     for holder in ("controller", "observer"):
@@ -93,9 +121,10 @@ def model_doubts(case: Case) -> list[str]:
                 unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
                 here = f"{inner}model.{name}"
                 found.append(
-                    f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the "
-                    f"model of the {holder} differs from the plant{words}; unless that is meant, set "
-                    f"{here} = {_listed(own)} too (in a rig file a model that is left out follows the plant)"
+                    f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the"
+                    f" model of the {holder} differs from the plant{words}; unless that is meant,"
+                    f" set {here} = {_listed(own)} too (in a rig file a model that is left out"
+                    " follows the plant)"
                 )
     return found
 
@@ -121,12 +150,15 @@ def _listed(value):
 
 
 def clock_doubts(clock: Clock) -> list[str]:
-    """Sentences on a clock: where the run does not end when it is asked to, for it is made of whole samples."""
+    """Sentences on a clock: where the run does not end when it is asked to, for it is made of whole
+    samples.
+    """
     end = (clock.samples - 1) * clock.dt
     if abs(end - clock.duration) <= 1e-6 * clock.dt:
         return []
     return [
-        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt = {clock.dt:.9g} s: the run ends at {end:.9g} s"
+        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt ="
+        f" {clock.dt:.9g} s: the run ends at {end:.9g} s"
     ]
 
 
@@ -138,22 +170,29 @@ def _tank(case, i):
 def _late(found, what, times, end):
     late = [t for t in times if t >= end]
     if late:
-        found.append(f"{len(late)} of {len(times)} {what} come after the end of the run at {end:g} s")
+        found.append(
+            f"{len(late)} of {len(times)} {what} come after the end of the run at {end:g} s"
+        )
 
 
 SCENARIO_KEYS = ("name", "values", "seed", "weight")
 
 
 def check(case: Case) -> Case:
-    """`case`, after input validation: the loop and clock can be run, and every plateau of the reference has a steady state."""
-    lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))  # a key will be given where there is noise
+    """`case`, after input validation: the loop and clock can be run, and every plateau of the
+    reference has a steady state.
+    """
+    # a key will be given where there is noise
+    lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
     if case.reachable and (why := unreachable(case)):
         raise EquilibriumError(why)
     return case
 
 
 def unreachable(case: Case) -> str | None:
-    """Which plateau of the reference has no steady state on this plant, and why, in a sentence; None where all of them have one."""
+    """Which plateau of the reference has no steady state on this plant, and why, in a sentence;
+    None where all of them have one.
+    """
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
         for values in reference.plateaus(case.clock.duration):
@@ -169,29 +208,35 @@ def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str,
     for name, share in uncertain.items():
         get_value(loop, name)
         if not (is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
-            raise InputError(f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1")
+            raise InputError(
+                f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1"
+            )
     return {name: float(share) for name, share in uncertain.items()}
 
 
 def uncovered(
-    loop: ClosedLoop,
-    name: str,
-    share: float,
-    covered: Iterable[str],
+    loop: ClosedLoop, name: str, share: float, covered: Iterable[str]
 ) -> dict[str, float]:
-    """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry where that is part of an array; a
-    share of nothing is left out."""
+    """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry
+    where that is part of an array; a share of nothing is left out.
+    """
     if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
         return {name: share}
     if "[" in name:
         return {} if name in covered else {name: share}
     value = np.asarray(get_value(loop, name))
-    entries = [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(value.shape) if value[i] != 0] if value.shape else []
+    entries = (
+        [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(value.shape) if value[i] != 0]
+        if value.shape
+        else []
+    )
     return {n: share for n in entries if n not in covered}
 
 
 def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """`limits` as a dict, if every one is a measure with a finite number, one for each of its entries, or "rim" for max_level."""
+    """`limits` as a dict, if every one is a measure with a finite number, one for each of its
+    entries, or "rim" for max_level.
+    """
     check_names(limits)
     for measure, value in limits.items():
         count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
@@ -200,18 +245,27 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
         if not (is_finite(value) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
-            raise InputError(f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}")
+            raise InputError(
+                f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}"
+            )
         if measure == "max_level" and np.min(value) < 0:
-            raise InputError(f"limit {measure} = {shortened(value)} {unit}: must be at least 0 {unit}, no level is below empty")
+            raise InputError(
+                f"limit {measure} = {shortened(value)} {unit}: must be at least 0 {unit}, no level"
+                " is below empty"
+            )
     return dict(limits)
 
 
 def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
-    """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one of them above."""
+    """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one
+    of them above.
+    """
     check_names(objective)
     for measure, weight in objective.items():
         if not (is_finite(weight) and np.ndim(weight) == 0 and weight >= 0):
-            raise InputError(f"objective {measure} = {shortened(weight)}: must be a finite weight at or above 0")
+            raise InputError(
+                f"objective {measure} = {shortened(weight)}: must be a finite weight at or above 0"
+            )
     if not any(objective.values()):
         raise InputError("the objective has no measure with a weight above 0")
     return {measure: float(weight) for measure, weight in objective.items()}
@@ -224,12 +278,17 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
     else:
         meta = describe(loop, name)
     if meta["kind"] == "static":
-        raise InputError(f"free {name}: cannot be tuned, it is part of the compiled program and not a number with a derivative")
+        raise InputError(
+            f"free {name}: cannot be tuned, it is part of the compiled program and not a number"
+            " with a derivative"
+        )
     schedule.check_not_scheduled(loop, name)
     get_value(loop, name)
     unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError(f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}")
+        raise InputError(
+            f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}"
+        )
     for end in (low, high):
         for row in meta.get("rows") or (meta,):  # an array whose rows are different things
             check_value(f"free {name}", end, row)
@@ -239,12 +298,21 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
 
 
 def free_of(loop, table):
-    """{name: Free} of a [free] table. A gain that a schedule gives is free at every knot, and other names of the scheduled law are found."""
+    """{name: Free} of a [free] table. A gain that a schedule gives is free at every knot, and other
+    names of the scheduled law are found.
+    """
     found = {}
     for name, spec in table.items():
-        good = isinstance(spec, list) and len(spec) in (2, 3) and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
+        good = (
+            isinstance(spec, list)
+            and len(spec) in (2, 3)
+            and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
+        )
         if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
-            raise InputError(f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or "linear"]')
+            raise InputError(
+                f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or'
+                ' "linear"]'
+            )
         for own in schedule.names_of(loop, name):
             found[own] = check_free(loop, own, *spec)
     return found
@@ -263,9 +331,14 @@ def scenario(case, entry, index):
     if not isinstance(values, dict):
         raise InputError(f"scenario {name!r}: values = {shortened(values)}: must be a table")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(f"scenario {name!r}: seed = {shortened(seed)} must be a whole number from 0 to {2**31 - 1}")
+        raise InputError(
+            f"scenario {name!r}: seed = {shortened(seed)} must be a whole number from 0 to"
+            f" {2**31 - 1}"
+        )
     if not (is_finite(weight) and np.ndim(weight) == 0 and weight > 0):
-        raise InputError(f"scenario {name!r}: weight = {shortened(weight)} must be a finite number above 0")
+        raise InputError(
+            f"scenario {name!r}: weight = {shortened(weight)} must be a finite number above 0"
+        )
     try:
         values = by_dotted_name(values, "scenario.values")
         set_scenario(case, values)
@@ -273,4 +346,9 @@ def scenario(case, entry, index):
         pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
     except InputError as error:
         raise type(error)(f"scenario {name!r}: {error}") from None
-    return Scenario(name, {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}, seed, float(weight))
+    return Scenario(
+        name,
+        {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()},
+        seed,
+        float(weight),
+    )

@@ -11,7 +11,15 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import check_value, describe, get_value, shortened, split_index, walk, with_values
+from jaxtank.core.tree import (
+    check_value,
+    describe,
+    get_value,
+    shortened,
+    split_index,
+    walk,
+    with_values,
+)
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import schedule
 from jaxtank.rig.schema import is_numeric, plain, static_value, unit
@@ -24,17 +32,24 @@ STEADY = ("x0", "actuator.initial", "reference.initial")
 
 _NUMBER = r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _RELATIVE = re.compile(
-    rf"x *(?P<factor>{_NUMBER})|by +(?P<offset>{_NUMBER})|(?P<default>{_NUMBER}) +if zero",
+    rf"x *(?P<factor>{_NUMBER})|by +(?P<offset>{_NUMBER})|(?P<default>{_NUMBER}) +if zero"
 )
 
 
 def by_dotted_name(table, where):
-    """{dotted name: value} of a table in which names may be written without quotation marks: `clock.dt = 0.5` and [values.controller]
-    are tables in tables to TOML. InputError, naming the table `where`, for a name that is given both ways."""
+    """{dotted name: value} of a table in which names may be written without quotation marks:
+    `clock.dt = 0.5` and [values.controller] are tables in tables to TOML. InputError, naming the
+    table `where`, for a name that is given both ways.
+    """
     found = {}
     for key, value in table.items():
-        nested = isinstance(value, dict) and value and "." not in key  # a name that is quoted is whole: its value is no table
-        inner = {f"{key}.{k}": v for k, v in by_dotted_name(value, where).items()} if nested else {key: value}
+        # a name that is quoted is whole: its value is no table
+        nested = isinstance(value, dict) and value and "." not in key
+        inner = (
+            {f"{key}.{k}": v for k, v in by_dotted_name(value, where).items()}
+            if nested
+            else {key: value}
+        )
         for name in inner:
             if name in found:
                 raise InputError(f"[{where}] {name} is given twice")
@@ -45,8 +60,8 @@ def by_dotted_name(table, where):
 def set_values(case: Case, values: Mapping[str, Any]) -> Case:
     """A copy of `case` with leaves, static fields and clock fields set by dotted name.
 
-    values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with the nearest), a value of the wrong
-    kind or shape, and a value out of range.
+    values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with
+    the nearest), a value of the wrong kind or shape, and a value out of range.
     """
     clock = {name: value for name, value in values.items() if name.startswith("clock.")}
     if clock:
@@ -61,7 +76,9 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
             case = case.replace(loop=_set_static(case.loop, name, name.split("."), value, meta))
             continue
         if not is_numeric(value):
-            raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}")
+            raise InputError(
+                f"{name} = {shortened(value)}: must be a number or a list of numbers{unit(meta)}"
+            )
         schedule.check_not_scheduled(case.loop, name)
         loop = with_values(case.loop, {name: value})
         check_value(name, get_value(loop, name), meta)
@@ -98,8 +115,8 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
     ----------
     case : Case
     values : {dotted name: value} as in `set_values`, or a text for a number: "x1.3" (times 1.3),
-        "by -0.5" (0.5 less, in the unit of the parameter), "0.02 if zero" (0.02 where the case has 0
-        in every entry, else the case's own), and for x0, actuator.initial and reference.initial
+        "by -0.5" (0.5 less, in the unit of the parameter), "0.02 if zero" (0.02 where the case has
+        0 in every entry, else the case's own), and for x0, actuator.initial and reference.initial
         "steady" (the steady state of the case's plant at the setpoints of t = 0)
 
     Raises
@@ -209,8 +226,10 @@ def _meta(case, name):
 
 
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
-    """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What the case has by name is set before the
-    schedule is made, which starts from it; what only the scheduled case has, as controller.values, after."""
+    """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What
+    the case has by name is set before the schedule is made, which starts from it; what only the
+    scheduled case has, as controller.values, after.
+    """
     if table:
         before, values = schedule.known(case.loop, values)
         case = schedule.from_table(set_values(case, before), table)
@@ -244,8 +263,12 @@ def _set_clock(clock, values):
 
 def _set_static(tree, name, path, value, meta):
     if len(path) > 1:
-        return dataclasses.replace(tree, **{path[0]: _set_static(getattr(tree, path[0]), name, path[1:], value, meta)})
+        return dataclasses.replace(
+            tree, **{path[0]: _set_static(getattr(tree, path[0]), name, path[1:], value, meta)}
+        )
     old = getattr(tree, path[0])
     if isinstance(old, tuple):
-        raise InputError(f"{name} is the topology of the rig and cannot be set: choose another case")
+        raise InputError(
+            f"{name} is the topology of the rig and cannot be set: choose another case"
+        )
     return dataclasses.replace(tree, **{path[0]: static_value(name, value, meta, type(old))})

@@ -1,4 +1,6 @@
-"""From a Case to a rig file: terse (`dump`), complete with every key that can be set (`complete`), or what differs from a preset (`short`)."""
+"""From a Case to a rig file: terse (`dump`), complete with every key that can be set (`complete`),
+or what differs from a preset (`short`).
+"""
 
 import textwrap
 from pathlib import Path
@@ -15,9 +17,11 @@ SHORT = ("[limits]", "[free]", "[objective]")
 
 
 def dump(case: Case, tankwise: bool = False) -> str:
-    """The rig file of `case` as text: every leaf, every static field that a file may set, what is tuned and what is uncertain.
+    """The rig file of `case` as text: every leaf, every static field that a file may set, what is
+    tuned and what is uncertain.
 
-    tankwise: described tank by tank even where a preset has the same rig. Raises InputError for a case that no file can describe.
+    tankwise: described tank by tank even where a preset has the same rig. Raises InputError for a
+        case that no file can describe.
     """
     return _text([lines_of(s) for s in sections(case, tankwise) if s.on])
 
@@ -28,19 +32,27 @@ def save(case: Case, path: str | Path) -> None:
 
 
 def complete(case: Case, tankwise: bool = False) -> str:
-    """`dump` with every other key that can be set, and every table that could be there, commented out; each key below its unit, range
-    and meaning. A line that begins with "#" and no space is one that may be used as it stands; those of a table go together."""
+    """`dump` with every other key that can be set, and every table that could be there, commented
+    out; each key below its unit, range and meaning. A line that begins with "#" and no space is one
+    that may be used as it stands; those of a table go together.
+    """
     return _text([HEAD.splitlines()] + [_commented(s) for s in sections(case, tankwise)])
 
 
 def short(case: Case) -> str:
-    """What differs from the preset that `case` came from, and what is tuned; `complete` where there is no preset."""
+    """What differs from the preset that `case` came from, and what is tuned; `complete` where there
+    is no preset.
+    """
     origin, _ = origin_of(case)
     if origin is None:
         return complete(case)
     theirs, mine = sections(presets.find(origin.name)), sections(case)
     plain, same = {line for s in theirs for line in lines_of(s)}, _same_tables(mine, theirs)
-    found, wanted = [], {toml(n).split("[")[0].strip('"') for n in case.free} | {"clock.dt", "clock.duration", "sensor.noise"}
+    found, wanted = (
+        [],
+        {toml(n).split("[")[0].strip('"') for n in case.free}
+        | {"clock.dt", "clock.duration", "sensor.noise"},
+    )
     inside = False
     for s in mine:
         inside = s.title == "[values]" or (inside and not s.title)
@@ -52,11 +64,18 @@ def short(case: Case) -> str:
                 found.append(_commented(s._replace(keys=keys, prose=())))
         elif s.on and (not s.title or s.title in SHORT or s.title not in same):
             found.append(_commented(s._replace(prose=(), keys=[k for k in s.keys if k.on])))
-    return _text([[f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"], *found])
+    return _text(
+        [
+            [f"# {origin.title}; `jaxtank init {origin.name}` without --short prints every key"],
+            *found,
+        ]
+    )
 
 
 def _same_tables(mine, theirs):
-    """Titles of the tables that two files have alike, those of a list in the same number: an empty [uncertain] is not a preset's."""
+    """Titles of the tables that two files have alike, those of a list in the same number: an empty
+    [uncertain] is not a preset's.
+    """
     tables = [{}, {}]
     for found, sections_ in zip(tables, (mine, theirs)):
         for s in sections_:
@@ -69,7 +88,11 @@ def _text(blocks):
     """Blocks of lines as text, an empty line before each one that begins a table."""
     lines = []
     for block in blocks:
-        starts = next((line for line in block if not line.startswith("# ")), "").lstrip("#").startswith("[")
+        starts = (
+            next((line for line in block if not line.startswith("# ")), "")
+            .lstrip("#")
+            .startswith("[")
+        )
         lines += ["", *block] if lines and starts else block
     return "\n".join(lines) + "\n"
 

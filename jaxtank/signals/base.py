@@ -20,8 +20,10 @@ class Signal(abc.ABC):
 
     @abc.abstractmethod
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
-        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for a Clock. A signal whose every sample
-        follows from `sample_times(clock)` alone may be marked `pieces.pointwise`: a long run then asks for it piece by piece."""
+        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for
+        a Clock. A signal whose every sample follows from `sample_times(clock)` alone may be marked
+        `pieces.pointwise`: a long run then asks for it piece by piece.
+        """
 
 
 @component
@@ -29,7 +31,9 @@ class Constant(Signal):
     """A signal that does not change."""
 
     level: np.ndarray = leaf(
-        "-", "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a disturbance"
+        "-",
+        "(channels,) value, in the unit of what it stands for: a level of a setpoint, a flow of a"
+        " disturbance",
     )
 
     @property
@@ -47,10 +51,13 @@ class Constant(Signal):
 class Table(Signal):
     """Recorded samples, one every `period` from t = 0 on: an input or an inflow that was logged.
 
-    Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them ("linear"); after the last, the last.
+    Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them
+    ("linear"); after the last, the last.
     """
 
-    values: np.ndarray = leaf("-", "(channels, samples) the record, in the unit of what it stands for")
+    values: np.ndarray = leaf(
+        "-", "(channels, samples) the record, in the unit of what it stands for"
+    )
     period: float = static("s", "time between samples", low=0.0, strict=True)
     between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
 
@@ -60,7 +67,8 @@ class Table(Signal):
 
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         last = np.shape(self.values)[1] - 1
-        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 * 0.1 s sample 3
+        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 *
+        # 0.1 s sample 3
         at = np.arange(clock.samples) * (clock.dt / self.period)
         index = np.minimum(np.floor(at + 5e-7), last).astype(int)
         after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
@@ -86,13 +94,16 @@ class Sum(Signal):
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         value, rate, second = (
-            tuple(a + b for a, b in zip(one, two)) for one, two in zip(self.first.sample(clock), self.second.sample(clock))
+            tuple(a + b for a, b in zip(one, two))
+            for one, two in zip(self.first.sample(clock), self.second.sample(clock))
         )
         return value, rate, second
 
     @pointwise
     def windows(self, clock: Clock) -> tuple:
-        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step from its start on."""
+        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step
+        from its start on.
+        """
         t = sample_times(clock)
         steps, sine = cast(Any, self.first), cast(Any, self.second)  # a Ramps, with a Sine on it
         found = list(steps.windows(clock))

@@ -14,15 +14,23 @@ from jaxtank.signals.base import Signal
 
 @component
 class Pours(Signal):
-    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; gouta2022 notes S3.2). An inflow per tank [cm^3/s].
+    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2;
+    gouta2022 notes S3.2). An inflow per tank [cm^3/s].
 
-    What a sample is given is the mean over that sample, so that the whole volume arrives whatever the sampling period.
+    What a sample is given is the mean over that sample, so that the whole volume arrives whatever
+    the sampling period.
     """
 
     volume: np.ndarray = leaf("cm^3", "(pours,) volume of each pour; negative: taken out")
     events: tuple = static(doc="((time [s], duration [s], tank), ...) one per pour")
     width: int = static("-", "number of tanks", low=1, high=100)
-    window: float = static("s", "how long after a pour a tank is watched for its recovery", low=0.0, strict=True, default=60.0)
+    window: float = static(
+        "s",
+        "how long after a pour a tank is watched for its recovery",
+        low=0.0,
+        strict=True,
+        default=60.0,
+    )
 
     @property
     def channels(self) -> int:
@@ -33,7 +41,9 @@ class Pours(Signal):
         t = sample_times(clock)
         flow = [jnp.zeros_like(t) for _ in range(self.width)]
         for j, (start, duration, tank) in enumerate(self.events):
-            share = (jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)) / (duration * clock.dt)
+            share = (jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)) / (
+                duration * clock.dt
+            )
             flow[tank] = flow[tank] + self.volume[j] * jnp.maximum(share, 0.0)
         still = (jnp.zeros_like(t),) * self.width
         return tuple(flow), still, still
@@ -45,20 +55,26 @@ class Pours(Signal):
         since = -jnp.ones_like(t)
         for start, _, _ in sorted(self.events):
             after = t - start
-            since = jnp.where(after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since)
+            since = jnp.where(
+                after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since
+            )
         return since
 
 
 def pours(tanks: int, entries: Sequence[tuple[float, float, int, float]]) -> Pours:
-    """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0, volume [cm^3]). InputError for a bad one."""
+    """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0,
+    volume [cm^3]). InputError for a bad one.
+    """
     for time, duration, tank, _ in entries:
         if not (time >= 0 and duration > 0 and 0 <= tank < tanks):
             raise InputError(
-                f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0 s, a duration above 0 s and a tank "
-                f"from 0 to {tanks - 1}, counted from 0"
+                f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0"
+                f" s, a duration above 0 s and a tank from 0 to {tanks - 1}, counted from 0"
             )
     return Pours(
         volume=number([volume for *_, volume in entries]),
-        events=tuple((float(time), float(duration), int(tank)) for time, duration, tank, _ in entries),
+        events=tuple(
+            (float(time), float(duration), int(tank)) for time, duration, tank, _ in entries
+        ),
         width=tanks,
     )

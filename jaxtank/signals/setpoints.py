@@ -1,6 +1,7 @@
 """References and disturbances as functions of time, sampled before the time loop starts.
 
-A signal answers `sample(clock)` with three tuples (value, rate, second derivative), one array (samples,) per channel. The
+A signal answers `sample(clock)` with three tuples (value, rate, second derivative), one array
+(samples,) per channel. The
 samples are inputs of the loop: interpolating inside it would cost more than the plant does.
 """
 
@@ -20,13 +21,15 @@ SHAPES = ("linear", "quintic")
 
 @component
 class Ramps(Signal):
-    """Plateaus joined by ramps or S-curves: the trapezoidal benchmark of gouta2015 (sec. 5, Fig. 5).
+    """Plateaus joined by ramps or S-curves: the trapezoidal benchmark of gouta2015 (sec. 5, Fig.
+    5).
 
         r(t) = initial + sum_j (target_j - value before) S((t - t_j) / D)
 
-    S(x) is x (shape "linear"; rate Delta/D on [t_j, t_j + D), second derivative 0, the impulses at the corners left out) or
-    10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held at 0 before and 1 after. D = 0 gives steps. A change that
-    begins before the last one of its channel has ended starts from where that one has got to.
+    S(x) is x (shape "linear"; rate Delta/D on [t_j, t_j + D), second derivative 0, the impulses at
+    the corners left out) or 10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held
+    at 0 before and 1 after. D = 0 gives steps. A change that begins before the last one of its
+    channel has ended starts from where that one has got to.
     """
 
     initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
@@ -35,7 +38,12 @@ class Ramps(Signal):
     ramp: float = static("s", "duration D of every change", low=0.0, default=60.0)
     shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
     band: float = static(
-        "-", "half width of the settling band, as a share of the step", low=0.0, high=1.0, strict=True, default=0.05
+        "-",
+        "half width of the settling band, as a share of the step",
+        low=0.0,
+        high=1.0,
+        strict=True,
+        default=0.05,
     )
 
     @property
@@ -44,20 +52,28 @@ class Ramps(Signal):
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
-        pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]  # of each channel: (first sample, function of time)
+        # of each channel: (first sample, function of time)
+        pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]
         for j, (start, i) in enumerate(self.changes):
-            level = pieces[i][-1][1](start)[0]  # the last target, or how far a change that is not over has come
+            # the last target, or how far a change that is not over has come
+            level = pieces[i][-1][1](start)[0]
             if pieces[i][-1][0] > _index(start, clock):
                 pieces[i].pop()
                 level = pieces[i][-1][1](start)[0]
-            pieces[i].append((_index(start, clock), _course(level, self.targets[j] - level, start, self.ramp, self.shape)))
+            pieces[i].append(
+                (
+                    _index(start, clock),
+                    _course(level, self.targets[j] - level, start, self.ramp, self.shape),
+                )
+            )
             pieces[i].append((_index(start + self.ramp, clock), _flat(self.targets[j])))
         value, rate, second = zip(*(_join(channel, clock) for channel in pieces))
         return value, rate, second
 
     @pointwise
     def windows(self, clock: Clock) -> tuple:
-        """Per channel (target, step, time since the change ended, settling band), each (samples,): what overshoot and settling refer to.
+        """Per channel (target, step, time since the change ended, settling band), each (samples,):
+        what overshoot and settling refer to.
 
         Before a channel's first change the step is 0. Times in s, levels in cm.
         """
@@ -75,7 +91,9 @@ class Ramps(Signal):
         return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
 
     def plateaus(self, until: float = math.inf) -> np.ndarray:
-        """(plateaus, channels) the values held between changes, as host numbers: those whose changes end before the next and `until` [s]."""
+        """(plateaus, channels) the values held between changes, as host numbers: those whose
+        changes end before the next and `until` [s].
+        """
         values, now = [], np.array(self.initial, dtype=float)
         values.append(now.copy())
         by_time = {}
@@ -96,7 +114,8 @@ class Sine(Signal):
 
         s(t) = offset + amplitude sin(2 pi (t - zero) / period)   for start <= t < end, else 0
 
-    One channel of several moves, the others stay at 0. Its rate is that of the sine; jumps at the two ends have no impulse.
+    One channel of several moves, the others stay at 0. Its rate is that of the sine; jumps at the
+    two ends have no impulse.
     """
 
     amplitude: np.ndarray = leaf("cm", "amplitude of the sine")
@@ -115,11 +134,19 @@ class Sine(Signal):
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         t, omega = sample_times(clock), 2.0 * math.pi / self.period
-        inside, angle = (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt), omega * (t - self.zero)
+        inside, angle = (
+            (t >= self.start - 1e-7 * clock.dt) & (t < self.end - 1e-7 * clock.dt),
+            omega * (t - self.zero),
+        )
         sine, cosine = self.amplitude * jnp.sin(angle), self.amplitude * jnp.cos(angle)
-        moving = [jnp.where(inside, v, 0.0) for v in (self.offset + sine, omega * cosine, -omega * omega * sine)]
+        moving = [
+            jnp.where(inside, v, 0.0)
+            for v in (self.offset + sine, omega * cosine, -omega * omega * sine)
+        ]
         still = jnp.zeros_like(t)
-        value, rate, second = (tuple(v if i == self.channel else still for i in range(self.width)) for v in moving)
+        value, rate, second = (
+            tuple(v if i == self.channel else still for i in range(self.width)) for v in moving
+        )
         return value, rate, second
 
 
@@ -137,7 +164,10 @@ def ramps(
     changes = sorted(changes, key=lambda change: change[0])
     for time, channel, _ in changes:
         if not 0 <= channel < len(initial):
-            raise InputError(f"reference change at {time:g} s names channel {channel}: there are {len(initial)}, counted from 0")
+            raise InputError(
+                f"reference change at {time:g} s names channel {channel}: there are {len(initial)},"
+                " counted from 0"
+            )
         if not time >= 0:
             raise InputError(f"reference change at {time} s: must be at or after 0 s")
     if shape not in SHAPES:
@@ -153,7 +183,9 @@ def ramps(
 
 
 def _index(time, clock):
-    """First sample at or after `time`; half a part in a million of a sample is forgiven, so that 20 s is sample 2000 at 0.01 s."""
+    """First sample at or after `time`; half a part in a million of a sample is forgiven, so that 20
+    s is sample 2000 at 0.01 s.
+    """
     return max(0, math.ceil(min(time / clock.dt, 2.0**53) - 5e-7))
 
 
@@ -162,9 +194,15 @@ def _flat(level):
 
 
 def _course(level, delta, start, duration, shape):
-    """Value, rate and second derivative of a change of `delta` from `level`, as a function of time inside the change."""
+    """Value, rate and second derivative of a change of `delta` from `level`, as a function of time
+    inside the change.
+    """
     if shape == "linear":
-        return lambda t: (level + delta * ((t - start) / duration), delta / duration + jnp.zeros_like(t), jnp.zeros_like(t))
+        return lambda t: (
+            level + delta * ((t - start) / duration),
+            delta / duration + jnp.zeros_like(t),
+            jnp.zeros_like(t),
+        )
 
     def quintic(t):
         x = (t - start) / duration
@@ -177,7 +215,9 @@ def _course(level, delta, start, duration, shape):
 
 
 def _join(pieces, clock):
-    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Piece`, which may lie anywhere, on all."""
+    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Piece`,
+    which may lie anywhere, on all.
+    """
     if isinstance(clock, Piece):
         k, t = indices(clock), sample_times(clock)
         found = pieces[0][1](t)
@@ -186,5 +226,9 @@ def _join(pieces, clock):
                 found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(t), found))
         return found
     starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
-    parts = [f((a + jnp.arange(b - a)) * clock.dt) for (_, f), a, b in zip(pieces, starts, starts[1:]) if b > a]
+    parts = [
+        f((a + jnp.arange(b - a)) * clock.dt)
+        for (_, f), a, b in zip(pieces, starts, starts[1:])
+        if b > a
+    ]
     return tuple(jnp.concatenate(column) for column in zip(*parts))

@@ -8,23 +8,32 @@ SWITCH = "JAXTANK_XLA_OPTION"
 OFF = ("0", "off", "false", "no")
 KEY = "xla_cpu_small_while_loop_byte_threshold"
 ROLLED = "xla_cpu_disable_loop_unrolling"
-"""LLVM unrolls a short loop before it can be made one of vectors: 16 plants in lanes then run as 16 single ones (36 against 11 ns per step
-and lane), and derivatives compile twice as long. A compiler that does not know the word passes over it."""
+"""LLVM unrolls a short loop before it can be made one of vectors: 16 plants in lanes then run as 16
+single ones (36 against 11 ns per step and lane), and derivatives compile twice as long. A compiler
+that does not know the word passes over it.
+"""
 OPTION = f"{KEY}=100000000000,{ROLLED}"
 _FLAG = "--xla_backend_extra_options="
 
-WIDE = {"xla_cpu_prefer_vector_width": 512} if os.environ.get(SWITCH, "1").lower() not in OFF else {}
-"""`compiler_options` of programs that run many lanes: XLA's own 256 bits leave half of an AVX-512 unit idle (1024 plants, RK4: 29 against 20 ns
-per step and lane). A processor without such a unit takes what it has."""
+WIDE = (
+    {"xla_cpu_prefer_vector_width": 512} if os.environ.get(SWITCH, "1").lower() not in OFF else {}
+)
+"""`compiler_options` of programs that run many lanes: XLA's own 256 bits leave half of an AVX-512
+unit idle (1024 plants, RK4: 29 against 20 ns per step and lane). A processor without such a unit
+takes what it has.
+"""
 
 
 def append_option(flags):
-    """`flags` (the text of XLA_FLAGS) with the options added; what the user set, these options included, stays as it is. A text that does
-    not begin with "--" names a file of flags, to which nothing can be appended."""
+    """`flags` (the text of XLA_FLAGS) with the options added; what the user set, these options
+    included, stays as it is. A text that does not begin with "--" names a file of flags, to which
+    nothing can be appended.
+    """
     wanted = ",".join(option for option in OPTION.split(",") if option.split("=")[0] not in flags)
     if not wanted or (flags.strip() and not flags.lstrip().startswith("--")):
         return flags
-    head, found, tail = flags.rpartition(_FLAG)  # XLA keeps the last of several such flags, so the options join that one
+    # XLA keeps the last of several such flags, so the options join that one
+    head, found, tail = flags.rpartition(_FLAG)
     if not found:
         return f"{flags} {_FLAG}{wanted}".strip()
     theirs = tail.split(maxsplit=1)[0] if tail and not tail[0].isspace() else ""
@@ -35,7 +44,9 @@ def backend_started():
     """True if jax has already read XLA_FLAGS, so that a change would come too late."""
     if "jax" not in sys.modules:
         return False
-    try:  # a private function: if it moves, the test of the compiled loop still tells whether the option took
+    # a private function: if it moves, the test of the compiled loop still tells whether the option
+    # took
+    try:
         from jax._src import xla_bridge
 
         return bool(xla_bridge.backends_are_initialized())
@@ -52,15 +63,17 @@ def enable_small_loop_compilation():
     if after == before:
         if KEY not in before:
             warnings.warn(
-                f"XLA_FLAGS names a file ({before!r}), to which the options for fast loops cannot be appended: runs are correct but about 16 "
-                f"times slower. Add {_FLAG}{OPTION} to it, or set {SWITCH}=0 to silence this.",
+                f"XLA_FLAGS names a file ({before!r}), to which the options for fast loops cannot"
+                f" be appended: runs are correct but about 16 times slower. Add {_FLAG}{OPTION} to"
+                f" it, or set {SWITCH}=0 to silence this.",
                 stacklevel=3,
             )
         return
     if backend_started():
         warnings.warn(
-            "jax had started before jaxtank was imported, so the XLA option for fast loops could not be set: runs are correct but "
-            f"about 16 times slower. Import jaxtank before the first jax computation, or set {SWITCH}=0 to silence this.",
+            "jax had started before jaxtank was imported, so the XLA option for fast loops could"
+            " not be set: runs are correct but about 16 times slower. Import jaxtank before the"
+            f" first jax computation, or set {SWITCH}=0 to silence this.",
             stacklevel=3,
         )
         return

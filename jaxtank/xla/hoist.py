@@ -1,8 +1,10 @@
-"""A scan whose body may be written plainly: work that does not belong in the loop is moved in front of it.
+"""A scan whose body may be written plainly: work that does not belong in the loop is moved in front
+of it.
 
-Laws and plants compute their coefficients from their leaves where they use them, as their papers write them. XLA leaves such work
-inside a compiled loop (measured on the four-tank: a fifth of a run). Here the body is traced once, and what depends on constants
-alone is computed once; equal coefficients (each Runge-Kutta stage makes its own) become one, so that XLA can see they are.
+Laws and plants compute their coefficients from their leaves where they use them, as their papers
+write them. XLA leaves such work inside a compiled loop (measured on the four-tank: a fifth of a
+run). Here the body is traced once, and what depends on constants alone is computed once; equal
+coefficients (each Runge-Kutta stage makes its own) become one, so that XLA can see they are.
 """
 
 import jax
@@ -11,7 +13,9 @@ from jax.extend.core import Literal
 
 
 def scan(body, carry, xs, length):
-    """jax.lax.scan(body, carry, xs, length), less what need not be in the loop. Values and derivatives are the same."""
+    """jax.lax.scan(body, carry, xs, length), less what need not be in the loop. Values and
+    derivatives are the same.
+    """
     closed, shape = jax.make_jaxpr(body, return_shape=True)(
         _like(carry), jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), xs)
     )
@@ -44,12 +48,16 @@ def _split(jaxpr):
             same.update(zip(eqn.outvars, twin.outvars))
     # a number spread over lanes is cheaper to spread again than to fetch
     wanted = {same.get(v, v) for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
-    spread = [eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in wanted]
+    spread = [
+        eqn for eqn in once if eqn.primitive.name == "broadcast_in_dim" and eqn.outvars[0] in wanted
+    ]
     return once, spread + inside, same
 
 
 def _key(eqn, operands):
-    """Equal for two operations that give the same result. Operations that carry a program are told apart by identity."""
+    """Equal for two operations that give the same result. Operations that carry a program are told
+    apart by identity.
+    """
     if any(hasattr(p, "eqns") or hasattr(p, "jaxpr") or callable(p) for p in eqn.params.values()):
         return id(eqn)
     told = tuple((str(v.aval), repr(v.val)) if isinstance(v, Literal) else id(v) for v in operands)
@@ -60,9 +68,12 @@ def _run(eqns, values, same):
     """Do the operations in order, reading and writing {variable: value}."""
     for eqn in eqns:
         bound = eqn.primitive.get_bind_params(eqn.params)
-        functions, params = bound if isinstance(bound, tuple) else ((), bound)  # a pair in older releases of jax
+        # a pair in older releases of jax
+        functions, params = bound if isinstance(bound, tuple) else ((), bound)
         with eqn.ctx.manager:  # what `materialised` says of a call
-            out = eqn.primitive.bind(*functions, *(_read(v, values, same) for v in eqn.invars), **params)
+            out = eqn.primitive.bind(
+                *functions, *(_read(v, values, same) for v in eqn.invars), **params
+            )
         values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out]))
 
 

@@ -1,4 +1,6 @@
-"""What a function does with some of its arguments, read from its traced program: nothing is computed."""
+"""What a function does with some of its arguments, read from its traced program: nothing is
+computed.
+"""
 
 import math
 from typing import NamedTuple
@@ -10,8 +12,9 @@ LOOPS = ("scan", "while")
 
 
 class Use(NamedTuple):
-    """What was found: whether any result depends on the arguments in question, the entries of the largest matrix on the way (0: none),
-    and whether a loop is on the way."""
+    """What was found: whether any result depends on the arguments in question, the entries of the
+    largest matrix on the way (0: none), and whether a loop is on the way.
+    """
 
     reached: bool
     largest: int
@@ -19,29 +22,35 @@ class Use(NamedTuple):
 
 
 def use_of(function, watched, *others):
-    """The Use of the pytree `watched` in function(watched, *others); arguments are numbers, arrays or `jax.ShapeDtypeStruct`s.
+    """The Use of the pytree `watched` in function(watched, *others); arguments are numbers, arrays
+    or `jax.ShapeDtypeStruct`s.
 
-    A dependence that is there in the program and cancels in value counts as one. Raises what `function` raises when it is traced,
-    as a law does that branches on the value of a leaf.
+    A dependence that is there in the program and cancels in value counts as one. Raises what
+    `function` raises when it is traced, as a law does that branches on the value of a leaf.
     """
     jaxpr = jax.make_jaxpr(function)(watched, *others).jaxpr
     return _follow(jaxpr, set(jaxpr.invars[: len(jax.tree.leaves(watched))]))[0]
 
 
 def reached(function, watched):
-    """[whether each leaf of the result of function(watched) depends on `watched`], a pytree of arrays."""
+    """[whether each leaf of the result of function(watched) depends on `watched`], a pytree of
+    arrays.
+    """
     jaxpr = jax.make_jaxpr(function)(watched).jaxpr
     return _follow(jaxpr, set(jaxpr.invars))[1]
 
 
 def _follow(jaxpr, reached):
-    """(Use, [whether each result is reached]) from the variables in `reached`, a set that is added to."""
+    """(Use, [whether each result is reached]) from the variables in `reached`, a set that is added
+    to.
+    """
     largest, looped = 0, False
     for eqn in jaxpr.eqns:
         hit = [_in(v, reached) for v in eqn.invars]
         if not any(hit):
             continue
-        results = [True] * len(eqn.outvars)  # operations with a program of their own are taken whole, but for plain calls
+        # operations with a program of their own are taken whole, but for plain calls
+        results = [True] * len(eqn.outvars)
         inner = eqn.params.get("jaxpr") if eqn.primitive.name in ("jit", "pjit") else None
         if inner is not None:
             use, results = _follow(inner.jaxpr, {v for v, h in zip(inner.jaxpr.invars, hit) if h})

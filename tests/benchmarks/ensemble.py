@@ -1,10 +1,12 @@
-"""Ensembles: time per closed-loop step and lane beside the C loop, what many draws cost, what they hold in memory, what a second device gives.
+"""Ensembles: time per closed-loop step and lane beside the C loop, what many draws cost, what they
+hold in memory, what a second device gives.
 
     python tests/benchmarks/ensemble.py [--rounds 3]
 
-Every figure is of this machine in this run; compilation is apart. The C loop in vector lanes is floor_lanes.c (gcc -O3 -march=native
--mprefer-vector-width=512, no -ffast-math) on the same plants, its time taken in turn with ours, one core each; the other one runs one plant
-at a time (tuning/floor.c).
+Every figure is of this machine in this run; compilation is apart. The C loop in vector lanes is
+floor_lanes.c (gcc -O3 -march=native
+-mprefer-vector-width=512, no -ffast-math) on the same plants, its time taken in turn with ours, one
+core each; the other one runs one plant at a time (tuning/floor.c).
 """
 
 import argparse
@@ -27,7 +29,15 @@ from tuning.uncertainty.distributions import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
 SOURCE = Path(__file__).with_name("floor_lanes.c")
-FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
+FLAGS = (
+    "-O3",
+    "-march=native",
+    "-mprefer-vector-width=512",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-shared",
+    "-fPIC",
+)
 BLOCK = 32  # lanes that the C loop holds in registers and L1; 8 to 64 differ by a tenth
 NAMES = ("rms_error_total", "max_level")
 
@@ -48,7 +58,8 @@ def draw(case, samples, **options):
     return tuning.ensemble(case, samples=samples, measures=NAMES, fan=False, **options)
 
 
-SINGLE = ("-DSINGLE", "-fsingle-precision-constant")  # the same source in float32, its sums not compensated
+# the same source in float32, its sums not compensated
+SINGLE = ("-DSINGLE", "-fsingle-precision-constant")
 
 
 def c_lanes(folder, single=False):
@@ -57,7 +68,16 @@ def c_lanes(folder, single=False):
         return None
     library = Path(folder) / "lanes.so"
     subprocess.run(
-        ["gcc", *FLAGS, *(SINGLE if single else ()), f"-DLANES={BLOCK}", "-o", str(library), str(SOURCE), "-lm"],
+        [
+            "gcc",
+            *FLAGS,
+            *(SINGLE if single else ()),
+            f"-DLANES={BLOCK}",
+            "-o",
+            str(library),
+            str(SOURCE),
+            "-lm",
+        ],
         check=True,
         capture_output=True,
     )
@@ -67,27 +87,54 @@ def c_lanes(folder, single=False):
 
 
 def c_run(function, case, samples, single=False):
-    """A call of the C loop on the plants that `draw` draws: () -> (total rms error (samples,), highest levels (samples, 4)) [cm]."""
+    """A call of the C loop on the plants that `draw` draws: () -> (total rms error (samples,),
+    highest levels (samples, 4)) [cm].
+    """
     plant, law, clock = case.loop.plant, case.loop.controller, case.clock
     space = Draws(case.loop, spread_of(case))
     v = space.values(probabilities("random", space.dimensions, samples, 0))
     rows = np.concatenate([v["plant.drain"][:, :2].T, v["plant.orifice"].T, v["plant.pump_gain"].T])
     real, c_real = (np.float32, ctypes.c_float) if single else (np.float64, ctypes.c_double)
-    rows = np.ascontiguousarray(np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge"), dtype=real)
+    rows = np.ascontiguousarray(
+        np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge"), dtype=real
+    )
     model = law.model
-    area, drain, orifice, gain = (np.array(x, dtype=float) for x in (model.area, model.drain, model.orifice, model.pump_gain))
+    area, drain, orifice, gain = (
+        np.array(x, dtype=float) for x in (model.area, model.drain, model.orifice, model.pump_gain)
+    )
     w = float(2.0 * model.gravity) ** 0.5
-    out = np.array([drain[0], orifice[0], orifice[2], drain[1], orifice[1], orifice[3]]) * w / area[[0, 0, 0, 1, 1, 1]]
-    upper = [orifice[:2].sum() * w / area[2], gain[0] / area[2], orifice[2:].sum() * w / area[3], gain[1] / area[3]]
+    out = (
+        np.array([drain[0], orifice[0], orifice[2], drain[1], orifice[1], orifice[3]])
+        * w
+        / area[[0, 0, 0, 1, 1, 1]]
+    )
+    upper = [
+        orifice[:2].sum() * w / area[2],
+        gain[0] / area[2],
+        orifice[2:].sum() * w / area[3],
+        gain[1] / area[3],
+    ]
     nominal, own = np.concatenate([out, upper]).astype(real), np.array(plant.area, dtype=real)
-    r, x0 = np.array(case.loop.reference.sample(clock)[0], dtype=real), np.array(case.loop.x0, dtype=real)
+    r, x0 = (
+        np.array(case.loop.reference.sample(clock)[0], dtype=real),
+        np.array(case.loop.x0, dtype=real),
+    )
     found = np.zeros((rows.shape[1], 5), dtype=real)
 
     def at(array):
         return array.ctypes.data_as(ctypes.POINTER(c_real))
 
     scalars = [
-        c_real(float(x)) for x in (plant.gravity, plant.knee, clock.dt, law.k, law.k1, law.level_floor, case.loop.actuator.high[0])
+        c_real(float(x))
+        for x in (
+            plant.gravity,
+            plant.knee,
+            clock.dt,
+            law.k,
+            law.k1,
+            law.level_floor,
+            case.loop.actuator.high[0],
+        )
     ]
     gravity, knee, dt, *rest = scalars
 
@@ -102,16 +149,23 @@ def c_run(function, case, samples, single=False):
 
 
 def beside_lanes(function, case, samples, rounds, single=False):
-    """(ns per step and plant of ours, of the C loop, ratio, largest difference [cm]): medians of core time, the two in turn."""
+    """(ns per step and plant of ours, of the C loop, ratio, largest difference [cm]): medians of
+    core time, the two in turn.
+    """
     ours, theirs = (lambda: draw(case, samples)), c_run(function, case, samples, single)
     seen, (rms, top), times = ours(), theirs(), {ours: [], theirs: []}
-    apart = max(abs(rms - seen.measures["rms_error_total"]).max(), abs(top - seen.measures["max_level"]).max())
+    apart = max(
+        abs(rms - seen.measures["rms_error_total"]).max(),
+        abs(top - seen.measures["max_level"]).max(),
+    )
     for _ in range(rounds):
         for call, spent in times.items():
             began = time.process_time()
             call()
             spent.append(time.process_time() - began)
-    a, b = (1e9 * statistics.median(spent) / (samples * case.clock.samples) for spent in times.values())
+    a, b = (
+        1e9 * statistics.median(spent) / (samples * case.clock.samples) for spent in times.values()
+    )
     return a, b, statistics.median(p / q for p, q in zip(*times.values())), apart
 
 
@@ -133,13 +187,18 @@ print(time.perf_counter() - began, int(re.search(r"VmHWM:\\s*(\\d+)", open("/pro
 def child(devices, samples, dt):
     """(wall time [s], peak memory [MiB]) of an ensemble in a process of its own."""
     out = subprocess.run(
-        [sys.executable, "-c", CHILD, str(devices), str(samples), str(dt)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", CHILD, str(devices), str(samples), str(dt)],
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return tuple(float(v) for v in out.stdout.split())
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rounds", type=int, default=3)
     rounds = parser.parse_args().rounds
     jax.config.update("jax_enable_x64", True)
@@ -147,26 +206,41 @@ def main():
     coarse = rig.set_values(fine, {"clock.dt": 0.1})
     with tempfile.TemporaryDirectory() as folder:
         function = bench.c_loop(folder)
-        c = None if function is None else seconds(bench.c_runner(function, fine), rounds) / fine.clock.samples
+        c = (
+            None
+            if function is None
+            else seconds(bench.c_runner(function, fine), rounds) / fine.clock.samples
+        )
     ns = seconds(lambda: draw(fine, 1024), rounds) / (1024 * fine.clock.samples) * 1e9
-    beside = "no gcc" if c is None else f"{ns / (1e9 * c):.2f} x the scalar C loop ({1e9 * c:.1f} ns)"
+    beside = (
+        "no gcc" if c is None else f"{ns / (1e9 * c):.2f} x the scalar C loop ({1e9 * c:.1f} ns)"
+    )
     print(f"1,024 plants x {fine.clock.samples} samples: {ns:.1f} ns per step and plant, {beside}")
     halves = {"clock.integrator": "midpoint"}
     with tempfile.TemporaryDirectory() as folder:
         function = c_lanes(folder)
-        for words, case in (("RK4", fine), ("midpoint", rig.set_values(fine, halves))) if function else ():
+        for words, case in (
+            (("RK4", fine), ("midpoint", rig.set_values(fine, halves))) if function else ()
+        ):
             a, b, ratio, apart = beside_lanes(function, case, 1000, rounds)
             print(
-                f"1,000 plants x {case.clock.samples} samples, {words}: {a:.1f} ns of one core per step and plant, {b:.1f} the C loop in "
-                f"lanes, {ratio:.2f} x; they agree to {apart:.0e} cm"
+                f"1,000 plants x {case.clock.samples} samples, {words}: {a:.1f} ns of one core per"
+                f" step and plant, {b:.1f} the C loop in lanes, {ratio:.2f} x; they agree to"
+                f" {apart:.0e} cm"
             )
     for words, case in (("RK4", coarse), ("midpoint", rig.set_values(coarse, halves))):
         draw(case, 1024)
         began = time.process_time()
         draw(case, 10_000)
-        print(f"10,000 plants x {case.clock.samples} samples, {words}: {time.process_time() - began:.2f} core-seconds")
+        print(
+            f"10,000 plants x {case.clock.samples} samples, {words}:"
+            f" {time.process_time() - began:.2f} core-seconds"
+        )
     few, many = child(1, 1_000, 1.0)[1], child(1, 100_000, 1.0)[1]
-    print(f"peak memory: 1,000 plants {few:.0f} MiB, 100,000 plants {many:.0f} MiB ({many - few:+.0f})")
+    print(
+        f"peak memory: 1,000 plants {few:.0f} MiB, 100,000 plants {many:.0f} MiB"
+        f" ({many - few:+.0f})"
+    )
     one, two = (np.median([child(n, 4096, 0.1)[0] for _ in range(rounds)]) for n in (1, 2))
     print(f"4,096 plants: one device {one:.2f} s, two devices {two:.2f} s, {one / two:.2f} times")
 

@@ -1,4 +1,6 @@
-"""Write the table of papers in README.md here: python tests/benchmarks/papers_table.py (about half a minute)."""
+"""Write the table of papers in README.md here: python tests/benchmarks/papers_table.py (about half
+a minute).
+"""
 
 import re
 from pathlib import Path
@@ -22,4 +24,6 @@ def table():
 
 if __name__ == "__main__":
     text = README.read_text()
-    README.write_text(re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", text, flags=re.DOTALL))
+    README.write_text(
+        re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table()}\n{END}", text, flags=re.DOTALL)
+    )

@@ -20,7 +20,9 @@ def programme(n):
     ahead = np.array([[response[i - j] if i >= j else 0.0 for j in range(n)] for i in range(2 * n)])
     H, f = 2.0 * (ahead.T @ ahead + 0.05 * np.eye(n)), -2.0 * ahead.sum(axis=0)
     G = np.concatenate([np.eye(n), np.tril(np.ones((n, n)))])
-    low, high = (np.concatenate([np.full(n, a), np.full(n, b)]) for a, b in ((-0.1, -0.3), (0.1, 0.7)))
+    low, high = (
+        np.concatenate([np.full(n, a), np.full(n, b)]) for a, b in ((-0.1, -0.3), (0.1, 0.7))
+    )
     return H, f, G, low, high
 
 

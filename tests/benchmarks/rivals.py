@@ -1,11 +1,13 @@
-"""One closed loop in everything a user might pick instead: the four-tank under backstepping, fourth-order Runge-Kutta, inputs held.
+"""One closed loop in everything a user might pick instead: the four-tank under backstepping,
+fourth-order Runge-Kutta, inputs held.
 
     pip install ".[bench]"
     python tests/benchmarks/rivals.py [rounds] [--markdown]
 
-All of them do the same arithmetic on the same setpoints and are timed in turn within one process; medians, the ratio to ours in the same
-round with its range, time of the first call (compilation) apart, and how far the RMS error is from ours. Slow ones run a part of the
-samples, and are told per step. Rivals that are not installed are named. Nothing is asserted: machines differ.
+All of them do the same arithmetic on the same setpoints and are timed in turn within one process;
+medians, the ratio to ours in the same round with its range, time of the first call (compilation)
+apart, and how far the RMS error is from ours. Slow ones run a part of the samples, and are told per
+step. Rivals that are not installed are named. Nothing is asserted: machines differ.
 """
 
 import atexit
@@ -31,11 +33,14 @@ from tuning.report import tables
 
 README = Path(__file__).with_name("README.md")
 BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
-FEW = 6000  # samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
+# samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
+FEW = 6000
 
 
 def constants(case):
-    """(c (10,), gain k + k1, k1, coefficients of the decoupling (6,), floor, high) as the C loop has them."""
+    """(c (10,), gain k + k1, k1, coefficients of the decoupling (6,), floor, high) as the C loop
+    has them.
+    """
     p, law = case.loop.plant, case.loop.controller
     w = np.sqrt(2 * float(p.gravity))
     A, d, o, g = (np.asarray(getattr(p, n)) for n in ("area", "drain", "orifice", "pump_gain"))
@@ -48,7 +53,14 @@ def constants(case):
     alpha = 0.5 * (c[1] * c[5] - c[2] * c[4])
     b = np.array([c[5], c[2], c[4], c[1]]) / (alpha * np.array([c[7], c[7], c[9], c[9]]))
     b = np.append(b, [c[6] / c[7], c[8] / c[9]])
-    return c, float(law.k) + float(law.k1), float(law.k1), b, float(law.level_floor), float(case.loop.actuator.high[0])
+    return (
+        c,
+        float(law.k) + float(law.k1),
+        float(law.k1),
+        b,
+        float(law.level_floor),
+        float(case.loop.actuator.high[0]),
+    )
 
 
 def law(c, gain, k1, b, floor, high, x, r, np):
@@ -88,8 +100,18 @@ def numba_loop(case, r, x0):
 
     @numba.njit(fastmath=False)
     def rates(x1, x2, x3, x4, u1, u2):
-        s1, s2, s3, s4 = np.sqrt(max(x1, 0.0)), np.sqrt(max(x2, 0.0)), np.sqrt(max(x3, 0.0)), np.sqrt(max(x4, 0.0))
-        return c[1] * s3 + c[2] * s4 - c[0] * s1, c[4] * s3 + c[5] * s4 - c[3] * s2, c[7] * u1 - c[6] * s3, c[9] * u2 - c[8] * s4
+        s1, s2, s3, s4 = (
+            np.sqrt(max(x1, 0.0)),
+            np.sqrt(max(x2, 0.0)),
+            np.sqrt(max(x3, 0.0)),
+            np.sqrt(max(x4, 0.0)),
+        )
+        return (
+            c[1] * s3 + c[2] * s4 - c[0] * s1,
+            c[4] * s3 + c[5] * s4 - c[3] * s2,
+            c[7] * u1 - c[6] * s3,
+            c[9] * u2 - c[8] * s4,
+        )
 
     @numba.njit(fastmath=False)
     def run(r, x1, x2, x3, x4, h):
@@ -103,8 +125,12 @@ def numba_loop(case, r, x0):
             u2 = min(max(s4 * (b[3] * v2 - b[2] * v1 + b[5]), 0.0), high)
             total += (x1 - r1) ** 2 + (x2 - r2) ** 2
             a1, a2, a3, a4 = rates(x1, x2, x3, x4, u1, u2)
-            b1, b2, b3, b4 = rates(x1 + 0.5 * h * a1, x2 + 0.5 * h * a2, x3 + 0.5 * h * a3, x4 + 0.5 * h * a4, u1, u2)
-            c1, c2, c3, c4 = rates(x1 + 0.5 * h * b1, x2 + 0.5 * h * b2, x3 + 0.5 * h * b3, x4 + 0.5 * h * b4, u1, u2)
+            b1, b2, b3, b4 = rates(
+                x1 + 0.5 * h * a1, x2 + 0.5 * h * a2, x3 + 0.5 * h * a3, x4 + 0.5 * h * a4, u1, u2
+            )
+            c1, c2, c3, c4 = rates(
+                x1 + 0.5 * h * b1, x2 + 0.5 * h * b2, x3 + 0.5 * h * b3, x4 + 0.5 * h * b4, u1, u2
+            )
             d1, d2, d3, d4 = rates(x1 + h * c1, x2 + h * c2, x3 + h * c3, x4 + h * c4, u1, u2)
             x1 += h / 6 * (a1 + 2 * (b1 + c1) + d1)
             x2 += h / 6 * (a2 + 2 * (b2 + c2) + d2)
@@ -116,8 +142,13 @@ def numba_loop(case, r, x0):
 
 
 def jax_as_it_comes(case, r, x0):
-    """`plain_scan` in a process of its own, without the XLA option that importing jaxtank sets: one line in, one number out."""
-    script = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import rivals; rivals.serve()"
+    """`plain_scan` in a process of its own, without the XLA option that importing jaxtank sets: one
+    line in, one number out.
+    """
+    script = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); import rivals;"
+        " rivals.serve()"
+    )
     child = subprocess.Popen(
         [sys.executable, "-c", script],
         stdin=subprocess.PIPE,
@@ -146,7 +177,9 @@ def serve():
 
 
 def plain_scan(case, r, x0):
-    """What one writes first: jax.lax.scan over a state vector (`rollout` of most libraries), with the XLA option that jaxtank sets."""
+    """What one writes first: jax.lax.scan over a state vector (`rollout` of most libraries), with
+    the XLA option that jaxtank sets.
+    """
     c, gain, k1, b, floor, high = constants(case)
     h = case.clock.dt
 
@@ -174,7 +207,9 @@ def diffrax_steps(case, r, x0):
 
     def body(x, now):
         u = jnp.stack(law(c, gain, k1, b, floor, high, x, now, jnp))
-        solved = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, h, h, x, args=u, stepsize_controller=constant, max_steps=2)
+        solved = diffrax.diffeqsolve(
+            term, diffrax.Tsit5(), 0.0, h, h, x, args=u, stepsize_controller=constant, max_steps=2
+        )
         return solved.ys[-1], jnp.sum((x[:2] - now) ** 2)
 
     run = jax.jit(lambda r: jnp.sqrt(jnp.mean(jax.lax.scan(body, jnp.asarray(x0), r)[1])))
@@ -193,7 +228,9 @@ def casadi_accumulated(case, r, x0):
 
     x, now = ca.SX.sym("x", 4), ca.SX.sym("r", 2)
     u = law(c, gain, k1, b, floor, high, [x[i] for i in range(4)], [now[0], now[1]], Namespace)
-    parts = runge_kutta(lambda z: field(c, z, u, Namespace), tuple(x[i] for i in range(4)), case.clock.dt)
+    parts = runge_kutta(
+        lambda z: field(c, z, u, Namespace), tuple(x[i] for i in range(4)), case.clock.dt
+    )
     step = ca.Function("step", [x, now], [ca.vertcat(*parts)])
     run = step.mapaccum("run", r.shape[1])
 
@@ -216,14 +253,18 @@ def scipy_lsoda(case, r, x0):
         for k in range(few):
             u = law(c, gain, k1, b, floor, high, x, r[:, k], np)
             total += np.sum((x[:2] - r[:, k]) ** 2)
-            x = solve_ivp(lambda t, x, u=u: field(c, x, u, np), (0, case.clock.dt), x, method="LSODA").y[:, -1]
+            x = solve_ivp(
+                lambda t, x, u=u: field(c, x, u, np), (0, case.clock.dt), x, method="LSODA"
+            ).y[:, -1]
         return np.sqrt(total / few)
 
     return call, few
 
 
 def plain_python(case, r, x0):
-    c, gain, k1, b, floor, high = (list(map(float, v)) if np.ndim(v) else v for v in constants(case))
+    c, gain, k1, b, floor, high = (
+        list(map(float, v)) if np.ndim(v) else v for v in constants(case)
+    )
     import math
 
     class Namespace:
@@ -248,7 +289,9 @@ def python_control(case, r, x0):
 
     c, gain, k1, b, floor, high = constants(case)
     few = FEW // 10
-    closed = lambda t, x, w, p: np.array(field(c, x, law(c, gain, k1, b, floor, high, x, w, np), np))
+    closed = lambda t, x, w, p: np.array(
+        field(c, x, law(c, gain, k1, b, floor, high, x, w, np), np)
+    )
     loop = control.nlsys(closed, None, inputs=2, outputs=4, states=4)
     t = np.arange(few) * case.clock.dt
 
@@ -277,7 +320,10 @@ def main(words):
     jax.config.update("jax_enable_x64", True)
     rounds = next((int(w) for w in words if w.isdigit()), 7)
     case = presets.find("gouta2015/backstepping")
-    r, x0 = np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]]), tuple(map(float, case.loop.x0))
+    r, x0 = (
+        np.array([np.asarray(v) for v in case.loop.reference.sample(case.clock)[0]]),
+        tuple(map(float, case.loop.x0)),
+    )
     resting = int(np.argmax(np.any(r != r[:, :1], axis=0)))
     names = ("rms_error_total",)
     ours = lambda: jaxtank.evaluate(case.loop, case.clock, names)["rms_error_total"]
@@ -288,7 +334,10 @@ def main(words):
             missing.append("C loop (no gcc)")
         else:
             run = bench.c_runner(function, case)
-            calls["C, gcc -O3 -march=native"], steps["C, gcc -O3 -march=native"] = (lambda: run()[0]), case.clock.samples
+            calls["C, gcc -O3 -march=native"], steps["C, gcc -O3 -march=native"] = (
+                (lambda: run()[0]),
+                case.clock.samples,
+            )
         for name, make in RIVALS.items():
             try:
                 calls[name], steps[name] = make(case, r if make in WHOLE else r[:, resting:], x0)
@@ -310,7 +359,8 @@ def main(words):
         same = (
             whole
             if not part
-            else float(jaxtank.evaluate(case.loop, clock, names)["rms_error_total"]) * (until / steps[name]) ** 0.5
+            else float(jaxtank.evaluate(case.loop, clock, names)["rms_error_total"])
+            * (until / steps[name]) ** 0.5
         )
         rows.append(
             [
@@ -322,14 +372,28 @@ def main(words):
                 f"{steps[name]:,}",
             ]
         )
-    heads = ["one run in float64", "ns per step", "times ours (range)", "first call, s more", "RMS error from ours, cm", "samples"]
+    heads = [
+        "one run in float64",
+        "ns per step",
+        "times ours (range)",
+        "first call, s more",
+        "RMS error from ours, cm",
+        "samples",
+    ]
     print(tables.table(rows, heads))
     print(f"not here: {', '.join(missing)}")
     if "--markdown" in words:
-        lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+        lines = [
+            f"| {' | '.join(heads)} |",
+            "|---" * len(heads) + "|",
+            *(f"| {' | '.join(row)} |" for row in rows),
+        ]
         text = README.read_text()
         table = "\n".join(lines)
-        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL))
+        write_atomic(
+            README,
+            re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL),
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""How far this machine's runs are from a C loop, what derivatives cost beside the run, and what a first use waits for.
+"""How far this machine's runs are from a C loop, what derivatives cost beside the run, and what a
+first use waits for.
 
     python tests/benchmarks/speed.py [rounds] [--markdown]
 
-Within a block every line is measured in turn, round by round, in one process on one core: medians of core time, and of the ratio to its
-rival in the same round, with the range. Compilation is apart. "at most" is what we set out to reach. Nothing is asserted of time: machines
-differ. The structural causes are pinned in tests/test_compiled_loop.py.
+Within a block every line is measured in turn, round by round, in one process on one core: medians
+of core time, and of the ratio to its rival in the same round, with the range. Compilation is apart.
+"at most" is what we set out to reach. Nothing is asserted of time: machines differ. The structural
+causes are pinned in tests/test_compiled_loop.py.
 """
 
 import dataclasses
@@ -40,7 +42,9 @@ LANES = 16
 
 
 def timed(calls, rounds):
-    """{name: [core time of each round, s]}: every call once a round, in turn, after one that compiles."""
+    """{name: [core time of each round, s]}: every call once a round, in turn, after one that
+    compiles.
+    """
     for call in calls.values():
         jax.block_until_ready(call())
     seconds = {name: [] for name in calls}
@@ -59,13 +63,21 @@ def ratio(seconds, name, rival):
 
 
 def parameters(case):
-    """Values of 2, 8 and 30 parameters of the four-tank: gains; areas and pumps; every coefficient of the plant and of the law's model."""
+    """Values of 2, 8 and 30 parameters of the four-tank: gains; areas and pumps; every coefficient
+    of the plant and of the law's model.
+    """
     law, plant = case.loop.controller, case.loop.plant
     two = {"controller.k": np.float64(law.k), "controller.k1": np.float64(law.k1)}
-    eight = {**two, "plant.area": np.array(plant.area), "plant.pump_gain": np.array(plant.pump_gain)}
+    eight = {
+        **two,
+        "plant.area": np.array(plant.area),
+        "plant.pump_gain": np.array(plant.pump_gain),
+    }
     of = {"plant": plant, "controller.model": law.model}
     every = {
-        f"{where}.{n}": np.array(getattr(part, n)) for where, part in of.items() for n in ("area", "drain", "orifice", "pump_gain")
+        f"{where}.{n}": np.array(getattr(part, n))
+        for where, part in of.items()
+        for n in ("area", "drain", "orifice", "pump_gain")
     }
     return {2: two, 8: eight, 30: {**two, **every}}
 
@@ -73,7 +85,13 @@ def parameters(case):
 def gradient(case, values):
     """(call, MB of temporary memory) of the gradient of the RMS error by `values`, forward mode."""
     call = (
-        jax.jit(jax.jacfwd(lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]])).lower(values).compile()
+        jax.jit(
+            jax.jacfwd(
+                lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
+            )
+        )
+        .lower(values)
+        .compile()
     )
     return (lambda: call(values)), call.memory_analysis().temp_size_in_bytes / 1e6
 
@@ -94,24 +112,54 @@ def one_run(rounds):
     with tempfile.TemporaryDirectory() as folder:
         function = bench.c_loop(folder)
         if function is not None:
-            calls["C"], calls["C midpoint"] = bench.c_runner(function, case), bench.c_runner(function, case, rk4=False)
+            calls["C"], calls["C midpoint"] = (
+                bench.c_runner(function, case),
+                bench.c_runner(function, case, rk4=False),
+            )
         seconds = timed(calls, rounds)
         if function is not None:
             rms, top = calls["C"]()
             ours = calls["run"]()
-            apart = max(abs(rms - float(ours[COST[0]])), float(np.max(np.abs(top - np.asarray(ours["max_level"])))))
-            print(f"jaxtank and the C loop agree to {apart:.1e} cm on the error and the highest levels")
-    per = {name: f"{1e9 * statistics.median(spent) / case.clock.samples:.0f} ns per step" for name, spent in seconds.items()}
+            apart = max(
+                abs(rms - float(ours[COST[0]])),
+                float(np.max(np.abs(top - np.asarray(ours["max_level"])))),
+            )
+            print(
+                f"jaxtank and the C loop agree to {apart:.1e} cm on the error and the highest"
+                " levels"
+            )
+    per = {
+        name: f"{1e9 * statistics.median(spent) / case.clock.samples:.0f} ns per step"
+        for name, spent in seconds.items()
+    }
     rows = []
     if function is None:
         print("no gcc here: no C loop")
     else:
         c = f"C loop, {per['C']}"
-        rows.append(["one run, 120,001 steps, RK4", per["run"], ratio(seconds, "run", "C"), c, "1.25"])
-        rows.append(["the same, midpoint", per["midpoint"], ratio(seconds, "midpoint", "C"), "RK4 C loop", "0.85"])
+        rows.append(
+            ["one run, 120,001 steps, RK4", per["run"], ratio(seconds, "run", "C"), c, "1.25"]
+        )
+        rows.append(
+            [
+                "the same, midpoint",
+                per["midpoint"],
+                ratio(seconds, "midpoint", "C"),
+                "RK4 C loop",
+                "0.85",
+            ]
+        )
     for count, most in ((2, "3.0"), (8, "4.5"), (30, "6")):
         spent = f"{1e3 * statistics.median(seconds[count]):.0f} ms, {memory[count]:.1f} MB"
-        rows.append([f"gradient, {count} parameters", spent, ratio(seconds, count, "cost"), "the run", f"{most}, 10 MB"])
+        rows.append(
+            [
+                f"gradient, {count} parameters",
+                spent,
+                ratio(seconds, count, "cost"),
+                "the run",
+                f"{most}, 10 MB",
+            ]
+        )
     return rows
 
 
@@ -124,18 +172,42 @@ def lanes(rounds):
         function = ensemble.c_lanes(folder)
         if function is None:
             return rows
-        for words, which, plants in (("RK4", case, 256), ("RK4", case, 4096), ("midpoint", halves, 256)):
-            few = which.replace(clock=dataclasses.replace(which.clock, duration=200.0)) if plants > 256 else which
+        for words, which, plants in (
+            ("RK4", case, 256),
+            ("RK4", case, 4096),
+            ("midpoint", halves, 256),
+        ):
+            few = (
+                which.replace(clock=dataclasses.replace(which.clock, duration=200.0))
+                if plants > 256
+                else which
+            )
             a, b, between, apart = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
             assert apart < 1e-10, f"{words}: jaxtank and the C loop are {apart:.1e} cm apart"
             rival = f"vectorised C loop, {b:.1f} ns"
-            rows.append([f"batch of {plants:,}, {words}", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "1.5"])
+            rows.append(
+                [
+                    f"batch of {plants:,}, {words}",
+                    f"{a:.1f} ns per step and plant",
+                    f"{between:.2f}",
+                    rival,
+                    "1.5",
+                ]
+            )
     program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(max(rounds // 4, 3))]
-    told = subprocess.run(program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent).stdout.split()
+    told = subprocess.run(
+        program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent
+    ).stdout.split()
     a, b, between = map(float, told)
     rival = f"vectorised C loop, float32 not compensated, {b:.1f} ns"
     rows.append(
-        ["batch of 256, RK4, float32 with compensated sums", f"{a:.1f} ns per step and plant", f"{between:.2f}", rival, "2.0"]
+        [
+            "batch of 256, RK4, float32 with compensated sums",
+            f"{a:.1f} ns per step and plant",
+            f"{between:.2f}",
+            rival,
+            "2.0",
+        ]
     )
     return rows
 
@@ -152,10 +224,14 @@ with tempfile.TemporaryDirectory() as folder:
 
 
 def gauss_newton(rounds):
-    """Row of the tuner's pass: gradient and Gauss-Newton matrix of 8 parameters over 16 scenarios, beside the run of the same lanes."""
+    """Row of the tuner's pass: gradient and Gauss-Newton matrix of 8 parameters over 16 scenarios,
+    beside the run of the same lanes.
+    """
     case = presets.find("gouta2015/backstepping")
     values = parameters(case)[8]
-    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (LANES, 4)) * np.asarray(case.loop.plant.orifice)
+    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (LANES, 4)) * np.asarray(
+        case.loop.plant.orifice
+    )
     names, point = tuple(values), tuple(values.values())
 
     def compiled(one):
@@ -165,12 +241,22 @@ def gauss_newton(rounds):
     at = lambda o: with_values(case.loop, {"plant.orifice": o})
     calls = {
         "run": compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST)),
-        "pass": compiled(lambda o: sensitivities_compiled(at(o), case.clock, COST, names, point, None, lanes=True)),
+        "pass": compiled(
+            lambda o: sensitivities_compiled(
+                at(o), case.clock, COST, names, point, None, lanes=True
+            )
+        ),
     }
     seconds = timed(calls, max(rounds // 3, 3))
     spent = f"{1e3 * statistics.median(seconds['pass']):.0f} ms"
     return [
-        ["Gauss-Newton pass, 8 parameters, 16 scenarios", spent, ratio(seconds, "pass", "run"), "the run of the same batch", "8"]
+        [
+            "Gauss-Newton pass, 8 parameters, 16 scenarios",
+            spent,
+            ratio(seconds, "pass", "run"),
+            "the run of the same batch",
+            "8",
+        ]
     ]
 
 
@@ -180,17 +266,34 @@ def laws(rounds):
     for name in ("gouta2022/chadpc", "mirakhorli/hybrid", "mirakhorli/sfc", "calofir/backstepping"):
         case = presets.find(name)
         key = jax.random.key(0) if noisy(case) else None
-        once, tenfold = case.clock, dataclasses.replace(case.clock, duration=10 * case.clock.duration)
+        once, tenfold = (
+            case.clock,
+            dataclasses.replace(case.clock, duration=10 * case.clock.duration),
+        )
 
         def run(clock, case=case, key=key):
             return lambda: loop.evaluate(case.loop, clock, COST, key)
 
-        # a run of microseconds is mostly the call: what ten times the samples take longer tells the sample
+        # a run of microseconds is mostly the call: what ten times the samples take longer tells the
+        # sample
         seconds = timed({"once": run(once), "tenfold": run(tenfold)}, rounds)
         short, long = (statistics.median(seconds[word]) for word in ("once", "tenfold"))
         step = 1e9 * (long - short) / ((tenfold.samples - once.samples) * once.substeps)
-        words = f"{name}, {once.integrator}" + (f", {once.substeps} steps to a sample" if once.substeps > 1 else "")
-        rows.append([words, f"{step:.0f} ns per step ({1e3 * short:.1f} ms the run of {once.samples:,} samples)", "", "", "150 ns"])
+        words = f"{name}, {once.integrator}" + (
+            f", {once.substeps} steps to a sample" if once.substeps > 1 else ""
+        )
+        rows.append(
+            [
+                words,
+                (
+                    f"{step:.0f} ns per step ({1e3 * short:.1f} ms the run of {once.samples:,}"
+                    " samples)"
+                ),
+                "",
+                "",
+                "150 ns",
+            ]
+        )
     case = presets.find("khalid/laguerre-constrained")
     case = case.replace(clock=dataclasses.replace(case.clock, duration=600 * case.clock.dt))
     cost = lambda v: loop.evaluate(with_values(case.loop, v), case.clock, COST)[COST[0]]
@@ -207,7 +310,13 @@ def laws(rounds):
         ]
     )
     rows.append(
-        ["its gradient", f"{1e3 * statistics.median(seconds['slope']):.1f} ms", ratio(seconds, "slope", "run"), "the run", "3"]
+        [
+            "its gradient",
+            f"{1e3 * statistics.median(seconds['slope']):.1f} ms",
+            ratio(seconds, "slope", "run"),
+            "the run",
+            "3",
+        ]
     )
     return rows
 
@@ -242,7 +351,10 @@ def cold():
         return f"{statistics.median(times):.2f} s"
 
     program = [sys.executable, "-c", COMPILE]
-    told = [subprocess.run(program, check=True, capture_output=True, text=True).stdout.split() for _ in range(3)]
+    told = [
+        subprocess.run(program, check=True, capture_output=True, text=True).stdout.split()
+        for _ in range(3)
+    ]
     first = [[float(word) for word in words] for words in told]
     run, slope = (f"{statistics.median(v):.2f} s" for v in zip(*first))
     return [
@@ -271,9 +383,18 @@ def main(words):
     rows += cold()
     print(tables.table(rows, HEADS))
     if "--markdown" in words:
-        table = "\n".join([f"| {' | '.join(HEADS)} |", "|---" * len(HEADS) + "|", *(f"| {' | '.join(row)} |" for row in rows)])
+        table = "\n".join(
+            [
+                f"| {' | '.join(HEADS)} |",
+                "|---" * len(HEADS) + "|",
+                *(f"| {' | '.join(row)} |" for row in rows),
+            ]
+        )
         text = README.read_text()
-        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL))
+        write_atomic(
+            README,
+            re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL),
+        )
 
 
 if __name__ == "__main__":

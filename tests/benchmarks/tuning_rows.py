@@ -1,7 +1,9 @@
-"""The rows of the table of tuned gains in README.md here: case, free parameters, objective, other measures.
+"""The rows of the table of tuned gains in README.md here: case, free parameters, objective, other
+measures.
 
 A target is the number of our re-derivation of the paper (S10 of its
-notes), which the tuned objective must reach to 1 % or half a unit of its last digit; tests/test_tuning_rows.py asks for it.
+notes), which the tuned objective must reach to 1 % or half a unit of its last digit;
+tests/test_tuning_rows.py asks for it.
 """
 
 from typing import Any, NamedTuple
@@ -13,7 +15,9 @@ from jaxtank.presets import khalid, mirakhorli
 
 
 class Bound(NamedTuple):
-    """A run whose best inputs are asked for: case and values as in `Row`; objective and limits as `tuning.bound` takes them."""
+    """A run whose best inputs are asked for: case and values as in `Row`; objective and limits as
+    `tuning.bound` takes them.
+    """
 
     case: str
     values: dict = {}
@@ -23,9 +27,13 @@ class Bound(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One tuning. values: by dotted name, set in the case; loop: in the case's place, where `presets` has no case for it; free, objective,
-    limits, scenarios, choices, options: as `tuning.tune` takes them; unit: of the objective; target: see above; bound: name in BOUNDS;
-    held: scenarios that the tuning never sees, None for plants perturbed within the case's own spread."""
+    """One tuning. values: by dotted name, set in the case; loop: in the case's place, where
+    `presets` has no case for it; free, objective,
+    limits, scenarios, choices, options: as `tuning.tune` takes them; unit: of the objective;
+        target: see above; bound: name in BOUNDS;
+    held: scenarios that the tuning never sees, None for plants perturbed within the case's own
+        spread.
+    """
 
     case: str
     values: dict = {}
@@ -38,7 +46,8 @@ class Row(NamedTuple):
     options: dict = {}
     unit: str = "cm"
     target: str | None = None  # as printed there
-    step: float | None = None  # at which it was reached there, where the step moves it by more than 1 % [s]
+    # at which it was reached there, where the step moves it by more than 1 % [s]
+    step: float | None = None
     bound: str | None = None
     held: Any = None
 
@@ -58,7 +67,8 @@ FOUR_TANK = {
     "backstepping-ff": {"controller.k": Free(1e-4, 7.4), "controller.k1": Free(1e-4, 7.4)},
 }
 LOST = {"plant.overflow": True}  # what would rise past 30 cm is lost
-# plant, saturation, ramp [s], levels ("free" to rise, "lost" past the rim, "held" below it), targets by law [cm]
+# plant, saturation, ramp [s], levels ("free" to rise, "lost" past the rim, "held" below it),
+# targets by law [cm]
 FOUR_TANK_SETTINGS = (
     ("B", "clip", 60, "free", ("0.040", "0.046", "0.038")),
     ("B", "clip", 60, "held", (None, None, None)),
@@ -73,18 +83,28 @@ FOUR_TANK_SETTINGS = (
 
 
 def four_tank():
-    """{name: Row} of gouta2015: as clipped or allocated by box QP, without limit, with rims as physics, and below the rims."""
+    """{name: Row} of gouta2015: as clipped or allocated by box QP, without limit, with rims as
+    physics, and below the rims.
+    """
     rows = {}
     for plant, saturation, ramp, levels, targets in FOUR_TANK_SETTINGS:
         for (law, free), target in zip(FOUR_TANK.items(), targets):
-            case = f"gouta2015/{law}{'-table1' * (plant == 'A')}{'-boxqp' * (saturation == 'boxqp')}"
+            case = (
+                f"gouta2015/{law}{'-table1' * (plant == 'A')}{'-boxqp' * (saturation == 'boxqp')}"
+            )
             rows[f"gouta2015-{plant}-{ramp}-{saturation}-{levels}-{law}"] = Row(
                 case,
                 values={"reference.ramp": float(ramp), **(LOST if levels == "lost" else {})},
                 free=free,
                 limits={"max_level": "rim"} if levels == "held" else {},
                 # plant A has many local minima
-                options={"starts": 16, "screening": 128} if plant == "A" else {"starts": 4} if levels != "held" else {},
+                options=(
+                    {"starts": 16, "screening": 128}
+                    if plant == "A"
+                    else {"starts": 4}
+                    if levels != "held"
+                    else {}
+                ),
                 target=target,
                 step=0.05 if (plant, levels) == ("B", "lost") else None,
                 bound=f"gouta2015-{plant}-{ramp}",
@@ -93,7 +113,9 @@ def four_tank():
 
 
 def unseen():
-    """The held-out runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal` does not have."""
+    """The held-out runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal` does
+    not have.
+    """
     x0, u0 = equilibrium(mirakhorli.plant(), mirakhorli.SETPOINT)
     warm_x, warm_u = equilibrium(mirakhorli.plant(), mirakhorli.WARM)
     k1, k2, (g1, g2), a2 = 27.43, 19.55, mirakhorli.SPLIT, 0.50265
@@ -116,7 +138,11 @@ def unseen():
         "a2 -10 %": {**rest, "plant.drain[1]": 0.9 * a2},
         "gamma 2 -10 %": {**rest, "plant.split[1]": 0.9 * g2},
         "gamma 1 +5 %": {**rest, "plant.split[0]": 1.05 * g1},
-        "k1 -15 %, k2 +10 %": {**rest, "plant.pump_gain[0]": 0.85 * k1, "plant.pump_gain[1]": 1.1 * k2},
+        "k1 -15 %, k2 +10 %": {
+            **rest,
+            "plant.pump_gain[0]": 0.85 * k1,
+            "plant.pump_gain[1]": 1.1 * k2,
+        },
     }
     return tuple(
         Scenario(f"{name}, seed {seed}", {**values, "sensor.noise": 0.05}, seed=seed)
@@ -131,7 +157,9 @@ BOTH = {"controller.pairing": ["cross", "same"]}
 
 
 def quadruple():
-    """{name: Row} of mirakhorli, tuned for seven runs with noise and plants that are off, judged on nine others with other seeds."""
+    """{name: Row} of mirakhorli, tuned for seven runs with noise and plants that are off, judged on
+    nine others with other seeds.
+    """
     shared = {"unit": "cm^2 s", "held": unseen, "options": {"starts": 4}}
     nominal = {"scenarios": (), "bound": "mirakhorli-sfc-nominal"}
     return {
@@ -148,14 +176,23 @@ def two_tank():
     rows = {}
     for delay, target in {0.0: "0.505", 0.2: "0.534", 0.5: "0.579", 1.0: "0.657"}.items():
         values, name = {"actuator.delay": delay}, f"gouta2022-delay-{delay:g}"
-        rows[name] = Row("gouta2022/chadpc", values, unit="cm^2", target=target, options={"starts": 4}, bound=name)
+        rows[name] = Row(
+            "gouta2022/chadpc",
+            values,
+            unit="cm^2",
+            target=target,
+            options={"starts": 4},
+            bound=name,
+        )
     return rows
 
 
 PLAIN = {"mean_square_error": 1e4, "mean_square_travel": 20.0}  # J of khalid notes S10 [cm^2]
-# with its price of overshoot, 10 times that of the error: a mean over the plateaus after a rise, which are half of the run
+# with its price of overshoot, 10 times that of the error: a mean over the plateaus after a rise,
+# which are half of the run
 PRICED = {**PLAIN, "mean_square_overshoot": 2e5}
-# two pumps: the prototype runs 300 samples and takes the mean over both pumps, not their sum, of the travel (its starting values 6.040, 7.842 and
+# two pumps: the prototype runs 300 samples and takes the mean over both pumps, not their sum, of
+# the travel (its starting values 6.040, 7.842 and
 # 6.484 are then met to 4 digits)
 HALF = {"clock.duration": 598.0}
 PLAIN_TWO, PRICED_TWO = ({**terms, "mean_square_travel": 10.0} for terms in (PLAIN, PRICED))
@@ -168,29 +205,58 @@ def clipped():
 
 
 def delayed():
-    """Two pumps, scenario M3 of khalid notes S3, which has no steady state half of the time; limits in the programme."""
+    """Two pumps, scenario M3 of khalid notes S3, which has no steady state half of the time; limits
+    in the programme.
+    """
     return khalid.build("laguerre-mimo", "M3", mode="constrained")
 
 
 def metres():
     """{name: Row} of calofir and khalid. A programme at every sample is slow: fewer starts."""
     few = {"starts": 2, "screening": 8, "iterations": 15, "validation": 16}
-    more = {**few, "starts": 4, "screening": 32, "iterations": 30}  # minima nearly as good as each other
+    # minima nearly as good as each other
+    more = {**few, "starts": 4, "screening": 32, "iterations": 30}
     one, two = "khalid/laguerre", "khalid/laguerre-mimo"
     rows = {
-        "laguerre": Row(one, free=FLAT, objective=PLAIN, choices={"controller.N": [1, 2, 4, 8]}, target="7.887", bound="khalid"),
-        "gpc": Row("khalid/gpc", free={"controller.r_w": FLAT["controller.r_w"]}, objective=PLAIN, target="7.873", bound="khalid"),
+        "laguerre": Row(
+            one,
+            free=FLAT,
+            objective=PLAIN,
+            choices={"controller.N": [1, 2, 4, 8]},
+            target="7.887",
+            bound="khalid",
+        ),
+        "gpc": Row(
+            "khalid/gpc",
+            free={"controller.r_w": FLAT["controller.r_w"]},
+            objective=PLAIN,
+            target="7.873",
+            bound="khalid",
+        ),
         "laguerre-priced": Row(one, objective=PRICED, bound="khalid-priced"),
         "clipped": Row(one, loop=clipped, objective=PLAIN, target="12.644", bound="khalid-clipped"),
         "clipped-priced": Row(one, loop=clipped, objective=PRICED, bound="khalid-clipped-priced"),
-        "constrained-priced": Row(f"{one}-constrained", objective=PRICED, options=few, bound="khalid-clipped-priced"),
+        "constrained-priced": Row(
+            f"{one}-constrained", objective=PRICED, options=few, bound="khalid-clipped-priced"
+        ),
         "mimo": Row(two, HALF, objective=PLAIN_TWO, target="4.147", bound="khalid-mimo"),
         "mimo-priced": Row(two, HALF, objective=PRICED_TWO, bound="khalid-mimo-priced"),
         "mimo-constrained": Row(
-            f"{two}-constrained", HALF, objective=PLAIN_TWO, options=more, target="7.719", bound="khalid-mimo-constrained"
+            f"{two}-constrained",
+            HALF,
+            objective=PLAIN_TWO,
+            options=more,
+            target="7.719",
+            bound="khalid-mimo-constrained",
         ),
         "mimo-constrained-M3": Row(
-            f"{two}-constrained", HALF, loop=delayed, objective=PLAIN_TWO, options=more, target="11.12", bound="khalid-mimo-M3"
+            f"{two}-constrained",
+            HALF,
+            loop=delayed,
+            objective=PLAIN_TWO,
+            options=more,
+            target="11.12",
+            bound="khalid-mimo-M3",
         ),
     }
     return {
@@ -204,11 +270,16 @@ ROWS = {**four_tank(), **two_tank(), **quadruple(), **metres()}
 BOUNDS = {
     **{
         f"gouta2015-{plant}-{ramp}": Bound(
-            f"gouta2015/backstepping{'-table1' * (plant == 'A')}", {"reference.ramp": float(ramp)}, limits={"max_level": "rim"}
+            f"gouta2015/backstepping{'-table1' * (plant == 'A')}",
+            {"reference.ramp": float(ramp)},
+            limits={"max_level": "rim"},
         )
         for plant, ramp in (("B", 60), ("B", 30), ("A", 60), ("A", 150))
     },
-    **{f"gouta2022-delay-{delay:g}": Bound("gouta2022/chadpc", {"actuator.delay": delay}) for delay in (0.0, 0.2, 0.5, 1.0)},
+    **{
+        f"gouta2022-delay-{delay:g}": Bound("gouta2022/chadpc", {"actuator.delay": delay})
+        for delay in (0.0, 0.2, 0.5, 1.0)
+    },
     "mirakhorli-sfc-nominal": Bound("mirakhorli/sfc"),
     "calofir-error": Bound("calofir/backstepping", objective={"rms_error_total": 1.0}),
     "khalid": Bound("khalid/laguerre", objective=PLAIN),
@@ -218,5 +289,7 @@ BOUNDS = {
     "khalid-mimo": Bound("khalid/laguerre-mimo", HALF, objective=PLAIN_TWO),
     "khalid-mimo-constrained": Bound("khalid/laguerre-mimo-constrained", HALF, objective=PLAIN_TWO),
     "khalid-mimo-priced": Bound("khalid/laguerre-mimo", HALF, objective=PRICED_TWO),
-    "khalid-mimo-M3": Bound("khalid/laguerre-mimo-constrained", HALF, objective=PLAIN_TWO, loop=delayed),
+    "khalid-mimo-M3": Bound(
+        "khalid/laguerre-mimo-constrained", HALF, objective=PLAIN_TWO, loop=delayed
+    ),
 }

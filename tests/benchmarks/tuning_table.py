@@ -1,11 +1,14 @@
-"""Published gains beside tuned ones, on validation plants and noise, with the perfect-information optimum.
+"""Published gains beside tuned ones, on validation plants and noise, with the perfect-information
+optimum.
 
     python tests/benchmarks/tuning_table.py               # every row; an hour or two on two cores
     python tests/benchmarks/tuning_table.py 'khalid*'     # some, by name
-    python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone; --rows for rows alone
-    python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into README.md here
+    python tests/benchmarks/tuning_table.py --bounds 'gouta2015*'    # bounds alone; --rows for rows
+    alone python tests/benchmarks/tuning_table.py --markdown    # writes what is stored into
+    README.md here
 
-Rows and bounds are those of tuning_rows.py. Each is stored in tuning_table.json as soon as it is done, with the versions it was made with.
+Rows and bounds are those of tuning_rows.py. Each is stored in tuning_table.json as soon as it is
+done, with the versions it was made with.
 """
 
 import fnmatch
@@ -34,12 +37,20 @@ VERSIONS = ("jaxtank", "python", "jax", "jaxlib", "numpy", "scipy", "optax", "dt
 def tuned(name):
     """The TuningResult of a row."""
     row = ROWS[name]
-    given = {"free": row.free, "objective": row.objective, "limits": row.limits, "scenarios": row.scenarios, "choices": row.choices}
+    given = {
+        "free": row.free,
+        "objective": row.objective,
+        "limits": row.limits,
+        "scenarios": row.scenarios,
+        "choices": row.choices,
+    }
     return tuning.tune(case_of(row), **given, **row.options)
 
 
 def held_out(row, result):
-    """{"runs", "before", "after", ...} on runs that the tuning never saw: means of the objective, and the share of runs made better."""
+    """{"runs", "before", "after", ...} on runs that the tuning never saw: means of the objective,
+    and the share of runs made better.
+    """
     if row.held is None:
         found = result.validation
         return found and {
@@ -49,20 +60,29 @@ def held_out(row, result):
             "better_share": found["better_share"],
             "limits_held": found["limits_held"],
         }
-    problem = tuning.Problem(result.case, free=row.free, objective=row.objective, limits=row.limits, scenarios=row.held())
+    problem = tuning.Problem(
+        result.case, free=row.free, objective=row.objective, limits=row.limits, scenarios=row.held()
+    )
     rows = {side: [{n: p[side] for n, p in result.parameters.items()}] for side in SIDES}
-    points = np.array([[float(b.to_unit(rows[side][0][b.name])) for b in problem.bounds] for side in SIDES])
+    points = np.array(
+        [[float(b.to_unit(rows[side][0][b.name])) for b in problem.bounds] for side in SIDES]
+    )
     costs, margins = problem.screen(points)
     return {
         "runs": len(problem.lanes),
         "before": float(costs[0]),
         "after": float(costs[1]),
-        "limits_held": {"before": bool(np.all(margins[0] >= 0)), "after": bool(np.all(margins[1] >= 0))},
+        "limits_held": {
+            "before": bool(np.all(margins[0] >= 0)),
+            "after": bool(np.all(margins[1] >= 0)),
+        },
     }
 
 
 def worst(constraints):
-    """The limit that is broken most, or nearest to it, with the amount by which it is passed [its unit]; None without limits."""
+    """The limit that is broken most, or nearest to it, with the amount by which it is passed [its
+    unit]; None without limits.
+    """
     tight = min(constraints, key=lambda c: c["margin"], default=None)
     return tight and {
         "name": tight["name"],
@@ -73,8 +93,13 @@ def worst(constraints):
 
 
 def levels(measures):
-    """What the levels did on the case's own run: {"highest", "lost"}, in the rig's unit of length and its cube."""
-    return {"highest": float(np.max(measures["max_level"])), "lost": float(np.sum(measures["overflow_volume"]))}
+    """What the levels did on the case's own run: {"highest", "lost"}, in the rig's unit of length
+    and its cube.
+    """
+    return {
+        "highest": float(np.max(measures["max_level"])),
+        "lost": float(np.sum(measures["overflow_volume"])),
+    }
 
 
 def measure(name):
@@ -86,16 +111,29 @@ def measure(name):
         "method": result.method,
         "status": result.status,
         "message": result.message,
-        "parameters": {n: {k: p[k] for k in ("before", "after", "unit", "at_bound")} for n, p in result.parameters.items()},
+        "parameters": {
+            n: {k: p[k] for k in ("before", "after", "unit", "at_bound")}
+            for n, p in result.parameters.items()
+        },
         "choices": result.choices,
         "chosen": choice[0]["values"] if choice else {},
-        "objective": {**result.objective, "unit": row.unit, "target": row.target and float(row.target)},
-        "limits": {"before": worst(constraint_rows(result.problem, result.tables["before"])), "after": worst(result.constraints)},
+        "objective": {
+            **result.objective,
+            "unit": row.unit,
+            "target": row.target and float(row.target),
+        },
+        "limits": {
+            "before": worst(constraint_rows(result.problem, result.tables["before"])),
+            "after": worst(result.constraints),
+        },
         "levels": {side: levels(result.measures[side]) for side in SIDES},
         "length": result.case.loop.plant.units[0],
         "held_out": held_out(row, result),
         "bound": row.bound,
-        "agree": sum(s["violation"] == 0.0 and s["cost"] <= result.objective["after"] * 1.001 for s in result.starts),
+        "agree": sum(
+            s["violation"] == 0.0 and s["cost"] <= result.objective["after"] * 1.001
+            for s in result.starts
+        ),
         "starts": len(result.starts),
         "evaluations": result.evaluations,
         "wall_s": result.wall_s,
@@ -111,7 +149,11 @@ def best_inputs(name):
     made_with = provenance.provenance(case, 0)
     told = found.to_json()
     kept = ("cost", "objective", "holds", "closed_loop", "source", "interval_s", "grids", "wall_s")
-    return {"case": case.name, **{n: told[n] for n in kept}, "versions": {n: made_with[n] for n in VERSIONS}}
+    return {
+        "case": case.name,
+        **{n: told[n] for n in kept},
+        "versions": {n: made_with[n] for n in VERSIONS},
+    }
 
 
 def load():
@@ -124,7 +166,9 @@ def keep(kind, name, found):
     stored = load()
     stored[kind][name] = _plain(found)
     order = {"rows": ROWS, "bounds": BOUNDS}
-    stored = {kind: {n: stored[kind][n] for n in order[kind] if n in stored[kind]} for kind in order}
+    stored = {
+        kind: {n: stored[kind][n] for n in order[kind] if n in stored[kind]} for kind in order
+    }
     write_atomic(STORE, json.dumps(stored, indent=1, allow_nan=False) + "\n")
 
 
@@ -152,7 +196,10 @@ def _free(row):
     shown = []
     for base, values in arrays.items():
         sides = [", ".join(f"{v:.3g}" for v in side) for side in zip(*values)]
-        shown.append(f"{base} {sides[0]} → {sides[1]}{' ' + units[base] if units[base] not in ('', '-') else ''}")
+        shown.append(
+            f"{base} {sides[0]} →"
+            f" {sides[1]}{' ' + units[base] if units[base] not in ('', '-') else ''}"
+        )
     shown += [f"{n.removeprefix('controller.')} = {v}" for n, v in row["chosen"].items()]
     return "; ".join(shown)
 
@@ -162,8 +209,12 @@ def _limits(row):
     if row["limits"]["after"] is not None:
         return f"passed by {_passed(row, 'before')} → {_passed(row, 'after')}"
     if side["before"]["lost"] > 0:
-        return "rims are physics; lost {:.0f} → {:.0f} cm^3".format(*(1e6**metres * side[s]["lost"] for s in SIDES))
-    return "none; highest {:.1f} → {:.1f} cm".format(*(100**metres * side[s]["highest"] for s in SIDES))
+        return "rims are physics; lost {:.0f} → {:.0f} cm^3".format(
+            *(1e6**metres * side[s]["lost"] for s in SIDES)
+        )
+    return "none; highest {:.1f} → {:.1f} cm".format(
+        *(100**metres * side[s]["highest"] for s in SIDES)
+    )
 
 
 def _passed(row, side):
@@ -185,7 +236,11 @@ def _held(row):
     if not found:
         return "-"
     shares = [100 * float(found["limits_held"][s]) for s in SIDES]
-    kept = "" if row["limits"]["after"] is None or min(shares) == 100 else "; limits hold in {:.0f} → {:.0f} %".format(*shares)
+    kept = (
+        ""
+        if row["limits"]["after"] is None or min(shares) == 100
+        else "; limits hold in {:.0f} → {:.0f} %".format(*shares)
+    )
     return _pair(found["before"], found["after"]) + kept
 
 
@@ -196,7 +251,15 @@ def _bound(row, bounds):
 
 def markdown(stored):
     """The table that belongs between the marks."""
-    heads = ("row", "published → tuned", "objective", "limits at the true step", "validation plants and noise", "bound", "s")
+    heads = (
+        "row",
+        "published → tuned",
+        "objective",
+        "limits at the true step",
+        "validation plants and noise",
+        "bound",
+        "s",
+    )
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in stored["rows"].items():
         cells = [
@@ -213,7 +276,9 @@ def markdown(stored):
 
 
 def picked(patterns, names):
-    """Those of `names` that one of the patterns matches; all of them where there is no pattern. Raises KeyError where one matches none."""
+    """Those of `names` that one of the patterns matches; all of them where there is no pattern.
+    Raises KeyError where one matches none.
+    """
     for pattern in patterns:
         if not fnmatch.filter(names, pattern):
             raise KeyError(f"no row is named {pattern}; there are {', '.join(names)}")
@@ -225,17 +290,33 @@ def main(words):
     patterns = [w for w in words if not w.startswith("--")]
     if "--markdown" in words:
         text = README.read_text()
-        write_atomic(README, re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{markdown(load())}\n{END}", text, flags=re.DOTALL))
+        write_atomic(
+            README,
+            re.sub(
+                f"{BEGIN}.*?{END}",
+                lambda _: f"{BEGIN}\n{markdown(load())}\n{END}",
+                text,
+                flags=re.DOTALL,
+            ),
+        )
         return
     if "--bounds" not in words:
         for name in picked(patterns, ROWS):
             found = measure(name)
             keep("rows", name, found)
             aim = found["objective"]
-            print(f"{name}: {_pair(aim['before'], aim['after'])}, {found['status']}, {found['wall_s']:.0f} s", flush=True)
+            print(
+                f"{name}: {_pair(aim['before'], aim['after'])}, {found['status']},"
+                f" {found['wall_s']:.0f} s",
+                flush=True,
+            )
     if "--rows" in words:
         return
-    needed = picked(patterns, BOUNDS) if "--bounds" in words else {ROWS[n].bound for n in picked(patterns, ROWS)} - {None}
+    needed = (
+        picked(patterns, BOUNDS)
+        if "--bounds" in words
+        else {ROWS[n].bound for n in picked(patterns, ROWS)} - {None}
+    )
     for name in sorted(set(needed) - (set() if "--bounds" in words else set(load()["bounds"]))):
         found = best_inputs(name)
         keep("bounds", name, found)

@@ -38,7 +38,13 @@ faster: jaxtank.ClosedLoop = jaxtank.with_values(loop, {"controller.k1": 0.09})
 mine: jaxtank.Case = rig.loads('case = "gouta2015/backstepping"')
 
 two: TankNetwork = jaxtank.plants.coupled_tanks(
-    area=[1.0, 1.0], drain=[0.1, 0.1], pipe=0.1, pump_gain=1.0, rim=50.0, outputs=(1,), feeds=((0, None),)
+    area=[1.0, 1.0],
+    drain=[0.1, 0.1],
+    pipe=0.1,
+    pump_gain=1.0,
+    rim=50.0,
+    outputs=(1,),
+    feeds=((0, None),),
 )
 
 result: tuning.TuningResult = tuning.tune(case, starts=4, limits={"max_level": 30.0})

@@ -21,7 +21,12 @@ from tuning.report import tables
 from tuning.search.provenance import provenance
 
 MEASURES = ("rms_error_total", "max_level")
-CASES = ("gouta2015/backstepping", "gouta2015/ngpc", "gouta2015/backstepping-ff", "gouta2015/ngpc-boxqp")
+CASES = (
+    "gouta2015/backstepping",
+    "gouta2015/ngpc",
+    "gouta2015/backstepping-ff",
+    "gouta2015/ngpc-boxqp",
+)
 SOURCE = Path(__file__).with_name("floor.c")
 
 
@@ -31,12 +36,16 @@ def _compilations():
 
 
 def c_loop(folder):
-    """The C loop of floor.c, built with gcc -O3 -march=native in `folder`; None where there is no gcc."""
+    """The C loop of floor.c, built with gcc -O3 -march=native in `folder`; None where there is no
+    gcc.
+    """
     if shutil.which("gcc") is None:
         return None
     library = Path(folder) / "floor.so"
     subprocess.run(
-        ["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"], check=True, capture_output=True
+        ["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(library), str(SOURCE), "-lm"],
+        check=True,
+        capture_output=True,
     )
     function = ctypes.CDLL(str(library)).four_tank
     function.restype = ctypes.c_double
@@ -44,21 +53,44 @@ def c_loop(folder):
 
 
 def c_runner(function, case, rk4=True):
-    """A call of the C loop with the numbers of `case` (backstepping as printed): () -> (rms error [cm], highest levels [cm])."""
+    """A call of the C loop with the numbers of `case` (backstepping as printed): () -> (rms error
+    [cm], highest levels [cm]).
+    """
     plant, law, clock = case.loop.plant, case.loop.controller, case.clock
-    numbers = np.concatenate([plant.area, plant.drain[:2], plant.orifice, plant.pump_gain, [float(plant.gravity), plant.knee]])
+    numbers = np.concatenate(
+        [
+            plant.area,
+            plant.drain[:2],
+            plant.orifice,
+            plant.pump_gain,
+            [float(plant.gravity), plant.knee],
+        ]
+    )
     r = np.ascontiguousarray(np.array(case.loop.reference.sample(clock)[0]))
     x0, result = np.array(case.loop.x0, dtype=float), np.zeros(5)
 
     def pointer(array):
         return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
 
-    real = [float(clock.dt), float(law.k), float(law.k1), float(law.level_floor), float(case.loop.actuator.high[0])]
+    real = [
+        float(clock.dt),
+        float(law.k),
+        float(law.k1),
+        float(law.level_floor),
+        float(case.loop.actuator.high[0]),
+    ]
     dt, *rest = (ctypes.c_double(v) for v in real)
 
     def run():
         rms = function(
-            pointer(numbers), ctypes.c_long(clock.samples), dt, int(rk4), *rest, pointer(x0), pointer(r), pointer(result)
+            pointer(numbers),
+            ctypes.c_long(clock.samples),
+            dt,
+            int(rk4),
+            *rest,
+            pointer(x0),
+            pointer(r),
+            pointer(result),
         )
         return rms, result[1:].copy()
 
@@ -66,7 +98,9 @@ def c_runner(function, case, rk4=True):
 
 
 def timed(calls, rounds):
-    """{name: [seconds of each round]}: every call once a round, in turn, after a warm-up; {name: first result}."""
+    """{name: [seconds of each round]}: every call once a round, in turn, after a warm-up; {name:
+    first result}.
+    """
     results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
     seconds = {name: [] for name in calls}
     for _ in range(rounds):
@@ -82,13 +116,21 @@ def measure(rounds=7):
     cases = {name: presets.find(name) for name in CASES}
     first = cases[CASES[0]]
     gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
-    derivative = jax.jit(jax.jacfwd(lambda v: lp.evaluate(with_values(first.loop, v), first.clock, MEASURES)["rms_error_total"]))
+    derivative = jax.jit(
+        jax.jacfwd(
+            lambda v: lp.evaluate(with_values(first.loop, v), first.clock, MEASURES)[
+                "rms_error_total"
+            ]
+        )
+    )
     compile_s = {}
     calls = {}
     for name, case in cases.items():
         calls[name] = lambda case=case: lp.evaluate(case.loop, case.clock, MEASURES)
     calls["jacfwd for 2 gains"] = lambda: derivative(gains)
-    calls["gradient, Gauss-Newton and maxima for 2 gains"] = lambda: lp.sensitivities(first.loop, first.clock, MEASURES, gains)
+    calls["gradient, Gauss-Newton and maxima for 2 gains"] = lambda: lp.sensitivities(
+        first.loop, first.clock, MEASURES, gains
+    )
     for name, call in calls.items():
         began = time.perf_counter()
         jax.block_until_ready(call())
@@ -110,13 +152,23 @@ def measure(rounds=7):
         }
         for name, s in seconds.items()
     }
-    found = {"steps": first.clock.samples, "rounds": rounds, "rows": rows, "provenance": provenance(first, None)}
+    found = {
+        "steps": first.clock.samples,
+        "rounds": rounds,
+        "rows": rows,
+        "provenance": provenance(first, None),
+    }
     if "C loop, backstepping" in seconds:
         rms, top = results["C loop, backstepping"]
         ours = results[CASES[0]]
-        found["ratio_to_c"] = statistics.median(a / b for a, b in zip(seconds[CASES[0]], seconds["C loop, backstepping"]))
+        found["ratio_to_c"] = statistics.median(
+            a / b for a, b in zip(seconds[CASES[0]], seconds["C loop, backstepping"])
+        )
         found["difference_to_c_cm"] = float(
-            max(abs(rms - float(ours["rms_error_total"])), np.max(np.abs(top - np.asarray(ours["max_level"]))))
+            max(
+                abs(rms - float(ours["rms_error_total"])),
+                np.max(np.abs(top - np.asarray(ours["max_level"]))),
+            )
         )
     found["notes"] = _notes(found, function)
     return found
@@ -130,7 +182,8 @@ def _notes(found, function):
         notes.append("no gcc here, so there is no C loop to compare with")
     if found["provenance"]["backend"] != "cpu":
         notes.append(
-            f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small steps and belongs on a CPU"
+            f"these runs are on {found['provenance']['backend']}: a single loop is a chain of small"
+            " steps and belongs on a CPU"
         )
     return notes
 
@@ -149,62 +202,88 @@ def text(found):
         for n, r in found["rows"].items()
     ]
     lines = [
-        f"one run of {found['steps']} steps, float64, {found['provenance']['integrator']}; medians of {found['rounds']} interleaved rounds",
+        (
+            f"one run of {found['steps']} steps, float64, {found['provenance']['integrator']};"
+            f" medians of {found['rounds']} interleaved rounds"
+        ),
         "",
         tables.table(rows, ["run", "ns/step", "ms", "spread", "first call s", "x backstepping"]),
     ]
     if "ratio_to_c" in found:
         lines += [
             "",
-            f"backstepping over the C loop of the same arithmetic (gcc -O3 -march=native): {found['ratio_to_c']:.2f}; "
-            f"the two agree to {found['difference_to_c_cm']:.1e} cm",
+            (
+                "backstepping over the C loop of the same arithmetic (gcc -O3 -march=native):"
+                f" {found['ratio_to_c']:.2f}; the two agree to {found['difference_to_c_cm']:.1e} cm"
+            ),
         ]
     return "\n".join([*lines, *found["notes"]])
 
 
 def is_one_function(program, samples):
-    """True if the time loop (the loop of `samples` turns) of a compiled program's text is one that XLA runs as one function."""
-    small = set(re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program))
+    """True if the time loop (the loop of `samples` turns) of a compiled program's text is one that
+    XLA runs as one function.
+    """
+    small = set(
+        re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program)
+    )
     inside = None
     for line in program.splitlines():
         if line.startswith(("%", "ENTRY")):
             inside = line.split()[0]
-        elif " while(" in line and f'"known_trip_count":{{"n":"{samples}"}}' in line and inside in small:
+        elif (
+            " while(" in line
+            and f'"known_trip_count":{{"n":"{samples}"}}' in line
+            and inside in small
+        ):
             return True
     return False
 
 
 WALLED = ("custom-call", "scatter", "sort", "fft", "partition-id", "outfeed", "infeed")
-"""Operations that keep XLA from compiling a loop to one function (methods 2.1): LAPACK, callbacks, `.at[].set`, sorting."""
+"""Operations that keep XLA from compiling a loop to one function (methods 2.1): LAPACK, callbacks,
+`.at[].set`, sorting.
+"""
 
-OFF = "the XLA options are off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): each operation of the loop is dispatched by itself"
+OFF = (
+    "the XLA options are off (JAXTANK_XLA_OPTION=0, or jax started before jaxtank): each operation"
+    " of the loop is dispatched by itself"
+)
 
 
 def reasons(program, samples, option, dtype, compiled):
     """Why a run is slower or less exact than it could be, in words; [] if nothing is known.
 
-    program: text of the compiled run; samples: of its loop; option: whether the XLA options are on; dtype: of the levels; compiled: how
-    many programs three further runs compiled."""
+    program: text of the compiled run; samples: of its loop; option: whether the XLA options are on;
+    dtype: of the levels; compiled: how many programs three further runs compiled.
+    """
     found = []
     if not is_one_function(program, samples):
         named = [word for word in WALLED if f" {word}(" in program]
         found.append(
             OFF
             if not option
-            else f"the time loop is not one function: it holds {', '.join(named) or 'more than XLA takes for a small loop'}"
+            else (
+                "the time loop is not one function: it holds"
+                f" {', '.join(named) or 'more than XLA takes for a small loop'}"
+            )
         )
     if dtype == np.float32:
-        found.append("float32: less exact, and one run is no faster for it; many lanes are (half the time)")
+        found.append(
+            "float32: less exact, and one run is no faster for it; many lanes are (half the time)"
+        )
     if compiled:
         found.append(
-            f"traced anew at every call: {compiled} of 3 further runs compiled a program (a static field changes between calls)"
+            f"traced anew at every call: {compiled} of 3 further runs compiled a program (a static"
+            " field changes between calls)"
         )
     return found
 
 
 def measure_cases(cases, rounds=3):
-    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s", "reasons"}} of {name: Case}: a run with two measures, median
-    of `rounds`."""
+    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s", "reasons"}} of {name:
+    Case}: a run with two measures, median of `rounds`.
+    """
     found = {}
     for name, case in cases.items():
         key = jax.random.key(0) if noisy(case) else None
@@ -212,7 +291,10 @@ def measure_cases(cases, rounds=3):
         began = time.perf_counter()
         text_of_program = program.compile().as_text()
         first = time.perf_counter() - began
-        seconds, results = timed({name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)}, rounds)
+        seconds, results = timed(
+            {name: lambda case=case, key=key: lp.evaluate(case.loop, case.clock, MEASURES, key)},
+            rounds,
+        )
         median = statistics.median(seconds[name])
         before = _compilations()
         for _ in range(3):
@@ -248,4 +330,6 @@ def text_of_cases(found):
         for name, r in found.items()
     ]
     why = [f"{name}: {reason}" for name, r in found.items() for reason in r["reasons"]]
-    return "\n".join([tables.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why])
+    return "\n".join(
+        [tables.table(rows, ["case", "ns/step", "steps", "ms", "one function", "compile s"]), *why]
+    )

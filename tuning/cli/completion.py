@@ -1,7 +1,8 @@
 """Shell completion, generated from the parser: `jaxtank completion bash|zsh|fish` prints a script.
 
-The words that only a started jax knows (cases, parameters, measures) are kept in names.txt beside this file; `refresh()` writes it anew and
-a test holds it to what the library has. Nothing here imports jax.
+The words that only a started jax knows (cases, parameters, measures) are kept in names.txt beside
+this file; `refresh()` writes it anew and a test holds it to what the library has. Nothing here
+imports jax.
 """
 
 import argparse
@@ -46,7 +47,9 @@ FEW = {
 
 
 class Option(NamedTuple):
-    """An option of a command: its spellings, what its value is ("" for a flag, "text" for what is not completed), a line of help."""
+    """An option of a command: its spellings, what its value is ("" for a flag, "text" for what is
+    not completed), a line of help.
+    """
 
     flags: tuple
     value: str
@@ -62,7 +65,9 @@ class Command(NamedTuple):
 
 
 def script(shell, parser):
-    """The completion script of a shell, of SHELLS, for a parser with subcommands. Raises InputError for another shell."""
+    """The completion script of a shell, of SHELLS, for a parser with subcommands. Raises InputError
+    for another shell.
+    """
     if shell not in SHELLS:
         raise unknown("shell", shell, SHELLS)
     return {"bash": bash, "zsh": zsh, "fish": fish}[shell](commands_of(parser), words())
@@ -84,9 +89,15 @@ def _options(command, parser):
     for a in parser._actions:
         if not a.option_strings:
             continue
-        few = next((" ".join(FEW[command, o]) for o in a.option_strings if (command, o) in FEW), None)
+        few = next(
+            (" ".join(FEW[command, o]) for o in a.option_strings if (command, o) in FEW), None
+        )
         measured = command and "--measure" in a.option_strings and command != "identify"
-        kind = "" if a.nargs == 0 else few or ("measures" if measured else KINDS.get(a.metavar, "text"))
+        kind = (
+            ""
+            if a.nargs == 0
+            else few or ("measures" if measured else KINDS.get(a.metavar, "text"))
+        )
         found.append(Option(tuple(a.option_strings), kind, (a.help or "").replace("%%", "%")))
     return found
 
@@ -98,7 +109,10 @@ def words():
         kind, _, word = line.partition(" ")
         found[kind].append(word)
     papers = list(dict.fromkeys(c.split("/")[0] for c in found["cases"]))
-    with_value = {"parameters": [f"{p}=" for p in found["parameters"]], "limits": [f"{m}=" for m in found["measures"]]}
+    with_value = {
+        "parameters": [f"{p}=" for p in found["parameters"]],
+        "limits": [f"{m}=" for m in found["measures"]],
+    }
     return {**found, **with_value, "papers": [*papers, "all"], "shells": list(SHELLS)}
 
 
@@ -112,7 +126,11 @@ def gather():
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():
         for kind in ("leaf", "static"):
-            names |= {n for n, v, _ in walk(presets.find(case).loop, kind=kind) if not isinstance(v, tuple)}
+            names |= {
+                n
+                for n, v, _ in walk(presets.find(case).loop, kind=kind)
+                if not isinstance(v, tuple)
+            }
     lines = [f"cases {c}" for c in presets.names()] + [f"parameters {n}" for n in sorted(names)]
     return "\n".join([*lines, *(f"measures {m}" for m in MEASURES)]) + "\n"
 
@@ -125,7 +143,8 @@ def refresh():
 def bash(commands, words):
     """A function that bash calls with the words of the line, and its registration."""
     lines = [
-        '# jaxtank completion for bash: eval "$(jaxtank completion bash)", or a file in ~/.local/share/bash-completion/completions/jaxtank'
+        '# jaxtank completion for bash: eval "$(jaxtank completion bash)", or a file in'
+        " ~/.local/share/bash-completion/completions/jaxtank"
     ]
     lines += [f"_jaxtank_{kind}='{' '.join(own)}'" for kind, own in words.items()]
     lines += BASH_HEAD.splitlines()
@@ -136,14 +155,24 @@ def bash(commands, words):
         lines.append('        case "$prev" in')
         for option in command.options:
             if option.value:
-                lines.append(f"        {'|'.join(option.flags)}) {_bash_value(option.value)}; return ;;")
+                lines.append(
+                    f"        {'|'.join(option.flags)}) {_bash_value(option.value)}; return ;;"
+                )
         lines += ["        =) return ;;", "        esac"]
         flags = " ".join(f for o in command.options for f in o.flags)
         lines.append(
-            f'        if [[ $cur == -* ]]; then _jaxtank_words "{flags}"; else {_bash_value(command.argument or "text")}; fi ;;'
+            f'        if [[ $cur == -* ]]; then _jaxtank_words "{flags}"; else'
+            f" {_bash_value(command.argument or 'text')}; fi ;;"
         )
-    starts = " ".join([*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)])
-    lines += [f"    '') _jaxtank_words '{starts}' ;;", "    esac", "}", "complete -F _jaxtank jaxtank"]
+    starts = " ".join(
+        [*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)]
+    )
+    lines += [
+        f"    '') _jaxtank_words '{starts}' ;;",
+        "    esac",
+        "}",
+        "complete -F _jaxtank jaxtank",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -155,7 +184,10 @@ def _bash_value(kind):
     if kind in ("papers", "measures", "shells"):
         return f'_jaxtank_words "$_jaxtank_{kind}"'
     if kind in ("folders", "files"):
-        return f'COMPREPLY=( $(compgen -{"d" if kind == "folders" else "f"} -- "$cur") ); compopt -o filenames 2>/dev/null'
+        return (
+            f'COMPREPLY=( $(compgen -{"d" if kind == "folders" else "f"} -- "$cur") ); compopt -o'
+            " filenames 2>/dev/null"
+        )
     return ":" if kind == "text" else f"_jaxtank_words '{kind}'"
 
 
@@ -179,7 +211,10 @@ def zsh(commands, words):
     """A function for zsh's own completion system, and its registration."""
     lines = [
         "#compdef jaxtank",
-        '# jaxtank completion for zsh: eval "$(jaxtank completion zsh)" after compinit, or a file _jaxtank in $fpath',
+        (
+            '# jaxtank completion for zsh: eval "$(jaxtank completion zsh)" after compinit, or a'
+            " file _jaxtank in $fpath"
+        ),
     ]
     lines += [f"_jaxtank_{kind}=({' '.join(own)})" for kind, own in words.items()]
     lines += ZSH_HEAD.splitlines()
@@ -189,13 +224,20 @@ def zsh(commands, words):
         lines += [f"    {name})", '        case "$prev" in']
         for option in command.options:
             if option.value:
-                lines.append(f"        {'|'.join(option.flags)}) {_zsh_value(option.value)}; return ;;")
+                lines.append(
+                    f"        {'|'.join(option.flags)}) {_zsh_value(option.value)}; return ;;"
+                )
         flags = " ".join(f for o in command.options for f in o.flags)
         lines += [
             "        esac",
-            f"        if [[ $cur == -* ]]; then compadd -- {flags}; else {_zsh_value(command.argument or 'text')}; fi ;;",
+            (
+                f"        if [[ $cur == -* ]]; then compadd -- {flags}; else"
+                f" {_zsh_value(command.argument or 'text')}; fi ;;"
+            ),
         ]
-    starts = " ".join([*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)])
+    starts = " ".join(
+        [*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)]
+    )
     lines += [f"    '') compadd -- {starts} ;;", "    esac", "}", ZSH_TAIL]
     return "\n".join(lines) + "\n"
 
@@ -212,7 +254,9 @@ def _zsh_value(kind):
     return ":" if kind == "text" else f"compadd -- {kind}"
 
 
-ZSH_TAIL = 'if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtank jaxtank; fi'
+ZSH_TAIL = (
+    'if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtank jaxtank; fi'
+)
 
 ZSH_HEAD = """_jaxtank() {
     local cur="${words[CURRENT]}" prev="${words[CURRENT-1]}" command='' word
@@ -225,20 +269,38 @@ ZSH_HEAD = """_jaxtank() {
 def fish(commands, words):
     """Lines `complete -c jaxtank ...`, one per command and option."""
     lines = [
-        "# jaxtank completion for fish: jaxtank completion fish > ~/.config/fish/completions/jaxtank.fish",
+        (
+            "# jaxtank completion for fish: jaxtank completion fish >"
+            " ~/.config/fish/completions/jaxtank.fish"
+        ),
         "complete -c jaxtank -f",
     ]
     quote = lambda text: "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
     for name, command in commands.items():
         here = f"'__fish_seen_subcommand_from {name}'" if name else "'__fish_use_subcommand'"
         if name:
-            lines.append(f"complete -c jaxtank -n '__fish_use_subcommand' -a {name} -d {quote(command.help)}")
+            lines.append(
+                f"complete -c jaxtank -n '__fish_use_subcommand' -a {name} -d {quote(command.help)}"
+            )
             values = _fish_value(command.argument, words)
             lines += [f"complete -c jaxtank -n {here} {values}"] if values else []
         for option in command.options:
-            spelled = " ".join(f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in option.flags)
+            spelled = " ".join(
+                f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in option.flags
+            )
             value = f"-r {_fish_value(option.value, words)}".rstrip() if option.value else ""
-            lines.append(" ".join(filter(None, [f"complete -c jaxtank -n {here} {spelled}", value, f"-d {quote(option.help)}"])))
+            lines.append(
+                " ".join(
+                    filter(
+                        None,
+                        [
+                            f"complete -c jaxtank -n {here} {spelled}",
+                            value,
+                            f"-d {quote(option.help)}",
+                        ],
+                    )
+                )
+            )
     return "\n".join(lines) + "\n"
 
 

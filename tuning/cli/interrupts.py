@@ -1,5 +1,5 @@
-"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`. It is imported before all else, so it imports
-only what is part of the interpreter; any module of `tuning` may import it.
+"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`. It is imported before all else, so it
+imports only what is part of the interpreter; any module of `tuning` may import it.
 
 The program ends at once, with exit code 130 or 143 and one line, wherever it is: in an import, in a
 compilation, in a run. Only a search that has found something (`Interrupts`) goes on after the first
@@ -22,7 +22,8 @@ _held = []  # True once the main thread waits for its end
 
 
 def listen():
-    """Answer SIGINT and SIGTERM from now on: for a program of its own, never for a caller's process.
+    """Answer SIGINT and SIGTERM from now on: for a program of its own, never for a caller's
+    process.
 
     A thread answers them. The main thread cannot while it is in native code, which may compile for
     minutes, and an exception raised in an import would leave a module half made.
@@ -37,7 +38,8 @@ def listen():
         except RuntimeError:  # no more threads for this user: the main thread answers when it can
             _signal.set_wakeup_fd(-1)
     for number in SIGNALS:
-        if _signal.getsignal(number) != _signal.SIG_IGN:  # a script that ran this with & keeps its Ctrl-C
+        # a script that ran this with & keeps its Ctrl-C
+        if _signal.getsignal(number) != _signal.SIG_IGN:
             _signal.signal(number, _handler)
     atexit.register(_end)  # the first to be registered is the last to be called
 
@@ -115,8 +117,9 @@ class before_leaving:
 
 
 class Interrupts:
-    """Ctrl-C of a search: from the first `check` on, the first one lets it end with the best point so
-    far, the second ends the program at once. Before that there is nothing yet that could be lost.
+    """Ctrl-C of a search: from the first `check` on, the first one lets it end with the best point
+    so far, the second ends the program at once. Before that there is nothing yet that could be
+    lost.
     """
 
     def __init__(self):

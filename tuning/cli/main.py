@@ -1,8 +1,9 @@
 """The command `jaxtank`. Results on stdout, progress and errors on stderr.
 
-Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing written), 3 not converged, 4 limits cannot
-be met, 5 bad data file, 130 interrupted (the best point so far of a search is written and printed), 143 terminated. Nothing heavy is
-imported before the arguments are read.
+Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing
+written), 3 not converged, 4 limits cannot be met, 5 bad data file, 130 interrupted (the best point
+so far of a search is written and printed), 143 terminated. Nothing heavy is imported before the
+arguments are read.
 """
 
 import importlib
@@ -61,7 +62,11 @@ def _run(argv):
             kind = "option" if rest[0].startswith("-") else "argument"
             raise InputError(
                 f"unknown {kind} {rest[0]!r}"
-                + (nearest(rest[0].split("=")[0], top.options(args.command)) if kind == "option" else "")
+                + (
+                    nearest(rest[0].split("=")[0], top.options(args.command))
+                    if kind == "option"
+                    else ""
+                )
             )
         if args.version:
             import jaxtank
@@ -73,8 +78,15 @@ def _run(argv):
         args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
         folder = folder_of(args)
         if getattr(args, "resume", None) and not os.path.isdir(folder):
-            raise InputError(f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder")
-        with hold(folder, shared=getattr(args, "shard", None) is not None, leaving=interrupts.before_leaving):
+            raise InputError(
+                f"--resume: {folder!r} cannot be read as a run to go on with: there is no such"
+                " folder"
+            )
+        with hold(
+            folder,
+            shared=getattr(args, "shard", None) is not None,
+            leaving=interrupts.before_leaving,
+        ):
             module, name = COMMANDS[args.command].split(".")
             code = getattr(importlib.import_module(f"tuning.cli.commands.{module}"), name)(args)
         sys.stdout.flush()
@@ -89,21 +101,27 @@ def _run(argv):
         _drop_output()
         return 0
     except OSError as error:
-        print(f"jaxtank: {one_line(error.filename or 'output')}: {error.strerror or one_line(error)}", file=sys.stderr)
+        print(
+            f"jaxtank: {one_line(error.filename or 'output')}: {error.strerror or one_line(error)}",
+            file=sys.stderr,
+        )
         _drop_output()
         return 2
     except Exception as error:
         if os.environ.get("JAXTANK_TRACEBACK"):
             raise
         print(
-            f"jaxtank: internal error: {type(error).__name__}: {one_line(error)} (JAXTANK_TRACEBACK=1 shows where)",
+            f"jaxtank: internal error: {type(error).__name__}: {one_line(error)}"
+            " (JAXTANK_TRACEBACK=1 shows where)",
             file=sys.stderr,
         )
         return 1
 
 
 def _drop_output():
-    """Let go of what stdout cannot take (a reader that has left, a full disk), so that the end of the program does not try again."""
+    """Let go of what stdout cannot take (a reader that has left, a full disk), so that the end of
+    the program does not try again.
+    """
     try:
         sys.stdout.flush()
     except OSError:

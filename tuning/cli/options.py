@@ -1,4 +1,6 @@
-"""What the options that several commands share mean, and what every command says of the files it wrote."""
+"""What the options that several commands share mean, and what every command says of the files it
+wrote.
+"""
 
 import re
 import sys
@@ -12,7 +14,10 @@ def limits_of(args, case):
     limits, given = dict(case.limits), [text.partition("=")[0].strip() for text in args.limit]
     for name in given:
         if given.count(name) > 1:
-            raise InputError(f"--limit {name} is given {given.count(name)} times: give it once (several tanks: {name}=[30,28])")
+            raise InputError(
+                f"--limit {name} is given {given.count(name)} times: give it once (several tanks:"
+                f" {name}=[30,28])"
+            )
     for text in args.limit:
         if text == "none":
             limits = {}
@@ -38,11 +43,19 @@ def scenarios_of(args):
         return ()
     found = []
     for i, text in enumerate(args.scenario):
-        values = once("--scenario", [pair("--scenario", part) for part in text.split(";") if part.strip()]) or {}
+        values = (
+            once(
+                "--scenario", [pair("--scenario", part) for part in text.split(";") if part.strip()]
+            )
+            or {}
+        )
         for name, value in values.items():
-            if any(rig.overlap(name, given) for given in settings(args)) and not rig.is_change(value):
+            if any(rig.overlap(name, given) for given in settings(args)) and not rig.is_change(
+                value
+            ):
                 raise InputError(
-                    f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of them, or a factor, as {name}=x1.1"
+                    f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of"
+                    f" them, or a factor, as {name}=x1.1"
                 )
         seed = values.pop("seed", i)
         weight = values.pop("weight", 1.0)
@@ -54,7 +67,10 @@ def choices_of(args):
     def values(name, text):
         parts = [part.strip() for part in text.split(",")]
         if "" in parts or any(re.match(r"[+-]?0\d", part) for part in parts):
-            raise InputError(f"--choose {name}={text}: must be values with commas between them, decimals with a point, as 0.5,1.5")
+            raise InputError(
+                f"--choose {name}={text}: must be values with commas between them, decimals with a"
+                " point, as 0.5,1.5"
+            )
         return [parse_value(part, f"--choose {name}") for part in parts]
 
     pairs = [pair("--choose", text, str) for text in args.choose]
@@ -75,7 +91,8 @@ def tradeoff_of(args):
         good = False
     if not good:
         raise InputError(
-            f"--tradeoff {args.tradeoff!r}: must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW below HIGH, N from 2 to 50"
+            f"--tradeoff {args.tradeoff!r}: must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW"
+            " below HIGH, N from 2 to 50"
         )
     from jaxtank.measures.catalogue import check_names
 
@@ -88,7 +105,9 @@ def distributions_of(args, case):
     from tuning.uncertainty.sampling import spread_of
 
     if args.vary and args.spread is not None:
-        raise InputError("--vary says what varies, --spread how much of the case's own: give one of them")
+        raise InputError(
+            "--vary says what varies, --spread how much of the case's own: give one of them"
+        )
     if args.vary:
         varied = [_pair_of(text, case) for text in args.vary]
         if len({name for name, _ in varied}) < len(varied):
@@ -127,15 +146,26 @@ def devices_of(args):
 
 def tell_written(paths, args):
     if paths and not args.quiet:
-        print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths), file=sys.stderr)
+        print(
+            f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths),
+            file=sys.stderr,
+        )
 
 
 def tell_unreachable(case, paths, args):
-    """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false` and the case itself did not."""
+    """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false`
+    and the case itself did not.
+    """
     from jaxtank import rig
 
-    if any(p.name == "rig.toml" for p in paths) and case.reachable and not args.quiet and (why := rig.unreachable(case)):
+    if (
+        any(p.name == "rig.toml" for p in paths)
+        and case.reachable
+        and not args.quiet
+        and (why := rig.unreachable(case))
+    ):
         print(
-            f"jaxtank: {printable(args.out.rstrip('/'))}/rig.toml: note: {why}; the file says reachable = false for it",
+            f"jaxtank: {printable(args.out.rstrip('/'))}/rig.toml: note: {why}; the file says"
+            " reachable = false for it",
             file=sys.stderr,
         )

@@ -1,4 +1,6 @@
-"""The three standard streams of a program: there when the shell has closed them, and none of its end when nobody takes what stderr says."""
+"""The three standard streams of a program: there when the shell has closed them, and none of its
+end when nobody takes what stderr says.
+"""
 
 import io
 import os
@@ -6,7 +8,9 @@ import sys
 
 
 class Forgiving(io.RawIOBase):
-    """A file descriptor to write progress and errors to. What it does not take, a full disk or a reader that has gone, is let go."""
+    """A file descriptor to write progress and errors to. What it does not take, a full disk or a
+    reader that has gone, is let go.
+    """
 
     def __init__(self, descriptor):
         self.descriptor = descriptor
@@ -32,10 +36,12 @@ class Forgiving(io.RawIOBase):
 
 
 def guard():
-    """Make the process's streams ones that the command can use: for a program of its own, never for a caller's process.
+    """Make the process's streams ones that the command can use: for a program of its own, never for
+    a caller's process.
 
-    Descriptors that were closed (`>&-`) are taken first, or the next file that is opened would get what is meant for them. A stdout that was
-    closed is one that nothing can be written to: an OSError once something is. stderr is a `Forgiving` one.
+    Descriptors that were closed (`>&-`) are taken first, or the next file that is opened would get
+    what is meant for them. A stdout that was closed is one that nothing can be written to: an
+    OSError once something is. stderr is a `Forgiving` one.
     """
     for descriptor, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
@@ -43,10 +49,16 @@ def guard():
         except OSError:
             os.open(os.devnull, mode)  # gets the lowest number that is free: this one
     if sys.stdout is None:
-        sys.stdout = io.TextIOWrapper(io.FileIO(os.open(os.devnull, os.O_RDONLY), "w"), encoding="utf-8")
+        sys.stdout = io.TextIOWrapper(
+            io.FileIO(os.open(os.devnull, os.O_RDONLY), "w"), encoding="utf-8"
+        )
     there = sys.stderr is not None
     raw = Forgiving(sys.stderr.fileno() if there else os.open(os.devnull, os.O_WRONLY))
     encoding = sys.stderr.encoding if there else "utf-8"
     sys.stderr = io.TextIOWrapper(
-        io.BufferedWriter(raw), encoding=encoding, errors="backslashreplace", line_buffering=True, write_through=True
+        io.BufferedWriter(raw),
+        encoding=encoding,
+        errors="backslashreplace",
+        line_buffering=True,
+        write_through=True,
     )

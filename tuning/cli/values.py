@@ -10,7 +10,9 @@ from jaxtank.core.text import printable
 
 
 def open_case(args):
-    """The checked case of the command line, in float64; what of a rig file can hardly be meant is told on stderr."""
+    """The checked case of the command line, in float64; what of a rig file can hardly be meant is
+    told on stderr.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -18,7 +20,8 @@ def open_case(args):
     from jaxtank.loop import step_size
 
     case, notes = rig.open_case(args.case), []
-    if args.case.endswith(".toml") and not args.quiet:  # as the file is: what --set changes is meant
+    # as the file is: what --set changes is meant
+    if args.case.endswith(".toml") and not args.quiet:
         notes = rig.doubts(case)
         for sentence in notes:
             print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
@@ -45,7 +48,9 @@ def settings(args):
     values = once("--set", [pair("--set", text) for text in args.values]) or {}
     if args.dt is not None:
         if "clock.dt" in values:
-            raise InputError(f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them")
+            raise InputError(
+                f"--dt {args.dt} beside --set clock.dt={values['clock.dt']}: give one of them"
+            )
         values["clock.dt"] = number("--dt", args.dt)
     return values
 
@@ -60,7 +65,9 @@ def schedule(texts):
     found = [pair("--schedule", text, lambda v: v) for text in texts]
     once("--schedule", found)
     if len({rule for _, rule in found}) > 1:
-        raise InputError(f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains")
+        raise InputError(
+            f"--schedule {texts[-1]!r}: variable and knots must be the same for all gains"
+        )
     for name, rule in found:
         variable, colon, knots = rule.partition(":")
         if not colon:
@@ -74,7 +81,9 @@ def schedule(texts):
 
 
 def pair(option, text, read=None) -> tuple[str, Any]:
-    """(name, value) of NAME=VALUE; read: makes the value of its text, `parse_value` where it is None."""
+    """(name, value) of NAME=VALUE; read: makes the value of its text, `parse_value` where it is
+    None.
+    """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise InputError(f"{option} {text!r}: must be NAME=VALUE")
@@ -83,7 +92,9 @@ def pair(option, text, read=None) -> tuple[str, Any]:
 
 
 def once(option, pairs):
-    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is given twice."""
+    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is
+    given twice.
+    """
     names = [name for name, _ in pairs]
     for name in names:
         if names.count(name) > 1:
@@ -110,23 +121,35 @@ def parse_value(text, where):
     except ValueError:
         return text
     if len(found) < len(parts):
-        raise InputError(f"{where}={text}: an entry of the list is empty: leave out the comma, or give its number")
+        raise InputError(
+            f"{where}={text}: an entry of the list is empty: leave out the comma, or give its"
+            " number"
+        )
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole, digits = comma.groups()
         point = f"{sign}{whole.replace('.', '')}.{digits}"
         raise InputError(
-            f"{where}={text}: the comma may be a decimal one: write {point}, with a point, for a number, "
-            f"or [{', '.join(map(str, found))}] for a list"
+            f"{where}={text}: the comma may be a decimal one: write {point}, with a point, for a"
+            f" number, or [{', '.join(map(str, found))}] for a list"
         )
     if len(parts) > 1 and (odd := next((p for p in parts if re.match(r"[+-]?0\d", p)), None)):
         raise InputError(
-            f"{where}={text}: entry {odd} begins with a zero, as the digits after a decimal comma do: write decimals with a point, as 0.05"
+            f"{where}={text}: entry {odd} begins with a zero, as the digits after a decimal comma"
+            " do: write decimals with a point, as 0.05"
         )
-    return found[0] if len(found) == 1 and inner is text else found if found or inner is not text else text
+    return (
+        found[0]
+        if len(found) == 1 and inner is text
+        else found
+        if found or inner is not text
+        else text
+    )
 
 
 def plain_number(text):
-    """An int where it is written as one and a float can hold it, else a float; underscores are not numbers."""
+    """An int where it is written as one and a float can hold it, else a float; underscores are not
+    numbers.
+    """
     if "_" in text:
         raise ValueError(text)
     try:
@@ -159,7 +182,9 @@ def seed(args):
 
 
 def folder_of(args) -> Any:
-    """The folder that a command writes to, None where it writes to none. Raises InputError where it cannot; nothing is made yet."""
+    """The folder that a command writes to, None where it writes to none. Raises InputError where it
+    cannot; nothing is made yet.
+    """
     out, resume = getattr(args, "out", None), getattr(args, "resume", None)
     for option, folder in (("--out", out), ("--resume", resume)):
         if folder is not None and not folder.strip():
@@ -183,5 +208,7 @@ def span(text):
     except ValueError:
         raise InputError(f"--free range {text!r}: must be NAME=LOW:HIGH with two numbers") from None
     if len(parts) > 3 or (len(parts) == 3 and parts[2] not in ("log", "linear")):
-        raise InputError(f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
+        raise InputError(
+            f"--free range {text!r}: must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear"
+        )
     return (low, high, parts[2] if len(parts) == 3 else "log" if low > 0 else "linear")

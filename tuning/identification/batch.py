@@ -1,10 +1,12 @@
-"""Many logs of one rig, fitted each by itself in one batch: bounded Levenberg-Marquardt on normal equations, all fits abreast."""
+"""Many logs of one rig, fitted each by itself in one batch: bounded Levenberg-Marquardt on normal
+equations, all fits abreast.
+"""
 
 import dataclasses
 import functools
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -31,9 +33,11 @@ STILL = 1e-10
 class Identifications:
     """What `identify_many` found: arrays with one row per log.
 
-    names: of the parameters; units: theirs; values, sd: (logs, parameters); interval95: (logs, parameters, 2); covariance: (logs, parameters,
-    parameters); levels, levels_sd: (logs, tanks) at the first sample; NaN in sd, interval and covariance where the data leave a parameter
-    open or it ends at its bound. rmse, autocorrelation: (logs, channels), the latter from sample to sample: intervals are those of white
+    names: of the parameters; units: theirs; values, sd: (logs, parameters); interval95: (logs,
+    parameters, 2); covariance: (logs, parameters, parameters); levels, levels_sd: (logs, tanks) at
+    the first sample; NaN in sd, interval and covariance where the data leave a parameter open or it
+    ends at its bound. rmse, autocorrelation: (logs, channels), the latter from sample to sample:
+    intervals are those of white
     noise. converged: (logs,); iterations: of the slowest; wall_s: [s].
     """
 
@@ -66,18 +70,24 @@ def identify_many(
     iterations: int = 50,
     gap: float = 1.5,
 ) -> Identifications:
-    """Estimate the same parameters from each of many logs by itself, in one compiled program: Monte Carlo, a log a day, a rig of each kind.
+    """Estimate the same parameters from each of many logs by itself, in one compiled program: Monte
+    Carlo, a log a day, a rig of each kind.
 
-        min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2      for each log
+        min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2      for
+        each log
 
-    case: a Case; logs: list of `tuning.Log`, of any lengths; free, start, noise, substeps, gap: as in `identify`; iterations: most of each fit.
-    Every fit starts from the case's own values, so these must be fair; `identify` tries several starts.
+    case: a Case; logs: list of `tuning.Log`, of any lengths; free, start, noise, substeps, gap: as
+    in `identify`; iterations: most of each fit. Every fit starts from the case's own values, so
+    these must be fair; `identify` tries several starts.
 
-    Returns Identifications. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
+    Returns Identifications. Raises InputError for what cannot be estimated, DataError for a log
+    that cannot be used.
     """
     began, logs = time.perf_counter(), list(logs)
     if not jax.config.read("jax_enable_x64"):
-        raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
+        raise InputError(
+            "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
+        )
     if not logs:
         raise InputError("no log is given")
     for one in logs:
@@ -85,7 +95,9 @@ def identify_many(
         lg.check_fits(one, case.loop)
     check_length(logs)
     first = Estimation(case, logs[:1], free, start, noise, substeps)
-    problem = Estimation(case, logs, free, start, first.noise if noise is None else noise, first.substeps)
+    problem = Estimation(
+        case, logs, free, start, first.noise if noise is None else noise, first.substeps
+    )
     lanes = _Lanes(problem)
     z, here, converged, count = _descend(lanes, iterations)
     p, levels = z[:, : problem.coordinates.size], problem.first.copy()
@@ -98,7 +110,10 @@ def identify_many(
     levels_sd[:, list(problem.tanks)] = sd[:, shared:]
     half = student.ppf(0.975, np.maximum(lanes.readings - z.shape[1], 1))[:, None] * sd[:, :shared]
     with np.errstate(invalid="ignore", divide="ignore"):  # a channel without a reading in some log
-        rmse, autocorrelation = np.sqrt(here[3] / problem.mask.sum(axis=1)) * problem.noise, here[4] / here[3]
+        rmse, autocorrelation = (
+            np.sqrt(here[3] / problem.mask.sum(axis=1)) * problem.noise,
+            here[4] / here[3],
+        )
     return Identifications(
         names=names,
         units=tuple(next(b.unit for b in problem.bounds if b.name == n) for n in names),
@@ -117,7 +132,9 @@ def identify_many(
 
 
 class _Lanes:
-    """The fits side by side: what each one's unknowns (lanes, unknowns) cost, with gradient and J'J."""
+    """The fits side by side: what each one's unknowns (lanes, unknowns) cost, with gradient and
+    J'J.
+    """
 
     def __init__(self, problem):
         self.problem, self.count = problem, len(problem.logs)
@@ -126,7 +143,10 @@ class _Lanes:
         self.begin = np.concatenate([np.tile(origin[:shared], (self.count, 1)), own], axis=1)
         self.scale = np.concatenate([np.ones(shared), problem.level_scale[:tanks]])
         self.low, self.high = (
-            np.concatenate([np.tile(side[:shared], (self.count, 1)), side[shared:].reshape(self.count, tanks)], axis=1)
+            np.concatenate(
+                [np.tile(side[:shared], (self.count, 1)), side[shared:].reshape(self.count, tanks)],
+                axis=1,
+            )
             for side in problem.box
         )
         self.weight = problem.mask / problem.noise
@@ -136,13 +156,16 @@ class _Lanes:
 
     def normal(self, z):
         """What `normal_equations` tells of every fit at z (lanes, unknowns)."""
-        parts = [self._normal(z, slice(i, i + self.share)) for i in range(0, self.count, self.share)]
+        parts = [
+            self._normal(z, slice(i, i + self.share)) for i in range(0, self.count, self.share)
+        ]
         return tuple(np.concatenate(part) for part in zip(*parts))
 
     def _normal(self, z, lanes):
         problem, record = self.problem, self.problem.record
         size = len(range(*lanes.indices(self.count)))
-        pick = np.arange(lanes.start, lanes.start + self.share).clip(max=self.count - 1)  # the last share is filled up: one program
+        # the last share is filled up: one program
+        pick = np.arange(lanes.start, lanes.start + self.share).clip(max=self.count - 1)
         y = np.where(problem.mask, record.y, 0.0)
         found = normal_equations(
             problem.rig,
@@ -162,12 +185,15 @@ class _Lanes:
 
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
-def normal_equations(rig, dt, u, y, weight, q, first, scale, *, coordinates, tanks, channels, substeps):
-    """(r'r / 2 (lanes,), J'r (lanes, unknowns), J'J (lanes, unknowns, unknowns), sums of r^2 and of r_k r_{k+1} (lanes,
-    channels)), r = weight (readings - y), by unknowns q / scale.
+def normal_equations(
+    rig, dt, u, y, weight, q, first, scale, *, coordinates, tanks, channels, substeps
+):
+    """(r'r / 2 (lanes,), J'r (lanes, unknowns), J'J (lanes, unknowns, unknowns), sums of r^2 and of
+    r_k r_{k+1} (lanes, channels)), r = weight (readings - y), by unknowns q / scale.
 
-    dt: (lanes, samples) [s]; u: (lanes, samples, pumps); y, weight: (lanes, samples, channels); q: (lanes, unknowns) coordinates, then levels of
-    `tanks`; first: (lanes, all tanks) levels of the others.
+    dt: (lanes, samples) [s]; u: (lanes, samples, pumps); y, weight: (lanes, samples, channels); q:
+    (lanes, unknowns) coordinates, then levels of `tanks`; first: (lanes, all tanks) levels of the
+    others.
     """
     shared = coordinates.size
 
@@ -179,7 +205,9 @@ def normal_equations(rig, dt, u, y, weight, q, first, scale, *, coordinates, tan
             return (pb.readings(r, dt, u, channels, substeps) - y) * weight
 
         tangents = jnp.diag(scale)
-        r, slopes = jax.vmap(lambda tangent: jax.jvp(residual, (q,), (tangent,)), out_axes=(None, 0))(tangents)
+        r, slopes = jax.vmap(
+            lambda tangent: jax.jvp(residual, (q,), (tangent,)), out_axes=(None, 0)
+        )(tangents)
         r, slopes = r.reshape(-1), slopes.reshape(q.shape[0], -1)
         left = r.reshape(y.shape)
         sums = jnp.sum(left * left, axis=0), jnp.sum(left[1:] * left[:-1], axis=0)
@@ -189,7 +217,9 @@ def normal_equations(rig, dt, u, y, weight, q, first, scale, *, coordinates, tan
 
 
 def _descend(lanes, iterations):
-    """Levenberg and Marquardt within bounds, every fit with its own damping (Nielsen's rule): a trial that gains is kept."""
+    """Levenberg and Marquardt within bounds, every fit with its own damping (Nielsen's rule): a
+    trial that gains is kept.
+    """
     z = np.clip(lanes.begin, lanes.low, lanes.high)
     here = lanes.normal(z)
     size = z.shape[1]
@@ -199,15 +229,22 @@ def _descend(lanes, iterations):
         count += 1
         cost, gradient, matrix = here[:3]
         edge = 1e-12 * (lanes.high - lanes.low)
-        held = ((z <= lanes.low + edge) & (gradient > 0)) | ((z >= lanes.high - edge) & (gradient < 0))
+        held = ((z <= lanes.low + edge) & (gradient > 0)) | (
+            (z >= lanes.high - edge) & (gradient < 0)
+        )
         diagonal = np.maximum(matrix[:, range(size), range(size)], 1e-300)
         left = np.where(held[:, :, None] | held[:, None, :], 0.0, matrix)
         left[:, range(size), range(size)] = np.where(held, 1.0, diagonal * (1.0 + damping[:, None]))
-        scale = 1.0 / np.sqrt(left[:, range(size), range(size)])  # by columns, so that solving does not mind their units
-        step = -scale * _solve(left * scale[:, :, None] * scale[:, None, :], scale * np.where(held, 0.0, gradient))
+        # by columns, so that solving does not mind their units
+        scale = 1.0 / np.sqrt(left[:, range(size), range(size)])
+        step = -scale * _solve(
+            left * scale[:, :, None] * scale[:, None, :], scale * np.where(held, 0.0, gradient)
+        )
         trial = np.clip(z + step, lanes.low, lanes.high)
         step = trial - z
-        hoped = -np.einsum("li,li->l", gradient, step) - 0.5 * np.einsum("li,lij,lj->l", step, matrix, step)
+        hoped = -np.einsum("li,li->l", gradient, step) - 0.5 * np.einsum(
+            "li,lij,lj->l", step, matrix, step
+        )
         at = lanes.normal(np.where((done | stuck)[:, None], z, trial))
         gain = np.where(np.isfinite(at[0]), cost - at[0], -np.inf)
         ratio = gain / np.maximum(hoped, 1e-300)
@@ -215,8 +252,13 @@ def _descend(lanes, iterations):
         small = hoped <= STILL * cost + 1e-25
         done |= small & (gain >= -1e-12 * cost)
         z[better] = trial[better]
-        here = tuple(np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old) for new, old in zip(at, here))
-        damping = np.where(better, damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3), damping * growth)
+        here = tuple(
+            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            for new, old in zip(at, here)
+        )
+        damping = np.where(
+            better, damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3), damping * growth
+        )
         growth = np.where(better, 2.0, 2 * growth)
         stuck |= damping > 1e12
         damping = np.maximum(damping, 1e-12)
@@ -231,7 +273,9 @@ def _solve(matrix, right):
 
 
 def _spread(lanes, e, z, cost, matrix):
-    """(unknowns, unknowns) covariance of the values of fit e; NaN in the rows of what is open or at its bound (see identifiability.Spread)."""
+    """(unknowns, unknowns) covariance of the values of fit e; NaN in the rows of what is open or at
+    its bound (see identifiability.Spread).
+    """
     problem, size, shared = lanes.problem, len(z), lanes.problem.coordinates.size
     edge = 1e-6 * (lanes.high[e] - lanes.low[e])
     held = (z < lanes.low[e] + edge) | (z > lanes.high[e] - edge)
@@ -239,12 +283,13 @@ def _spread(lanes, e, z, cost, matrix):
     scale = 2 * cost / max(lanes.readings[e] - moving.size, 1)
     full, hidden = np.zeros((size, size)), held.copy()
     if moving.size and np.all(np.isfinite(matrix)):
-        squares, axes = np.linalg.eigh(matrix[np.ix_(moving, moving)])  # pyright: ignore[reportCallIssue]  (stubs know lists only)
+        block = cast(Any, np.ix_)(moving, moving)  # numpy's stubs know lists only
+        squares, axes = np.linalg.eigh(matrix[block])
         singular = np.sqrt(np.maximum(squares, 0.0))
         sd = np.sqrt(scale) / np.maximum(singular, 1e-300)
         # squares know a singular value to half of the digits only
         open_ = (sd > VAGUE) | (singular < np.sqrt(ROUND_OFF) * 1e-3 * singular.max())
-        full[np.ix_(moving, moving)] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T  # pyright: ignore[reportCallIssue]  (stubs know lists only)
+        full[block] = scale * (axes[:, ~open_] / squares[~open_]) @ axes[:, ~open_].T
         own = np.sqrt(np.diag(full))[moving]
         for axis, reach in zip(axes[:, open_].T, np.minimum(sd[open_], 1.0)):
             hidden[moving[np.abs(axis) * reach > np.maximum(0.5 * own, 1e-6)]] = True

@@ -30,17 +30,15 @@ NAMES = {
 
 
 def read_log(
-    path: str | Path,
-    loop: ClosedLoop,
-    columns: Mapping[str, Any] | None = None,
-    decimal: str = ".",
+    path: str | Path, loop: ClosedLoop, columns: Mapping[str, Any] | None = None, decimal: str = "."
 ) -> Log:
     """The Log of a CSV file, for the rig of `loop` (a ClosedLoop).
 
-    columns: {"t", "pump1", .., "h1", ..: a column's header, or (header, unit)}, where the header does not say it in its own words ("h1 [cm]",
-    "pump1_V", "time [s]"); "none" leaves a level out; decimal: "." or ",".
-    Comma or semicolon or tab between cells, "#" for lines to pass over, an empty cell or
-    "nan" for a reading that is missing. Raises DataError, naming line and column, for anything else.
+    columns: {"t", "pump1", .., "h1", ..: a column's header, or (header, unit)}, where the header
+    does not say it in its own words ("h1 [cm]", "pump1_V", "time [s]"); "none" leaves a level out;
+    decimal: "." or ",". Comma or semicolon or tab between cells, "#" for lines to pass over, an
+    empty cell or "nan" for a reading that is missing. Raises DataError, naming line and column, for
+    anything else.
     """
     path = Path(path)
     if decimal not in (".", ","):
@@ -54,15 +52,19 @@ def read_log(
     wanted = _columns(header, called, first, loop, columns or {})
     lines, table = [], []
     for line, cells in rows:
-        while len(cells) > len(header) and not cells[-1].strip():  # a separator at the end of the line
+        # a separator at the end of the line
+        while len(cells) > len(header) and not cells[-1].strip():
             cells.pop()
         if len(cells) != len(header):
             hint = (
-                ": a comma within a number? Cells need another separator then, as ';' with --decimal ,"
+                ": a comma within a number? Cells need another separator then, as ';' with"
+                " --decimal ,"
                 if len(cells) > len(header)
                 else ""
             )
-            raise DataError(f"{called}, line {line}: {len(cells)} cells under {len(header)} column names{hint}")
+            raise DataError(
+                f"{called}, line {line}: {len(cells)} cells under {len(header)} column names{hint}"
+            )
         if len(table) >= MOST_ROWS:
             raise DataError(f"{called}: more than {MOST_ROWS} samples")
         table.append([_number(cells[w.index], decimal, called, line, w) for w in wanted])
@@ -89,7 +91,13 @@ class _Column:
     """A column of the file: where it stands, what it is, what to multiply it with."""
 
     def __init__(self, index, kind, number, header, unit, factor, in_volts=False):
-        self.index, self.kind, self.number, self.header, self.unit = index, kind, number, header, unit
+        self.index, self.kind, self.number, self.header, self.unit = (
+            index,
+            kind,
+            number,
+            header,
+            unit,
+        )
         self.factor, self.in_volts = factor, in_volts
 
 
@@ -113,7 +121,10 @@ def _text(path):
 
 def _rows(text, name):
     """(line number, cells) of every line that is not empty and not a comment."""
-    first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    first = next(
+        (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")),
+        "",
+    )
     delimiter = max((";", "\t", ","), key=lambda d: (first.count(d), d == ","))
     reader = csv.reader(io.StringIO(text), delimiter=delimiter)
     try:
@@ -121,7 +132,9 @@ def _rows(text, name):
         for cells in reader:
             start, end = end + 1, reader.line_num
             if end > start:
-                raise DataError(f"{name}, line {start}: a quotation mark opens and does not close on that line")
+                raise DataError(
+                    f"{name}, line {start}: a quotation mark opens and does not close on that line"
+                )
             if cells and any(c.strip() for c in cells) and not cells[0].lstrip().startswith("#"):
                 yield reader.line_num, cells
     except csv.Error as error:
@@ -136,7 +149,9 @@ def _number(cell, decimal, name, line, column):
     if text.lower() in ("", "nan", "na", "null", "-"):
         if column.kind == "level":
             return math.nan
-        raise DataError(f"{where}: is empty: every sample needs its time and the input of every pump")
+        raise DataError(
+            f"{where}: is empty: every sample needs its time and the input of every pump"
+        )
     if decimal == "," and "." in text:
         raise DataError(f"{where}: {text!r} has a point, where the decimal sign is a comma")
     try:
@@ -165,7 +180,11 @@ def split_header(header):
     if found:
         return found.group(1).strip(), found.group(2)
     stem, line, tail = header.rpartition("_")
-    return (stem.strip(), tail) if line and tail in KNOWN and not tail.isdigit() else (header.strip(), None)
+    return (
+        (stem.strip(), tail)
+        if line and tail in KNOWN and not tail.isdigit()
+        else (header.strip(), None)
+    )
 
 
 def _columns(header, name, line, loop, given):
@@ -175,7 +194,8 @@ def _columns(header, name, line, loop, given):
     slots |= {f"h{i + 1}": ("level", i) for i in range(plant.tanks)}
     if all(_is_number(cell) for cell in header):
         raise DataError(
-            f"{name}, line {line}: has numbers where the columns' names should be: begin with a header, as 't [s],pump1 [{drive}],h1 [{length}]'"
+            f"{name}, line {line}: has numbers where the columns' names should be: begin with a"
+            f" header, as 't [s],pump1 [{drive}],h1 [{length}]'"
         )
     found, taken = [], {}
     for slot, spec in given.items():
@@ -184,13 +204,21 @@ def _columns(header, name, line, loop, given):
         wanted, unit = (spec, None) if isinstance(spec, str) else spec
         if wanted.strip() == "none" and wanted not in header:
             if slots[slot][0] != "level":
-                raise InputError(f"log column {slot} = none: only a level may be left out, as h1=none")
+                raise InputError(
+                    f"log column {slot} = none: only a level may be left out, as h1=none"
+                )
             continue
         if wanted not in header:
-            raise DataError(f"{name}, line {line}: there is no column {wanted!r} for {slot}{nearest(wanted, header)}")
+            raise DataError(
+                f"{name}, line {line}: there is no column {wanted!r} for"
+                f" {slot}{nearest(wanted, header)}"
+            )
         index = header.index(wanted)
         if other := next((known for known, (column, _) in taken.items() if column == index), None):
-            raise DataError(f"{name}, line {line}: column {wanted!r} is given for {other} and for {slot}: name one column for each")
+            raise DataError(
+                f"{name}, line {line}: column {wanted!r} is given for {other} and for {slot}: name"
+                " one column for each"
+            )
         taken[slot] = (index, unit or split_header(wanted)[1])
     used = {index for index, _ in taken.values()}
     for index, cell in enumerate(header):
@@ -200,24 +228,31 @@ def _columns(header, name, line, loop, given):
             continue
         if slot in taken:
             raise DataError(
-                f"{name}, line {line}: columns {header[taken[slot][0]]!r} and {cell!r} both look like {slot}; say which with --column"
+                f"{name}, line {line}: columns {header[taken[slot][0]]!r} and {cell!r} both look"
+                f" like {slot}; say which with --column"
             )
         taken[slot] = (index, unit)
     for slot, (kind, number) in slots.items():
         if slot not in taken:
             if kind != "level":
                 raise DataError(
-                    f"{name}, line {line}: no column for {slot} ({'time' if kind == 'time' else f'pump {number + 1}'}) among "
-                    f"{_listed(header)}; name it with --column {slot}=HEADER"
+                    f"{name}, line {line}: no column for {slot}"
+                    f" ({'time' if kind == 'time' else f'pump {number + 1}'}) among"
+                    f" {_listed(header)}; name it with --column {slot}=HEADER"
                 )
             continue
         index, unit = taken[slot]
         if header.count(header[index]) > 1:
             raise DataError(f"{name}, line {line}: two columns are called {header[index]!r}")
-        factor, in_volts = _factor(kind, unit, length, drive, f"{name}, line {line}, column {header[index]!r}")
+        factor, in_volts = _factor(
+            kind, unit, length, drive, f"{name}, line {line}, column {header[index]!r}"
+        )
         found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
     if not any(c.kind == "level" for c in found):
-        raise DataError(f"{name}, line {line}: no column for a level among {_listed(header)}; name it with --column h1=HEADER")
+        raise DataError(
+            f"{name}, line {line}: no column for a level among {_listed(header)}; name it with"
+            " --column h1=HEADER"
+        )
     return found
 
 
@@ -229,7 +264,8 @@ def _listed(header, most=20):
 
 def _slot(stem, plant):
     """The slot ("t", "pump1", "h2") that a column's name says, or None."""
-    word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())  # no rig has a tank of seven digits
+    # no rig has a tank of seven digits
+    word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
     if word is None:
         return None
     for kind, names in NAMES.items():
@@ -247,18 +283,24 @@ def _factor(kind, unit, length, drive, where):
     if unit is None:
         own = {"time": "s", "pump": drive, "level": length}[kind]
         word = {"time": "t", "pump": "pump1", "level": "h1"}[kind]
-        raise DataError(f"{where}: has no unit: write it in the header, as '{word} [{own}]', or with --column")
+        raise DataError(
+            f"{where}: has no unit: write it in the header, as '{word} [{own}]', or with --column"
+        )
     if kind == "time":
         table, own = TIMES, "s"
     elif kind == "pump":
         own = drive
         table = next((t for t in (VOLTS, FLOWS, SHARES) if drive in t), {drive: 1.0})
     else:
-        own, table = length, LENGTHS if length in LENGTHS else VOLTS if length in VOLTS else {length: 1.0}
+        own, table = (
+            length,
+            (LENGTHS if length in LENGTHS else VOLTS if length in VOLTS else {length: 1.0}),
+        )
         if unit in VOLTS and length not in VOLTS:
             return VOLTS[unit], True
     if unit not in table:
         raise DataError(
-            f"{where}: unit {unit!r} cannot be that of a {'time' if kind == 'time' else kind}: must be one of {', '.join(table)}"
+            f"{where}: unit {unit!r} cannot be that of a {'time' if kind == 'time' else kind}: must"
+            f" be one of {', '.join(table)}"
         )
     return table[unit] / table[own], False

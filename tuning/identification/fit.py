@@ -1,4 +1,6 @@
-"""Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the answer is to be believed."""
+"""Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the
+answer is to be believed.
+"""
 
 import dataclasses
 import functools
@@ -33,17 +35,23 @@ AGREE = 1.001
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Identification:
-    """What `identify` found. See `jaxtank identify --json` for the same as a table; `save(folder)`, `plot()`."""
+    """What `identify` found. See `jaxtank identify --json` for the same as a table; `save(folder)`,
+    `plot()`.
+    """
 
     case: Any  # the case that was given
     estimation: Estimation
     fit: Fit
     status: Status  # CONVERGED, NOT_CONVERGED, NOT_IDENTIFIABLE or INTERRUPTED
-    parameters: dict  # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable", "at_bound"}}
+    # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable",
+    # "at_bound"}}
+    parameters: dict
     levels: list  # of each log, of each tank: {"value", "interval95"}
     covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
-    quality: dict  # {"rmse", "nrmse_percent", "residual_autocorrelation"}: per channel; and {"widened", "noise"}
-    directions: list  # what the data cannot tell apart: {"words", "parameters" {name: factor}, "sd"}
+    # {"rmse", "nrmse_percent", "residual_autocorrelation"}: per channel; and {"widened", "noise"}
+    quality: dict
+    # what the data cannot tell apart: {"words", "parameters" {name: factor}, "sd"}
+    directions: list
     remedies: list  # words: what experiment would tell it
     starts: list  # {"cost", "evaluations", "agrees"}
     validation: dict | None
@@ -54,12 +62,16 @@ class Identification:
 
     @functools.cached_property
     def proposed(self) -> tuple[Case, str | None]:
-        """(`identified`, why): why no controller of the kind `law` could be proposed, None where it was, or none was asked for."""
+        """(`identified`, why): why no controller of the kind `law` could be proposed, None where it
+        was, or none was asked for.
+        """
         return proposed(self)
 
     @property
     def identified(self) -> Case:
-        """The case with the estimated plant in it, in the law's and the observer's models too, with covariance and noise."""
+        """The case with the estimated plant in it, in the law's and the observer's models too, with
+        covariance and noise.
+        """
         return self.proposed[0]
 
     @property
@@ -87,7 +99,8 @@ class Identification:
         return identification.figures(self)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and report.html; returns the paths.
+        """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and
+        report.html; returns the paths.
 
         command: the line that made it, for the report, where there is one.
         """
@@ -118,28 +131,38 @@ def identify(
     ready: Callable | None = None,
     law: str | None = None,
 ) -> Identification:
-    """Estimate parameters of a rig from one log or several, by least squares on the simulated readings (output error).
+    """Estimate parameters of a rig from one log or several, by least squares on the simulated
+    readings (output error).
 
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2
 
-    case: a Case, or a plant for one with ideal pumps and sensors; log: a `tuning.Log` (see tuning.log, tuning.read_log), or a list of them, each
-    with its own start; free: {name: (low, high)} or (low, high, "log" or "linear"), of plant, sensor, actuator or a constant disturbance;
-    None: pump gains, splits, orifices and pipes; start: levels at the first sample of each log: "free" (estimated, too), "measured" or
-    "case"; starts: searches, the first from the case's own values, the others from Sobol points of the ranges; hold_back: share of
-    each log (below 1), or number of samples, at its end on which a fit to the rest is judged before all is fitted; noise: standard
-    deviation of each channel in its unit, from the record where None; loss: "linear", "soft_l1" or "huber" (beyond 3 standard deviations);
-    substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile likelihood of the worst parameter;
+    case: a Case, or a plant for one with ideal pumps and sensors; log: a `tuning.Log` (see
+    tuning.log, tuning.read_log), or a list of them, each with its own start; free: {name: (low,
+    high)} or (low, high, "log" or "linear"), of plant, sensor, actuator or a constant disturbance;
+    None: pump gains, splits, orifices and pipes; start: levels at the first sample of each log:
+    "free" (estimated, too), "measured" or "case"; starts: searches, the first from the case's own
+    values, the others from Sobol points of the ranges; hold_back: share of each log (below 1), or
+    number of samples, at its end on which a fit to the rest is judged before all is fitted; noise:
+    standard deviation of each channel in its unit, from the record where None; loss: "linear",
+    "soft_l1" or "huber" (beyond 3 standard deviations);
+    substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile
+        likelihood of the worst parameter;
     gap: longest step between samples, in median steps; checkpoint (or folder): where a log
     of the searches is kept, with which resume=True goes on after a
-    kill, to the same bits; progress: called with the Fit of each search that has ended; if it raises
-    KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all has been checked, before the first search;
-    law: "pi" for the identified rig under a PI controller with gains from its model (`proposal.py`), None for the case's own.
+    kill, to the same bits; progress: called with the Fit of each search that has ended; if it
+    raises KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all
+    has been checked, before the first search;
+    law: "pi" for the identified rig under a PI controller with gains from its model
+        (`proposal.py`), None for the case's own.
 
-    Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log that cannot be used.
+    Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log
+    that cannot be used.
     """
     began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
     if not jax.config.read("jax_enable_x64"):
-        raise InputError("identification needs float64: call jax.config.update('jax_enable_x64', True) first")
+        raise InputError(
+            "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
+        )
     case = bare(case) if isinstance(case, Plant) else case
     check_law(law, case)
     logs = [log] if isinstance(log, lg.Log) else list(log)
@@ -154,7 +177,13 @@ def identify(
         lg.check_gaps(one, gap)
         lg.check_fits(one, case.loop)
     kept = [_kept(one, hold_back) for one in logs]
-    options = {"free": free, "start": start, "noise": noise, "substeps": substeps, "samples": max(one.samples for one in logs)}
+    options = {
+        "free": free,
+        "start": start,
+        "noise": noise,
+        "substeps": substeps,
+        "samples": max(one.samples for one in logs),
+    }
     begin = [one.part(0, n) for one, n in zip(logs, kept)]
     longest, first = (max(np.diff(one.t).max() for one in side) for side in (logs, begin))
     if substeps is None and longest > 1.01 * first:  # the longest step is in what is held back
@@ -163,7 +192,13 @@ def identify(
     check_length(logs)
     memo = Memo()
     if folder is not None:
-        memo = Log(folder, _problem(case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}), resume)
+        memo = Log(
+            folder,
+            _problem(
+                case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}
+            ),
+            resume,
+        )
     if ready is not None:
         ready()
     fits, interrupted = [], False
@@ -179,18 +214,30 @@ def identify(
     ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
     if not ranked:
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
-    best, estimation, validation = partial.solve(partial.unknowns(ranked[0]), loss, iterations), partial, None
+    best, estimation, validation = (
+        partial.solve(partial.unknowns(ranked[0]), loss, iterations),
+        partial,
+        None,
+    )
     if any(n < one.samples for n, one in zip(kept, logs)):
-        estimation = Estimation(case, logs, **(options | {"substeps": partial.substeps, "noise": partial.noise}))
+        estimation = Estimation(
+            case, logs, **(options | {"substeps": partial.substeps, "noise": partial.noise})
+        )
         validation = idf.held_back(estimation, partial, best, kept)
         best = estimation.solve(partial.unknowns(best), loss, iterations)
-    if not _within(estimation, best):  # branch gains may leave the ranges of gain and split: the same search in these themselves
+    # branch gains may leave the ranges of gain and split: the same search in these themselves
+    if not _within(estimation, best):
         plain = estimation.plainly()
         values = estimation.coordinates.values(best.p)
-        start_at = np.concatenate([plain.coordinates.point(values), best.own.ravel() / plain.level_scale])
+        start_at = np.concatenate(
+            [plain.coordinates.point(values), best.own.ravel() / plain.level_scale]
+        )
         estimation, best = plain, plain.solve(np.clip(start_at, *plain.box), loss, iterations)
     if not np.isfinite(best.cost):
-        raise DataError(f"{logs[0].name}: what fits the first {kept[0]} samples cannot be simulated over all of them")
+        raise DataError(
+            f"{logs[0].name}: what fits the first {kept[0]} samples cannot be simulated over all of"
+            " them"
+        )
     quality = idf.quality(estimation, best)
     spread = idf.Spread(estimation, best, quality)
     if spread.open.any():
@@ -199,7 +246,9 @@ def identify(
         spread = idf.Spread(estimation, best, quality)
     parameters, levels = spread.parameters(), spread.levels()
     directions = spread.directions()
-    status = "converged" if best.status > 0 and not stopped(case.loop, parameters) else "not_converged"
+    status = (
+        "converged" if best.status > 0 and not stopped(case.loop, parameters) else "not_converged"
+    )
     if not all(
         p["identifiable"] for p in parameters.values()
     ):  # a level at the start that is not told costs nothing but its interval
@@ -214,14 +263,22 @@ def identify(
         parameters=parameters,
         levels=levels,
         covariance=spread.covariance_of_values(),
-        quality=quality | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
+        quality=quality
+        | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
         directions=directions,
         remedies=idf.remedies(estimation, best, spread) if status == "not_identifiable" else [],
         starts=[
-            {"cost": f.cost, "evaluations": f.evaluations, "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12)} for f in fits
+            {
+                "cost": f.cost,
+                "evaluations": f.evaluations,
+                "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12),
+            }
+            for f in fits
         ],
         validation=validation,
-        profile=idf.profile(estimation, best, spread, loss) if profile and not interrupted else None,
+        profile=(
+            idf.profile(estimation, best, spread, loss) if profile and not interrupted else None
+        ),
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
@@ -229,19 +286,34 @@ def identify(
 
 
 def _search(memo, estimation, z, loss, iterations):
-    """The Fit of a first search from z. One that a memo knows is where it ended, without its residual and jacobian."""
+    """The Fit of a first search from z. One that a memo knows is where it ended, without its
+    residual and jacobian.
+    """
     made = []
 
     def compute():
         made.append(estimation.solve(z, loss, iterations, tolerance=1e-8))
-        return made[0].p, made[0].own, made[0].cost, float(made[0].evaluations), float(made[0].status)
+        return (
+            made[0].p,
+            made[0].own,
+            made[0].cost,
+            float(made[0].evaluations),
+            float(made[0].status),
+        )
 
     p, own, cost, evaluations, status = memo.recall("search", [z], compute)
     if made:
         return made[0]
     none = np.zeros((0, estimation.size))
     return Fit(
-        p=p, own=own, cost=cost, residual=none[:, 0], jacobian=none, evaluations=int(evaluations), status=int(status), loss=loss
+        p=p,
+        own=own,
+        cost=cost,
+        residual=none[:, 0],
+        jacobian=none,
+        evaluations=int(evaluations),
+        status=int(status),
+        loss=loss,
     )
 
 
@@ -264,13 +336,20 @@ def _problem(case, logs, partial, options):
 def _within(estimation, fit):
     """Whether every value lies in its range."""
     values = estimation.coordinates.values(fit.p)
-    return all(b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high) for b in estimation.bounds)
+    return all(
+        b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
+        for b in estimation.bounds
+    )
 
 
 def _nearest(estimation, best, scale, loss, iterations):
-    """Of the points in the 95 % region about `best` one near to the case's own values: a search that slides along a valley ends in a corner
-    that says nothing."""
-    origin, most = estimation.origin(), best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
+    """Of the points in the 95 % region about `best` one near to the case's own values: a search
+    that slides along a valley ends in a corner that says nothing.
+    """
+    origin, most = (
+        estimation.origin(),
+        best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale,
+    )
     for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
         near = estimation.solve(origin, loss, iterations, tolerance=1e-8, pull=(origin, strength))
         if near.residual.size and near.residual @ near.residual <= most:
@@ -280,9 +359,14 @@ def _nearest(estimation, best, scale, loss, iterations):
 
 def _kept(one, hold_back):
     """Number of samples of a Log that the first fit sees."""
-    if not (isinstance(hold_back, (int, float)) and not isinstance(hold_back, bool) and 0 <= hold_back < one.samples):
+    if not (
+        isinstance(hold_back, (int, float))
+        and not isinstance(hold_back, bool)
+        and 0 <= hold_back < one.samples
+    ):
         raise InputError(
-            f"hold_back = {hold_back!r}: must be a share from 0 to below 1, or a number of samples below {one.samples}"
+            f"hold_back = {hold_back!r}: must be a share from 0 to below 1, or a number of samples"
+            f" below {one.samples}"
         )
     kept = one.samples - (round(hold_back * one.samples) if hold_back < 1 else int(hold_back))
     return max(kept, 2)

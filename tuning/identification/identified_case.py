@@ -23,18 +23,36 @@ def bare(plant):
     still = number(np.zeros(m))
     loop = ClosedLoop(
         plant=plant,
-        sensor=LevelSensor(gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))),
+        sensor=LevelSensor(
+            gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))
+        ),
         observer=Direct(),
         controller=OpenLoop(signal=Constant(level=still)),
-        actuator=PumpBank(low=still, high=number(np.full(m, np.inf)), stop=still, pulse=number(np.ones(m)), initial=still),
+        actuator=PumpBank(
+            low=still,
+            high=number(np.full(m, np.inf)),
+            stop=still,
+            pulse=number(np.ones(m)),
+            initial=still,
+        ),
         reference=Constant(level=number(np.zeros(len(plant.outputs)))),
         x0=number(np.zeros(n)),
     )
-    return Case(name="plant", title="a plant without a law", loop=loop, clock=Clock(), limits={}, free={}, objective={})
+    return Case(
+        name="plant",
+        title="a plant without a law",
+        loop=loop,
+        clock=Clock(),
+        limits={},
+        free={},
+        objective={},
+    )
 
 
 def proposed(result):
-    """(Case, why): `identified(result)` under the controller of result.law; why: the reason where there is none, else None."""
+    """(Case, why): `identified(result)` under the controller of result.law; why: the reason where
+    there is none, else None.
+    """
     case = identified_plant(result)
     if result.law is None:
         return case, None
@@ -49,8 +67,10 @@ def proposed(result):
 
 
 def identified_plant(result):
-    """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of law and observer; what its uncertainty
-    is made of; noise of the residuals where they are white, else of the record from sample to sample."""
+    """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of
+    law and observer; what its uncertainty is made of; noise of the residuals where they are white,
+    else of the record from sample to sample.
+    """
     case = result.case
     values = {n: p["value"] for n, p in result.parameters.items()}
     loop = case.loop
@@ -62,9 +82,13 @@ def identified_plant(result):
             if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
                 loop = with_values(loop, {inner: value})
     noise = np.array(loop.sensor.noise, dtype=float)
-    for (tank, volts), rmse, seen in zip(result.estimation.record.channels, result.quality["rmse"], result.quality["noise"]):
+    for (tank, volts), rmse, seen in zip(
+        result.estimation.record.channels, result.quality["rmse"], result.quality["noise"]
+    ):
         white = result.quality["widened"] <= 1.05
-        noise[tank] = (rmse if white else min(rmse, seen)) * (float(loop.sensor.gain[tank]) if volts else 1.0)
+        noise[tank] = (rmse if white else min(rmse, seen)) * (
+            float(loop.sensor.gain[tank]) if volts else 1.0
+        )
     loop = with_values(loop, {"sensor.noise": noise})
     names, matrix = result.covariance
     covered = set(names)
@@ -72,4 +96,6 @@ def identified_plant(result):
     for name, share in case.uncertain.items():
         uncertain |= rigs.uncovered(loop, name, share, covered)
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
-    return case.replace(name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance)
+    return case.replace(
+        name=f"{case.name} identified", loop=loop, uncertain=uncertain, covariance=covariance
+    )

@@ -1,4 +1,6 @@
-"""What a fit moves: logarithms of positive parameters, branch gains of a pump that feeds two tanks, the rest as shares of its range."""
+"""What a fit moves: logarithms of positive parameters, branch gains of a pump that feeds two tanks,
+the rest as shares of its range.
+"""
 
 import dataclasses
 from typing import Any, cast
@@ -13,21 +15,28 @@ from jaxtank.signals.base import Constant
 class Coordinates:
     """The coordinates p of the scalars to be estimated, as a hashable description.
 
-    items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low + p (high - low); ("branch", gain, split,
-    (low, high) of both branches): p = (log c1, log c2), c1 = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows
-    are linear (mirakhorli notes S11), gain k = c1 + c2, split s = c1 / (c1 + c2).
+    items: ("log", name, low, high) with value exp(p); ("linear", name, low, high) with value low +
+    p (high - low); ("branch", gain, split, (low, high) of both branches): p = (log c1, log c2), c1
+    = k s and c2 = k (1 - s) the gains of a pump's two branches, in which the inflows are linear
+    (mirakhorli notes S11), gain k = c1 + c2, split s = c1 / (c1 + c2).
     """
 
     items: tuple
 
     @property
     def names(self):
-        """(size,) dotted name of the value that belongs to each coordinate: of a branch, gain then split."""
-        return tuple(n for kind, *rest in self.items for n in (rest[:2] if kind == "branch" else rest[:1]))
+        """(size,) dotted name of the value that belongs to each coordinate: of a branch, gain then
+        split.
+        """
+        return tuple(
+            n for kind, *rest in self.items for n in (rest[:2] if kind == "branch" else rest[:1])
+        )
 
     @property
     def pairs(self):
-        """((i, i + 1), ...): which coordinates are the two branches of one pump, whose gain and split neither tells alone."""
+        """((i, i + 1), ...): which coordinates are the two branches of one pump, whose gain and
+        split neither tells alone.
+        """
         found, i = [], 0
         for kind, *_ in self.items:
             if kind == "branch":
@@ -50,7 +59,11 @@ class Coordinates:
                 pairs += [tuple(np.log(b)) for b in rest[2]]
             else:
                 pairs.append((0.0, 1.0) if kind == "linear" else (np.log(rest[1]), np.log(rest[2])))
-        return tuple(np.array(side, dtype=float) for side in zip(*pairs)) if pairs else (np.zeros(0), np.zeros(0))
+        return (
+            tuple(np.array(side, dtype=float) for side in zip(*pairs))
+            if pairs
+            else (np.zeros(0), np.zeros(0))
+        )
 
     def values(self, p):
         """{name: value} at coordinates p (size,), of numpy or jax."""
@@ -100,8 +113,9 @@ class Coordinates:
 
 
 def coordinates(bounds, branches=True):
-    """The Coordinates of a list of tuning.problem.bounds.Bound: a pump's gain and split, where both are free, by their branch gains (or, without
-    `branches`, by themselves)."""
+    """The Coordinates of a list of tuning.problem.bounds.Bound: a pump's gain and split, where both
+    are free, by their branch gains (or, without `branches`, by themselves).
+    """
     by_name = {b.name: b for b in bounds} if branches else {}
     items, done = [], set()
     for b in bounds:
@@ -112,7 +126,14 @@ def coordinates(bounds, branches=True):
         if split in by_name:
             s = by_name[split]
             low, high = max(s.low, 1e-6), min(s.high, 1 - 1e-6)
-            items.append(("branch", b.name, split, ((b.low * low, b.high * high), (b.low * (1 - high), b.high * (1 - low)))))
+            items.append(
+                (
+                    "branch",
+                    b.name,
+                    split,
+                    ((b.low * low, b.high * high), (b.low * (1 - high), b.high * (1 - low))),
+                )
+            )
             done |= {b.name, split}
         elif base == "plant.split" and f"plant.pump_gain[{index[0]}]" in by_name:
             continue  # comes with its gain
@@ -123,8 +144,10 @@ def coordinates(bounds, branches=True):
 
 
 def usual(loop):
-    """{name: (low, high, scale)}: what an identification takes for unknown where nothing is said. Areas are measured with a ruler; pump gains,
-    splits between two tanks, open orifices, pipes and what a lower tank catches of an overflow are not."""
+    """{name: (low, high, scale)}: what an identification takes for unknown where nothing is said.
+    Areas are measured with a ruler; pump gains, splits between two tanks, open orifices, pipes and
+    what a lower tank catches of an overflow are not.
+    """
     plant, found = loop.plant, {}
     for name in ("pump_gain", "drain", "orifice", "pipe"):
         values = np.asarray(getattr(plant, name, ()))
@@ -140,7 +163,11 @@ def usual(loop):
     if isinstance(loop.disturbance, Constant):
         for i, value in enumerate(np.asarray(loop.disturbance.level)):
             if value != 0:
-                found[f"disturbance.level[{i}]"] = (-10 * abs(float(value)), 10 * abs(float(value)), "linear")
+                found[f"disturbance.level[{i}]"] = (
+                    -10 * abs(float(value)),
+                    10 * abs(float(value)),
+                    "linear",
+                )
     return found
 
 

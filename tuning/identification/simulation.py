@@ -1,4 +1,6 @@
-"""A rig played by a log: what its sensors would have read, had the pumps been given what the log says."""
+"""A rig played by a log: what its sensors would have read, had the pumps been given what the log
+says.
+"""
 
 import dataclasses
 import functools
@@ -21,7 +23,9 @@ from jaxtank.xla.hoist import scan
 
 @component
 class Rig:
-    """What of a closed loop a log plays: everything but the law and its observer. Names are those of the loop."""
+    """What of a closed loop a log plays: everything but the law and its observer. Names are those
+    of the loop.
+    """
 
     plant: Plant
     sensor: LevelSensor
@@ -36,15 +40,20 @@ class Rig:
 
 
 def rig_of(loop):
-    """The Rig of a loop. A constant disturbance belongs to it; one that comes and goes belonged to another run and does not. A transport delay
-    is taken up by `shifted`."""
+    """The Rig of a loop. A constant disturbance belongs to it; one that comes and goes belonged to
+    another run and does not. A transport delay is taken up by `shifted`.
+    """
     disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
     actuator = dataclasses.replace(loop.actuator, delay=0.0)
-    return Rig(plant=loop.plant, sensor=loop.sensor, actuator=actuator, disturbance=disturbance, x0=loop.x0)
+    return Rig(
+        plant=loop.plant, sensor=loop.sensor, actuator=actuator, disturbance=disturbance, x0=loop.x0
+    )
 
 
 class Record(NamedTuple):
-    """Logs side by side, as arrays padded to the longest; the padding takes no time and counts for nothing."""
+    """Logs side by side, as arrays padded to the longest; the padding takes no time and counts for
+    nothing.
+    """
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
     u: np.ndarray  # (logs, samples, pumps)
@@ -53,8 +62,11 @@ class Record(NamedTuple):
 
 
 def record(logs, delay=0.0, samples=0):
-    """The Record of Logs. delay: transport delay of the pumps [s]: an input reaches its tank at the first sample that is at least as late;
-    samples: least length to pad to, so that logs cut short run through the program of the whole ones."""
+    """The Record of Logs. delay: transport delay of the pumps [s]: an input reaches its tank at the
+    first sample that is at least as late;
+    samples: least length to pad to, so that logs cut short run through the program of the whole
+        ones.
+    """
     channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
     n = max(samples, *(one.samples for one in logs))
     dt, u = np.zeros((len(logs), n)), np.zeros((len(logs), n, logs[0].u.shape[1]))
@@ -76,7 +88,8 @@ def shifted(one, delay):
 def readings(rig, dt, u, channels, substeps):
     """(samples, channels) what the sensors read, free of noise, in the channels' units.
 
-    dt: (samples,) [s]; u: (samples, pumps) held until the next sample; each step is `substeps` steps of fourth-order Runge-Kutta.
+    dt: (samples,) [s]; u: (samples, pumps) held until the next sample; each step is `substeps`
+        steps of fourth-order Runge-Kutta.
     """
     x, d = tuple(rig.x0[i] + 0.0 * dt[0] for i in range(rig.plant.tanks)), None
     if rig.disturbance is not None:
@@ -91,7 +104,9 @@ def readings(rig, dt, u, channels, substeps):
         step, inputs = now
         out = tuple(_reading(rig, x, channel) for channel in channels)
         # a command past its limits is what a saturated pump was asked for
-        inputs = tuple(clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs))
+        inputs = tuple(
+            clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
+        )
         held = jnp.where(step > 0, step, 1.0)  # the padding at the end must not divide by nothing
         driven, state = rig.actuator.deliver(state, inputs, held)
         driven = rig.actuator.driving(driven)
@@ -110,9 +125,11 @@ def _reading(rig, x, channel):
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
 def passes(rig, dt, u, p, own, *, coordinates, tanks, channels, substeps):
-    """(readings (logs, samples, channels), their derivatives (logs, samples, channels, shared + own)) of every log at once.
+    """(readings (logs, samples, channels), their derivatives (logs, samples, channels, shared +
+    own)) of every log at once.
 
-    p: (shared,) coordinates of what all logs have in common; own: (logs, len(tanks)) levels of `tanks` at the start of each log.
+    p: (shared,) coordinates of what all logs have in common; own: (logs, len(tanks)) levels of
+        `tanks` at the start of each log.
     """
     shared = coordinates.size
 
@@ -136,7 +153,9 @@ def passes(rig, dt, u, p, own, *, coordinates, tanks, channels, substeps):
 @functools.partial(jax.jit, static_argnames=("channels", "substeps"))
 def play(rig, dt, u, own, *, channels, substeps):
     """(logs, samples, channels) readings of a Rig whose levels start at own (logs, tanks)."""
-    return jax.vmap(lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps))(dt, u, own)
+    return jax.vmap(
+        lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps)
+    )(dt, u, own)
 
 
 MOST_SUBSTEPS = 64
@@ -145,12 +164,16 @@ MOST_SUBSTEPS = 64
 @functools.partial(jax.jit, static_argnames=("channels",))
 def _tried(rig, dt, u, own, substeps, *, channels):
     """`play` with any number of steps: one program for all."""
-    return jax.vmap(lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps))(dt, u, own)
+    return jax.vmap(
+        lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps)
+    )(dt, u, own)
 
 
 def substeps_for(rig, rec, own, error):
-    """(how many steps each sample needs: twice as many move no reading by more than `error` (channels,), in the channels' units, at most 64;
-    (channels,) by how much they do: NaN or infinite where the levels leave the numbers)."""
+    """(how many steps each sample needs: twice as many move no reading by more than `error`
+    (channels,), in the channels' units, at most 64; (channels,) by how much they do: NaN or
+    infinite where the levels leave the numbers).
+    """
     own, before, count = np.asarray(own), None, 1
     while count <= MOST_SUBSTEPS:
         y = np.asarray(_tried(rig, rec.dt, rec.u, own, count, channels=rec.channels))

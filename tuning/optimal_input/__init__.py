@@ -1,1 +1,3 @@
-"""The perfect-information open-loop optimum: the best inputs when the whole run is known in advance."""
+"""The perfect-information open-loop optimum: the best inputs when the whole run is known in
+advance.
+"""

@@ -1,4 +1,6 @@
-"""Inputs as unknowns: what a run costs as a function of every voltage it is given, with the exact gradient by checkpointed reverse mode."""
+"""Inputs as unknowns: what a run costs as a function of every voltage it is given, with the exact
+gradient by checkpointed reverse mode.
+"""
 
 import dataclasses
 import functools
@@ -32,7 +34,9 @@ class Terms(NamedTuple):
 
 
 class Held(NamedTuple):
-    """An augmented Lagrangian: values, multipliers and weight of the limits, and what the cost counts as 1."""
+    """An augmented Lagrangian: values, multipliers and weight of the limits, and what the cost
+    counts as 1.
+    """
 
     scale: Any  # () cost, or its square, that counts as 1
     weight: Any  # () of a squared excess [-]
@@ -45,18 +49,25 @@ class Held(NamedTuple):
 
 
 def open_loop(loop, u, interval):
-    """`loop` with its law replaced by the inputs u (pumps, intervals), each held for `interval` [s], and without sensor noise."""
+    """`loop` with its law replaced by the inputs u (pumps, intervals), each held for `interval`
+    [s], and without sensor noise.
+    """
     return dataclasses.replace(
         loop,
         controller=OpenLoop(signal=Table(values=u, period=interval)),
         observer=Direct(),
-        sensor=dataclasses.replace(loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise))), bits=0),
-        actuator=dataclasses.replace(loop.actuator, saturation="clip"),  # inputs within the limits need no allocation
+        sensor=dataclasses.replace(
+            loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise))), bits=0
+        ),
+        # inputs within the limits need no allocation
+        actuator=dataclasses.replace(loop.actuator, saturation="clip"),
     )
 
 
 def excess(terms, held, sample):
-    """How far each running limit is passed at a sample, negative inside, as a share of its room [-]."""
+    """How far each running limit is passed at a sample, negative inside, as a share of its room
+    [-].
+    """
     found = []
     for j, (measure, i) in enumerate(terms.running):
         quantity = magnitude(sample.e[i]) if measure == "max_error" else sample.x[i]
@@ -72,7 +83,9 @@ def value_and_gradient(loop, clock, terms, u, held):
 
 @functools.partial(jax.jit, static_argnames=("clock", "terms"))
 def look(loop, clock, terms, u, held):
-    """((running,) tuple of (samples,) excesses, (whole,) excesses, both as shares of their rooms, {measure: value}) of the inputs u."""
+    """((running,) tuple of (samples,) excesses, (whole,) excesses, both as shares of their rooms,
+    {measure: value}) of the inputs u.
+    """
     loop = _with_inputs(loop, u)
     names = _names(terms)
     run = run_of(loop, clock)
@@ -80,9 +93,16 @@ def look(loop, clock, terms, u, held):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), tuple(excess(terms, held, sample))
+        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), tuple(
+            excess(terms, held, sample)
+        )
 
-    (_, acc), over = lp.scan(body, (initial(loop, clock), ms.start(run, names)), inputs(loop, clock, names, None), clock.samples)
+    (_, acc), over = lp.scan(
+        body,
+        (initial(loop, clock), ms.start(run, names)),
+        inputs(loop, clock, names, None),
+        clock.samples,
+    )
     measures = ms.read(run, acc, names)
     return over, _whole(terms, held, measures), measures
 
@@ -115,7 +135,9 @@ def _search_cost(u, loop, clock, terms, held):
     measures = ms.read(run, acc, names)
     smooth = {"input_travel": travel, "iae": absolute * clock.dt}
     cost = sum(w * (smooth[m] if m in smooth else jnp.sum(measures[m])) for m, w in terms.objective)
-    total = (cost * cost if terms.squared else cost) / held.scale + 0.5 * penalty / (held.weight * clock.samples)
+    total = (cost * cost if terms.squared else cost) / held.scale + 0.5 * penalty / (
+        held.weight * clock.samples
+    )
     for j, over in enumerate(_whole(terms, held, measures)):
         push = held.pulls[j] + held.weight * over
         total = total + 0.5 * jnp.where(push > 0.0, push * push, 0.0) / held.weight
@@ -123,7 +145,10 @@ def _search_cost(u, loop, clock, terms, held):
 
 
 def _whole(terms, held, measures):
-    return [(jnp.ravel(measures[m])[i] - held.whole[j]) / held.room[1][j] for j, (m, i) in enumerate(terms.whole)]
+    return [
+        (jnp.ravel(measures[m])[i] - held.whole[j]) / held.room[1][j]
+        for j, (m, i) in enumerate(terms.whole)
+    ]
 
 
 def _names(terms):

@@ -12,12 +12,15 @@ FLAT = 5
 
 
 def minimise(function, z, iterations, tolerance=1e-8):
-    """(z, value, gradient, iterations) of a local minimum of `function` over the unit cube (Bertsekas 1982: two-metric projection).
+    """(z, value, gradient, iterations) of a local minimum of `function` over the unit cube
+    (Bertsekas 1982: two-metric projection).
 
-    function: z (n,) -> (value, gradient (n,)); z: (n,) start, inside. The direction is that of limited-memory BFGS (Nocedal 1980) in the
-    coordinates that are not held at a wall by their slope; the step is halved until the value falls by a ten-thousandth of what the slope
-    promises. Ends after `iterations`, or where FLAT iterations in a row gain less than `tolerance` of the value or of 1e-2. (SciPy's
-    L-BFGS-B does the same with small dense factorisations, which spend more on threads than such a simulation takes.)
+    function: z (n,) -> (value, gradient (n,)); z: (n,) start, inside. The direction is that of
+    limited-memory BFGS (Nocedal 1980) in the coordinates that are not held at a wall by their
+    slope; the step is halved until the value falls by a ten-thousandth of what the slope promises.
+    Ends after `iterations`, or where FLAT iterations in a row gain less than `tolerance` of the
+    value or of 1e-2. (SciPy's L-BFGS-B does the same with small dense factorisations, which spend
+    more on threads than such a simulation takes.)
     """
     value, gradient = function(z)
     pairs, flat, count = deque(maxlen=MEMORY), 0, 0

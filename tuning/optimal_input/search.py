@@ -1,4 +1,6 @@
-"""The search for the best inputs: grids from coarse to fine, L-BFGS in a box, limits by one multiplier per sample."""
+"""The search for the best inputs: grids from coarse to fine, L-BFGS in a box, limits by one
+multiplier per sample.
+"""
 
 import dataclasses
 
@@ -25,10 +27,14 @@ INTERVALS = 1200
 """Most intervals of an input where none are asked for."""
 
 GRIDS = (16, 4, 1)
-"""Intervals that move together, coarse to fine: slow changes of the input are found on few unknowns."""
+"""Intervals that move together, coarse to fine: slow changes of the input are found on few
+unknowns.
+"""
 
 WEIGHT = 1e5
-"""First weight of a squared excess, of a cost that counts as 1 and an excess as a share of its limit [-]."""
+"""First weight of a squared excess, of a cost that counts as 1 and an excess as a share of its
+limit [-].
+"""
 
 SETPOINTS = 8
 """Setpoints whose steady inputs are asked for: a start needs no more."""
@@ -43,44 +49,74 @@ class InputSearch:
     def __init__(self, case, objective, limits, interval, iterations, progress):
         if jax.numpy.result_type(float) != np.float64:
             raise InputError("bound needs float64: jax.config.update('jax_enable_x64', True)")
-        if not isinstance(iterations, int) or isinstance(iterations, bool) or not 1 <= iterations <= 100_000:
-            raise InputError(f"iterations = {iterations!r}: must be a whole number from 1 to 100000")
+        if (
+            not isinstance(iterations, int)
+            or isinstance(iterations, bool)
+            or not 1 <= iterations <= 100_000
+        ):
+            raise InputError(
+                f"iterations = {iterations!r}: must be a whole number from 1 to 100000"
+            )
         self.case, self.most, self.progress = case, iterations, progress
-        self.objective = {m: w for m, w in check_objective(case.objective if objective is None else objective).items() if w > 0}
+        self.objective = {
+            m: w
+            for m, w in check_objective(case.objective if objective is None else objective).items()
+            if w > 0
+        }
         loop, clock = case.loop, case.clock
         lp.check(loop, clock, jax.random.key(0))
         self.low, self.high = (
-            np.array(np.broadcast_to(v, loop.plant.pumps), dtype=float) for v in (loop.actuator.low, loop.actuator.high)
+            np.array(np.broadcast_to(v, loop.plant.pumps), dtype=float)
+            for v in (loop.actuator.low, loop.actuator.high)
         )
         if not np.all(np.isfinite([self.low, self.high])):
-            raise InputError("bound: every pump needs finite limits, actuator.low and actuator.high")
+            raise InputError(
+                "bound: every pump needs finite limits, actuator.low and actuator.high"
+            )
         self.limits = resolve_limits(case, limits)
         _check_served(self.objective, self.limits)
         self.interval = _interval(clock, interval)
         self.count = max(1, int(np.ceil((clock.samples - 1) * clock.dt / self.interval - 1e-6)))
-        needs = {a for m in (*self.objective, *(limit.measure for limit in self.limits)) for a in ms.MEASURES[m].needs}
+        needs = {
+            a
+            for m in (*self.objective, *(limit.measure for limit in self.limits))
+            for a in ms.MEASURES[m].needs
+        }
         # changes from sample to sample are fewer at a coarser step
         self.coarse = (
             dataclasses.replace(clock, integrator="midpoint")
             if "changes2" in needs
             else _search_clock(clock, self.interval, loop.actuator.delay)
         )
-        # below an offset dead zone the pump stands still whatever the voltage: a search would not find its way out
+        # below an offset dead zone the pump stands still whatever the voltage: a search would not
+        # find its way out
         if (
             loop.actuator.dead_zone is not None
             and loop.actuator.dead_zone_kind == "offset"
             and not needs & {"u2", "travel", "deviation2", "changes2", "past2"}
         ):
             self.low = np.minimum(np.maximum(self.low, loop.actuator.dead_zone), self.high)
-        # no liquid over a rim is a level at most at the rim: the slope of a level that stops there would say nothing
-        spill = [limit.index for limit in self.limits if limit.measure == "overflow_volume" and limit.value <= 1e-3]
+        # no liquid over a rim is a level at most at the rim: the slope of a level that stops there
+        # would say nothing
+        spill = [
+            limit.index
+            for limit in self.limits
+            if limit.measure == "overflow_volume" and limit.value <= 1e-3
+        ]
         if spill and len(spill) < loop.plant.tanks:
-            raise InputError("bound: a limit on overflow_volume must be given for all tanks, or max_level = rim")
+            raise InputError(
+                "bound: a limit on overflow_volume must be given for all tanks, or max_level = rim"
+            )
         self.plant = dataclasses.replace(loop.plant, overflow=False) if spill else loop.plant
         rim = np.asarray(loop.plant.rim)
         held = [(limit.measure, limit.index, limit.value) for limit in self.limits]
         levels = [
-            ("max_level", i, rim[i] * (1 - TOLERANCE)) if m == "overflow_volume" and i in spill else (m, i, v) for m, i, v in held
+            (
+                ("max_level", i, rim[i] * (1 - TOLERANCE))
+                if m == "overflow_volume" and i in spill
+                else (m, i, v)
+            )
+            for m, i, v in held
         ]
         running = [limit for limit in levels if limit[0] in RUNNING]
         whole = [limit for limit in levels if limit[0] not in RUNNING]
@@ -98,7 +134,10 @@ class InputSearch:
             forces=tuple(np.zeros(self.coarse.samples) for _ in running),
             whole=number([v for *_, v in whole]),
             pulls=number(np.zeros(len(whole))),
-            room=(number([abs(v) or length for *_, v in running]), number([abs(v) or 1.0 for *_, v in whole])),
+            room=(
+                number([abs(v) or length for *_, v in running]),
+                number([abs(v) or 1.0 for *_, v in whole]),
+            ),
             knees=(number(1e-3 * np.max(self.high - self.low)), number(1e-5 * length)),
         )
         self.asked = self.held
@@ -106,32 +145,51 @@ class InputSearch:
         self.iterations, self.gradients, self.simulations = 0, 0, 0
 
     def run(self):
-        """Grids from coarse to fine; on each, rounds of L-BFGS and new multipliers; on the last, until the limits hold."""
+        """Grids from coarse to fine; on each, rounds of L-BFGS and new multipliers; on the last,
+        until the limits hold.
+        """
         grids = [g for g in GRIDS if g == 1 or self.count >= 20 * g]
         u = self._start(grids[0])
         for group in grids:
-            # a wide knee on a fine grid would let one jump be had for nothing, cut into many small ones
-            self.held = self.held._replace(knees=(self.asked.knees[0] * group * group / GRIDS[0], self.asked.knees[1]))
+            # a wide knee on a fine grid would let one jump be had for nothing, cut into many small
+            # ones
+            self.held = self.held._replace(
+                knees=(self.asked.knees[0] * group * group / GRIDS[0], self.asked.knees[1])
+            )
             self._rescale(u)
             u, found = self._settle(u, group, 5 if group == 1 else 2)
             if group == 1:
                 found = self._repair(u, found)
-            self.grids.append({"interval_s": self.interval * group, "cost": found["cost"], "excess": found["excess"]})
+            self.grids.append(
+                {
+                    "interval_s": self.interval * group,
+                    "cost": found["cost"],
+                    "excess": found["excess"],
+                }
+            )
 
     def _start(self, group):
-        """The better of two searches on the coarsest grid: from the law's own inputs, and from those of steady state."""
+        """The better of two searches on the coarsest grid: from the law's own inputs, and from
+        those of steady state.
+        """
         starts = [s for s in (self._own(), self._steady()) if s is not None]
         self._rescale(starts[0])
         done = [self._descend(u, group) for u in starts]
         if not any(np.isfinite(f) for _, f in done):
-            raise NonFiniteError("neither the law's own inputs nor those of steady state give a run that stays finite")
+            raise NonFiniteError(
+                "neither the law's own inputs nor those of steady state give a run that stays"
+                " finite"
+            )
         return min(done, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
 
     def _own(self):
         """The law's own inputs, each the mean over its interval; None if they do not stay finite."""
         loop, clock = self.case.loop, self.case.clock
         quiet = dataclasses.replace(
-            loop, sensor=dataclasses.replace(loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise))))
+            loop,
+            sensor=dataclasses.replace(
+                loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise)))
+            ),
         )
         try:
             applied = np.asarray(lp.simulate(quiet, clock).applied).T
@@ -141,14 +199,31 @@ class InputSearch:
         self.closed = self.check(applied, clock.dt)
         if not np.isfinite(self.closed["cost"]):
             self.closed = None
-        at = np.minimum(np.arange(clock.samples) * clock.dt / self.interval + 1e-6, self.count - 1).astype(int)
-        return self._inside(np.stack([np.bincount(at, row, self.count) / np.bincount(at, minlength=self.count) for row in applied]))
+        at = np.minimum(
+            np.arange(clock.samples) * clock.dt / self.interval + 1e-6, self.count - 1
+        ).astype(int)
+        return self._inside(
+            np.stack(
+                [
+                    np.bincount(at, row, self.count) / np.bincount(at, minlength=self.count)
+                    for row in applied
+                ]
+            )
+        )
 
     def _steady(self):
-        """The inputs that would hold the nearest of a few setpoints, where they exist; the middle of the range elsewhere."""
+        """The inputs that would hold the nearest of a few setpoints, where they exist; the middle
+        of the range elsewhere.
+        """
         plant, actuator = self.case.loop.plant, self.case.loop.actuator
-        r = np.array(self.case.loop.reference.sample(dataclasses.replace(self.coarse, dt=self.interval))[0])[:, : self.count]
-        offset = 0.0 if actuator.dead_zone is None or actuator.dead_zone_kind != "offset" else np.asarray(actuator.dead_zone)
+        r = np.array(
+            self.case.loop.reference.sample(dataclasses.replace(self.coarse, dt=self.interval))[0]
+        )[:, : self.count]
+        offset = (
+            0.0
+            if actuator.dead_zone is None or actuator.dead_zone_kind != "offset"
+            else np.asarray(actuator.dead_zone)
+        )
         known = np.unique(r, axis=1)
         known, held = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
         for setpoint in known:
@@ -164,18 +239,30 @@ class InputSearch:
 
     def _loop(self):
         zeros = np.zeros((self.case.loop.plant.pumps, self.count))
-        return dataclasses.replace(open_loop(self.case.loop, zeros, self.interval), plant=self.plant)
+        return dataclasses.replace(
+            open_loop(self.case.loop, zeros, self.interval), plant=self.plant
+        )
 
     def _rescale(self, u):
         """Count the cost of u as 1, and keep the multipliers what they are in units of the cost."""
-        bare = self.held._replace(weight=np.float64(1e-30), forces=tuple(0.0 * f for f in self.held.forces), scale=np.float64(1.0))
-        cost = float(value_and_gradient(self._loop(), self.coarse, self.terms, u, bare._replace(pulls=0.0 * bare.pulls))[0])
+        bare = self.held._replace(
+            weight=np.float64(1e-30),
+            forces=tuple(0.0 * f for f in self.held.forces),
+            scale=np.float64(1.0),
+        )
+        cost = float(
+            value_and_gradient(
+                self._loop(), self.coarse, self.terms, u, bare._replace(pulls=0.0 * bare.pulls)
+            )[0]
+        )
         self.gradients += 1
         if not np.isfinite(cost) or cost <= 1e-12:
             return
         ratio = float(self.held.scale) / cost
         self.held = self.held._replace(
-            scale=np.float64(cost), forces=tuple(f * ratio for f in self.held.forces), pulls=self.held.pulls * ratio
+            scale=np.float64(cost),
+            forces=tuple(f * ratio for f in self.held.forces),
+            pulls=self.held.pulls * ratio,
         )
 
     def _descend(self, u, group):
@@ -189,7 +276,9 @@ class InputSearch:
 
         def cost(z):
             self.gradients += 1
-            value, gradient = value_and_gradient(loop, self.coarse, self.terms, spread(z), self.held)
+            value, gradient = value_and_gradient(
+                loop, self.coarse, self.terms, spread(z), self.held
+            )
             gradient = (np.add.reduceat(np.asarray(gradient), edges, axis=1) * span).ravel()
             if not (np.isfinite(value) and np.all(np.isfinite(gradient))):
                 return 1e12, np.zeros_like(gradient)
@@ -202,13 +291,17 @@ class InputSearch:
         return spread(z), value
 
     def _settle(self, u, group, rounds):
-        """(inputs, what check says of them) after rounds of descent and new multipliers; heavier where an excess does not shrink."""
+        """(inputs, what check says of them) after rounds of descent and new multipliers; heavier
+        where an excess does not shrink.
+        """
         last, before = np.inf, np.inf
         for _ in range(rounds):
             u, _ = self._descend(u, group)
             found = self.check(u, self.interval)
             self._tell(found, group)
-            if found["excess"] <= 30 * TOLERANCE and abs(found["cost"] - before) <= 2e-3 * abs(found["cost"]):
+            if found["excess"] <= 30 * TOLERANCE and abs(found["cost"] - before) <= 2e-3 * abs(
+                found["cost"]
+            ):
                 break
             before = found["cost"]
             if not self.terms.running and not self.terms.whole:
@@ -224,12 +317,21 @@ class InputSearch:
         over, whole, _ = self._look(u, self.interval, self.coarse, self.held)
         w = self.held.weight
         self.held = self.held._replace(
-            forces=tuple(np.maximum(0.0, np.asarray(f) + w * np.asarray(g)) for f, g in zip(self.held.forces, over)),
-            pulls=np.maximum(0.0, np.asarray(self.held.pulls) + w * np.asarray(whole)) if len(whole) else self.held.pulls,
+            forces=tuple(
+                np.maximum(0.0, np.asarray(f) + w * np.asarray(g))
+                for f, g in zip(self.held.forces, over)
+            ),
+            pulls=(
+                np.maximum(0.0, np.asarray(self.held.pulls) + w * np.asarray(whole))
+                if len(whole)
+                else self.held.pulls
+            ),
         )
 
     def _repair(self, u, found):
-        """Heavier weights, then limits tightened by the little that still passes them, until they hold at the case's own step."""
+        """Heavier weights, then limits tightened by the little that still passes them, until they
+        hold at the case's own step.
+        """
         for k in range(ROUNDS):
             if found["excess"] <= TOLERANCE:
                 break
@@ -249,7 +351,9 @@ class InputSearch:
         return found
 
     def check(self, u, interval):
-        """What a run with u (pumps, intervals) comes to at the case's own step; kept if it is the best so far."""
+        """What a run with u (pumps, intervals) comes to at the case's own step; kept if it is the
+        best so far.
+        """
         clock = self.case.clock
         over, whole, measures = self._look(u, interval, clock, self.asked)
         over, whole = [np.asarray(o) for o in over], [float(w) for w in whole]
@@ -264,29 +368,54 @@ class InputSearch:
             "holds": bool(excess <= TOLERANCE),
             "constraints": self._constraints(over, whole),
         }
-        if np.isfinite(found["cost"]) and (self.best is None or _better(found, self.best)) and u.shape[1] == self.count:
+        if (
+            np.isfinite(found["cost"])
+            and (self.best is None or _better(found, self.best))
+            and u.shape[1] == self.count
+        ):
             self.best = found
         return found
 
     def _look(self, u, interval, clock, held):
-        """What `inputs.look` says of u, given sample by sample: one compiled program for whatever interval."""
-        at = np.minimum(np.arange(clock.samples) * (clock.dt / interval) + 1e-6, u.shape[1] - 1).astype(int)
+        """What `inputs.look` says of u, given sample by sample: one compiled program for whatever
+        interval.
+        """
+        at = np.minimum(
+            np.arange(clock.samples) * (clock.dt / interval) + 1e-6, u.shape[1] - 1
+        ).astype(int)
         self.simulations += 1
         loop = dataclasses.replace(open_loop(self.case.loop, u[:, at], clock.dt), plant=self.plant)
         return look(loop, clock, self.terms, u[:, at], held)
 
     def _constraints(self, over, whole):
-        """One dict per limit: name, measure, limit, value, margin, tank or output counted from 1, time of the tightest sample."""
+        """One dict per limit: name, measure, limit, value, margin, tank or output counted from 1,
+        time of the tightest sample.
+        """
         rows = []
         for j, (m, i) in enumerate(self.terms.running):
-            at, limit, room = int(np.argmax(over[j])), float(self.asked.running[j]), float(self.asked.room[0][j])
-            rows.append((m, i, limit, limit + RUNNING[m] * over[j][at] * room, -over[j][at] * room, at * self.case.clock.dt))
+            at, limit, room = (
+                int(np.argmax(over[j])),
+                float(self.asked.running[j]),
+                float(self.asked.room[0][j]),
+            )
+            rows.append(
+                (
+                    m,
+                    i,
+                    limit,
+                    limit + RUNNING[m] * over[j][at] * room,
+                    -over[j][at] * room,
+                    at * self.case.clock.dt,
+                )
+            )
         for j, (m, i) in enumerate(self.terms.whole):
             limit, room = float(self.asked.whole[j]), float(self.asked.room[1][j])
             rows.append((m, i, limit, limit + whole[j] * room, -whole[j] * room, None))
         return [
             {
-                "name": m if ms.MEASURES[m].per == "run" else f"{m} of {ms.MEASURES[m].per} {i + 1}",
+                "name": (
+                    m if ms.MEASURES[m].per == "run" else f"{m} of {ms.MEASURES[m].per} {i + 1}"
+                ),
                 "measure": m,
                 "limit": limit,
                 "value": float(value),
@@ -311,7 +440,9 @@ class InputSearch:
 
 
 def _better(a, b):
-    """True if a is to be preferred: held limits first, then the smaller excess, then the lower cost."""
+    """True if a is to be preferred: held limits first, then the smaller excess, then the lower
+    cost.
+    """
     if a["holds"] != b["holds"]:
         return a["holds"]
     return a["cost"] < b["cost"] if a["holds"] else a["excess"] < b["excess"]
@@ -321,20 +452,29 @@ def _check_served(objective, limits):
     good = [m for m, spec in ms.MEASURES.items() if spec.by_input]
     for m in objective:
         if m not in good:
-            raise InputError(f"bound of {m}: has no slope in every input; can be made small: {', '.join(good)}")
+            raise InputError(
+                f"bound of {m}: has no slope in every input; can be made small: {', '.join(good)}"
+            )
     for limit in limits:
         if limit.measure not in (*good, *RUNNING):
             raise InputError(
-                f"bound under a limit on {limit.measure}: has no slope; can be limited: {', '.join([*RUNNING, *good])}"
+                f"bound under a limit on {limit.measure}: has no slope; can be limited:"
+                f" {', '.join([*RUNNING, *good])}"
             )
 
 
 def _interval(clock, interval):
-    """The interval [s]: as asked, or the shortest of 1, 2, 5 times a power of ten that gives at most INTERVALS."""
+    """The interval [s]: as asked, or the shortest of 1, 2, 5 times a power of ten that gives at
+    most INTERVALS.
+    """
     if interval is None:
         least = max(clock.duration / INTERVALS, clock.dt)
         nice = [a * 10.0**b for b in range(-6, 7) for a in (1, 2, 5)]
-        fits = [v for v in nice if (1 - 1e-9) * least <= v <= 2.5 * least and _whole_number(v / clock.dt)]
+        fits = [
+            v
+            for v in nice
+            if (1 - 1e-9) * least <= v <= 2.5 * least and _whole_number(v / clock.dt)
+        ]
         return float(fits[0] if fits else clock.dt * np.ceil(least / clock.dt - 1e-6))
     good = (
         isinstance(interval, (int, float))
@@ -343,18 +483,26 @@ def _interval(clock, interval):
     )
     if not good or not _whole_number(interval / clock.dt):
         raise InputError(
-            f"interval = {interval!r} s: must be a whole number of samples of {clock.dt:g} s, at most {clock.duration:g} s"
+            f"interval = {interval!r} s: must be a whole number of samples of {clock.dt:g} s, at"
+            f" most {clock.duration:g} s"
         )
     if clock.duration / interval > 20_000:
-        raise InputError(f"interval = {interval:g} s: {clock.duration / interval:.0f} intervals; must be at most 20000")
+        raise InputError(
+            f"interval = {interval:g} s: {clock.duration / interval:.0f} intervals; must be at most"
+            " 20000"
+        )
     return float(interval)
 
 
 def _search_clock(clock, interval, delay):
-    """The clock of the search: up to twenty of the case's samples in one, as intervals and delay allow, and a cheaper integrator."""
+    """The clock of the search: up to twenty of the case's samples in one, as intervals and delay
+    allow, and a cheaper integrator.
+    """
     for f in (20, 10, 5, 4, 2):
         dt = clock.dt * f
-        if (clock.samples - 1) / f >= SEARCH_SAMPLES and all(_whole_number(v / dt) for v in (interval, delay, clock.duration)):
+        if (clock.samples - 1) / f >= SEARCH_SAMPLES and all(
+            _whole_number(v / dt) for v in (interval, delay, clock.duration)
+        ):
             return dataclasses.replace(clock, dt=dt, integrator="midpoint")
     return dataclasses.replace(clock, integrator="midpoint")
 

@@ -12,7 +12,9 @@ from jaxtank.rig import check_free
 
 
 class Bound(NamedTuple):
-    """One scalar parameter: its dotted name, range and unit. The search sees z in [0, 1], logarithmic or linear in the value."""
+    """One scalar parameter: its dotted name, range and unit. The search sees z in [0, 1],
+    logarithmic or linear in the value.
+    """
 
     name: str
     low: float
@@ -37,13 +39,18 @@ class Bound(NamedTuple):
 
     def slope(self, value: Any) -> Any:
         """d value / d z."""
-        return value * math.log(self.high / self.low) if self.scale == "log" else np.full_like(value, self.high - self.low)
+        return (
+            value * math.log(self.high / self.low)
+            if self.scale == "log"
+            else np.full_like(value, self.high - self.low)
+        )
 
 
 def bounds(loop, free):
     """The Bounds of {name: Free}; the name of an array stands for all its entries.
 
-    Raises InputError for an unknown name, a range that is empty, not finite or outside what the parameter allows.
+    Raises InputError for an unknown name, a range that is empty, not finite or outside what the
+    parameter allows.
     """
     if not free:
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
@@ -53,7 +60,11 @@ def bounds(loop, free):
         unit = describe(loop, name)["unit"]
         base, _ = split_index(name)
         value = get_value(loop, name)
-        names = [name] if np.ndim(value) == 0 else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
+        names = (
+            [name]
+            if np.ndim(value) == 0
+            else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
+        )
         found += [Bound(n, float(low), float(high), scale, unit) for n in names]
     names = [b.name for b in found]
     for name in names:

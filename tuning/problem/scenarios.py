@@ -28,15 +28,23 @@ FEWEST = 200
 
 
 def coarse_clock(clock):
-    """The clock of the coarse stage: ten times the step, where that leaves at least a thousand samples; else the clock itself."""
+    """The clock of the coarse stage: ten times the step, where that leaves at least a thousand
+    samples; else the clock itself.
+    """
     if clock.samples < 1000 * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
 def rough_clock(clock):
-    """The clock of a first local search: ten times the step, where that leaves at least FEWEST samples; else the clock itself."""
-    return clock if clock.samples < FEWEST * COARSE else dataclasses.replace(clock, dt=clock.dt * COARSE)
+    """The clock of a first local search: ten times the step, where that leaves at least FEWEST
+    samples; else the clock itself.
+    """
+    return (
+        clock
+        if clock.samples < FEWEST * COARSE
+        else dataclasses.replace(clock, dt=clock.dt * COARSE)
+    )
 
 
 class Lane(NamedTuple):
@@ -71,9 +79,14 @@ def check_scenarios(case, scenarios, free=()):
         raise InputError(f"scenarios: {len(found)} of them, must be at most {MANY}")
     for s in found:
         if not np.isfinite(s.weight) or s.weight <= 0:
-            raise InputError(f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0")
+            raise InputError(
+                f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
+            )
         if isinstance(s.seed, bool) or not isinstance(s.seed, int) or not 0 <= s.seed < 2**31:
-            raise InputError(f"scenario {s.name!r}: seed = {s.seed!r} must be a whole number from 0 to {2**31 - 1}")
+            raise InputError(
+                f"scenario {s.name!r}: seed = {s.seed!r} must be a whole number from 0 to"
+                f" {2**31 - 1}"
+            )
         for name in s.values:
             for other in free:
                 if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
@@ -84,7 +97,9 @@ def check_scenarios(case, scenarios, free=()):
 
 
 def lanes_of(case, scenarios, seed):
-    """The Lanes of a case: one for each scenario, or one for the case itself. Raises InputError, naming the scenario."""
+    """The Lanes of a case: one for each scenario, or one for the case itself. Raises InputError,
+    naming the scenario.
+    """
     if not scenarios:
         key = jax.random.key(seed) if noisy(case) else None
         return [Lane("", case, key, 1.0)]
@@ -114,7 +129,9 @@ def groups_of(lanes):
     for (structure, _, clock, quiet), members in sorts.items():
         columns = list(zip(*(leaves for _, leaves in members)))
         apart = tuple(any(not np.array_equal(c[0], v) for v in c[1:]) for c in columns)
-        leaves = tuple(np.stack([np.asarray(v) for v in c]) if a else c[0] for c, a in zip(columns, apart))
+        leaves = tuple(
+            np.stack([np.asarray(v) for v in c]) if a else c[0] for c, a in zip(columns, apart)
+        )
         keys = None if quiet else jnp.stack([lanes[i].key for i, _ in members])
         found.append(Group(tuple(i for i, _ in members), clock, structure, leaves, apart, keys))
     return found
@@ -129,28 +146,52 @@ def take(group, picked):
 
 
 def values_of(group, names, points, clock=None):
-    """(measures {name: (points, lanes, ...)}, (points, lanes) True where a run is not finite); points {parameter: (points,)}."""
+    """(measures {name: (points, lanes, ...)}, (points, lanes) True where a run is not finite);
+    points {parameter: (points,)}.
+    """
     shape = (group.structure, group.apart, len(group.lanes))
     return _values(group.leaves, group.keys, shape, clock or group.clock, names, points)
 
 
 def slopes_of(group, names, values, squares):
-    """(measures {name: (lanes, ...)}, slopes {name: (lanes, ..., P)}, (lanes, P, P) Gauss-Newton, (lanes,) broken): forward mode."""
+    """(measures {name: (lanes, ...)}, slopes {name: (lanes, ..., P)}, (lanes, P, P) Gauss-Newton,
+    (lanes,) broken): forward mode.
+    """
     shape = (group.structure, group.apart, len(group.lanes))
-    return _slopes(group.leaves, group.keys, shape, group.clock, names, tuple(values), tuple(values.values()), squares)
+    return _slopes(
+        group.leaves,
+        group.keys,
+        shape,
+        group.clock,
+        names,
+        tuple(values),
+        tuple(values.values()),
+        squares,
+    )
 
 
 def reverse_slopes_of(group, names, values):
     """(measures, slopes) as `slopes_of`, by reverse mode through checkpointed pieces."""
     shape = (group.structure, group.apart, len(group.lanes))
-    return _reverse(group.leaves, group.keys, shape, group.clock, names, tuple(values), np.array(list(values.values())))
+    return _reverse(
+        group.leaves,
+        group.keys,
+        shape,
+        group.clock,
+        names,
+        tuple(values),
+        np.array(list(values.values())),
+    )
 
 
 def _mapped(function, leaves, keys, shape):
     """function(loop, key) over the lanes of a group; one lane runs as it would alone."""
     structure, apart, count = shape
     if count == 1:
-        one = jax.tree.unflatten(structure, leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)])
+        one = jax.tree.unflatten(
+            structure,
+            leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)],
+        )
         return jax.tree.map(lambda v: v[None], function(one, None if keys is None else keys[0]))
     return jax.vmap(
         lambda leaves, key: function(jax.tree.unflatten(structure, leaves), key),
@@ -159,19 +200,35 @@ def _mapped(function, leaves, keys, shape):
     )(leaves, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE)
+@functools.partial(
+    jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE
+)
 def _values(leaves, keys, shape, clock, names, points):
     def at(values):
-        return _mapped(lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key), leaves, keys, shape)
+        return _mapped(
+            lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key),
+            leaves,
+            keys,
+            shape,
+        )
 
     return jax.vmap(at)(points)
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order", "squares"), compiler_options=flags.WIDE)
+@functools.partial(
+    jax.jit,
+    static_argnames=("shape", "clock", "names", "order", "squares"),
+    compiler_options=flags.WIDE,
+)
 def _slopes(leaves, keys, shape, clock, names, order, values, squares):
     several = shape[-1] > 1
     return _mapped(
-        lambda loop, key: sensitivities_compiled(loop, clock, names, order, values, key, squares, several), leaves, keys, shape
+        lambda loop, key: sensitivities_compiled(
+            loop, clock, names, order, values, key, squares, several
+        ),
+        leaves,
+        keys,
+        shape,
     )
 
 
@@ -179,7 +236,9 @@ def _slopes(leaves, keys, shape, clock, names, order, values, squares):
 def _reverse(leaves, keys, shape, clock, names, order, theta):
     def one(loop, key):
         def run(theta):
-            measures = lp.evaluate_for_reverse(with_values(loop, dict(zip(order, theta))), clock, names, key)
+            measures = lp.evaluate_for_reverse(
+                with_values(loop, dict(zip(order, theta))), clock, names, key
+            )
             return measures, measures
 
         slopes, measures = jax.jacrev(run, has_aux=True)(theta)

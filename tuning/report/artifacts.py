@@ -18,7 +18,11 @@ from tuning.report.tables import dumps
 def trajectory_csv(run, rig_units=DEFAULT):
     """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
     known = bool(np.asarray(run.d_hat).any())
-    kept = {n: v for n, v in columns(run, rig_units).items() if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))}
+    kept = {
+        n: v
+        for n, v in columns(run, rig_units).items()
+        if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
+    }
     out = io.StringIO()
     out.write(",".join(kept) + "\n")
     np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
@@ -29,7 +33,8 @@ def run_for_people(case, key=None, rows=3000):
     """A Trajectory of about `rows` rows, as host arrays."""
     steps = case.clock.samples - 1
     least = max(1, steps // rows)
-    # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that rests; one that ends at the end, if any
+    # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that
+    # rests; one that ends at the end, if any
     every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
     run = lp.simulate(case.loop, case.clock, key, save_every=every)
     return type(run)(*(np.asarray(v) for v in run))
@@ -45,7 +50,9 @@ def png(figure):
 
 
 def pngs(drawn):
-    """{file name: bytes} of {name: figure}; the figures are closed. One that cannot be drawn is left out, with a note on stderr."""
+    """{file name: bytes} of {name: figure}; the figures are closed. One that cannot be drawn is
+    left out, with a note on stderr.
+    """
     found = {}
     for name, figure in drawn.items():
         try:
@@ -56,16 +63,21 @@ def pngs(drawn):
 
 
 def earlier(folder, names):
-    """Paths of report.html and of the pictures `names` that an earlier result left in `folder`; none where there is no report."""
+    """Paths of report.html and of the pictures `names` that an earlier result left in `folder`;
+    none where there is no report.
+    """
     page = Path(folder) / "report.html"
     return [page, *(page.with_name(f"{name}.png") for name in names)] if page.is_file() else []
 
 
 def write_result(folder, files, draw, page=None, stale=()):
-    """Write `files` {name: text or bytes} of a result to `folder`, all or none, then its pictures, all or none; returns the paths.
+    """Write `files` {name: text or bytes} of a result to `folder`, all or none, then its pictures,
+    all or none; returns the paths.
 
-    draw: function that returns {name: figure}, called once the files are written; page: function of these that returns report.html;
-    stale: paths of an earlier result, removed between the two. What cannot be drawn is left out, with a note on stderr.
+    draw: function that returns {name: figure}, called once the files are written; page: function of
+        these that returns report.html;
+    stale: paths of an earlier result, removed between the two. What cannot be drawn is left out,
+        with a note on stderr.
     """
     folder = Path(folder)
     written = write_files(folder, files)
@@ -77,7 +89,11 @@ def write_result(folder, files, draw, page=None, stale=()):
     try:
         drawn = draw()
     except Exception as error:
-        failed("the pictures", error, *(plt.figure(n) for n in plt.get_fignums() if n not in open_before))
+        failed(
+            "the pictures",
+            error,
+            *(plt.figure(n) for n in plt.get_fignums() if n not in open_before),
+        )
     try:
         more = {} if page is None else {"report.html": page(drawn)}
     except Exception as error:
@@ -86,17 +102,24 @@ def write_result(folder, files, draw, page=None, stale=()):
 
 
 def save_run(case, run, payload, folder, gif=False):
-    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to `folder`, from which the run.gif of an
-    earlier one is removed."""
+    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to
+    `folder`, from which the run.gif of an earlier one is removed.
+    """
     from jaxtank.plots import responses
 
     check_folder(folder)
-    files = {"result.json": dumps(payload) + "\n", "trajectory.csv": trajectory_csv(run, case.loop.units)}
+    files = {
+        "result.json": dumps(payload) + "\n",
+        "trajectory.csv": trajectory_csv(run, case.loop.units),
+    }
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
     stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
     written = write_result(
-        folder, files, lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)}, stale=stale
+        folder,
+        files,
+        lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)},
+        stale=stale,
     )
     if gif:
         from jaxtank.plots.animation import animate
@@ -112,10 +135,15 @@ def save_run(case, run, payload, folder, gif=False):
 
 
 def write_files(folder, files):
-    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; returns the paths."""
+    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; returns the
+    paths.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_together(folder, files)
     except OSError as error:
-        raise InputError(f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder that can") from None
+        raise InputError(
+            f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder"
+            " that can"
+        ) from None
     return [folder / name for name in files]

@@ -20,14 +20,21 @@ from tuning.report import tables
 
 
 def own_name(case, kind, i):
-    """ " (left)" of the `kind`, "tank" or "pump", that its rig file calls left; nothing of one without a name."""
+    """ " (left)" of the `kind`, "tank" or "pump", that its rig file calls left; nothing of one
+    without a name.
+    """
     name = case.names.get(kind, {i: ""})[i]
     return f" ({name})" if name else ""
 
 
 def called(case):
     """What the rig file calls its tanks and pumps."""
-    found = [f"{kind} {i + 1} is {name!r}" for kind in ("tank", "pump") for i, name in enumerate(case.names.get(kind, ())) if name]
+    found = [
+        f"{kind} {i + 1} is {name!r}"
+        for kind in ("tank", "pump")
+        for i, name in enumerate(case.names.get(kind, ()))
+        if name
+    ]
     return [f"The names of its file: {', '.join(found)}."] if found else []
 
 
@@ -55,7 +62,9 @@ def actuator(loop):
     words = {"clip": "each clipped", "boxqp": "allocated by the law's own cost"}[bank.saturation]
     found = [f"Pumps: {bank.pumps}, from {_list(bank.low)} to {_list(bank.high)} {drive} ({words})"]
     found += (
-        [f"dead zone {_list(bank.dead_zone)} {drive} ({bank.dead_zone_kind})"] if bank.dead_zone is not None else ["no dead zone"]
+        [f"dead zone {_list(bank.dead_zone)} {drive} ({bank.dead_zone_kind})"]
+        if bank.dead_zone is not None
+        else ["no dead zone"]
     )
     found += [f"lag {_list(bank.lag)} s"] if bank.lag is not None else ["no lag"]
     found += [f"transport delay {bank.delay:g} s" if bank.delay else "no delay"]
@@ -71,13 +80,24 @@ def _reference(signal, length):
     if isinstance(signal, Sum):
         return f"{_reference(signal.first, length)} {_reference(signal.second, length)}"
     if isinstance(signal, Ramps):
-        course = "steps" if signal.ramp == 0 else f"{'ramps' if signal.shape == 'linear' else 'S-curves'} of {signal.ramp:g} s"
+        course = (
+            "steps"
+            if signal.ramp == 0
+            else f"{'ramps' if signal.shape == 'linear' else 'S-curves'} of {signal.ramp:g} s"
+        )
         start = ", ".join(f"r{i + 1} = {float(v):g}" for i, v in enumerate(signal.initial))
-        changes = "; ".join(f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in zip(signal.changes, signal.targets))
+        changes = "; ".join(
+            f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in zip(signal.changes, signal.targets)
+        )
         return f"Setpoints [{length}]: {start}" + (f"; {course} at {changes}." if changes else ".")
     if isinstance(signal, Sine):
-        size = f"{float(signal.amplitude):g} {length} about {float(signal.offset):g} {length}, period {signal.period:g} s"
-        return f"On r{signal.channel + 1} a sine of {size}, from {signal.start:g} to {signal.end:g} s."
+        size = (
+            f"{float(signal.amplitude):g} {length} about {float(signal.offset):g} {length}, period"
+            f" {signal.period:g} s"
+        )
+        return (
+            f"On r{signal.channel + 1} a sine of {size}, from {signal.start:g} to {signal.end:g} s."
+        )
     return f"Setpoints: {type(signal).__name__} with {signal.channels} channels."
 
 
@@ -86,7 +106,10 @@ def _disturbance(loop):
     if signal is None:
         return ["No disturbance."]
     if isinstance(signal, Constant):
-        return [f"Steady inflow that no pump brings: {', '.join(f'{float(v):g}' for v in signal.level)} {length}^3/s, by tank."]
+        return [
+            f"Steady inflow that no pump brings: {', '.join(f'{float(v):g}' for v in signal.level)}"
+            f" {length}^3/s, by tank."
+        ]
     if isinstance(signal, Pours):
         each = (
             f"{float(v):g} {length}^3 into tank {tank + 1} at {t:g} s over {s:g} s"
@@ -101,7 +124,9 @@ def _faults(loop):
         return []
     rows = zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
     each = (
-        f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to {b:g} s" for (n, a, b), f, e in rows
+        f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to"
+        f" {b:g} s"
+        for (n, a, b), f, e in rows
     )
     return ["Faults, untold to the law: " + "; ".join(each) + "."]
 
@@ -111,7 +136,10 @@ def sampled(case):
     now = case.clock
     words = f"{now.substeps} step{'s' if now.substeps > 1 else ''} of {now.integrator} per sample"
     start = ", ".join(f"{float(v):.4g}" for v in case.loop.x0)
-    return [f"Sampled every {now.dt:g} s for {now.duration:g} s, {words}; levels start at {start} {case.loop.units[0]}."]
+    return [
+        f"Sampled every {now.dt:g} s for {now.duration:g} s, {words}; levels start at {start}"
+        f" {case.loop.units[0]}."
+    ]
 
 
 WIDTH = 100
@@ -162,9 +190,14 @@ def json_of(case):
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
         "limits": tables.clean(dict(case.limits)),
         "objective": dict(case.objective),
-        "published": {n: [tables.clean(p.value), " ".join(filter(None, [p.unit, p.where]))] for n, p in preset.published.items()}
-        if preset
-        else {},
+        "published": (
+            {
+                n: [tables.clean(p.value), " ".join(filter(None, [p.unit, p.where]))]
+                for n, p in preset.published.items()
+            }
+            if preset
+            else {}
+        ),
         "departures": list(preset.departures) if preset else [],
     }
 
@@ -176,51 +209,92 @@ def _count(number, thing):
 def text(case):
     """The page of `jaxtank show`."""
     page, preset, loop = json_of(case), _preset(case), case.loop
-    parts = [*textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH), *textwrap.wrap(page["citation"] or "", WIDTH)]
+    parts = [
+        *textwrap.wrap(f"{page['case']}: {page['title']}", WIDTH),
+        *textwrap.wrap(page["citation"] or "", WIDTH),
+    ]
     parts += [f"notes: {page['notes']}"] if preset else []
     outputs = ", ".join(f"h{i + 1}{own_name(case, 'tank', i)}" for i in loop.plant.outputs)
-    parts += _chapter(f"The rig: {_count(loop.plant.tanks, 'tank')}, {_count(loop.plant.pumps, 'pump')}; controlled: {outputs}")
+    parts += _chapter(
+        f"The rig: {_count(loop.plant.tanks, 'tank')}, {_count(loop.plant.pumps, 'pump')};"
+        f" controlled: {outputs}"
+    )
     parts += [
-        line for row in page["equations"] for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
+        line
+        for row in page["equations"]
+        for line in textwrap.wrap(row, WIDTH, initial_indent="  ", subsequent_indent="      ")
     ]
     parts += ["", *_sentences([*called(case), *physics(loop.plant)])]
     parts += _chapter("The loop")
     parts += _sentences([*sensor(loop), *actuator(loop), *moved(loop), *sampled(case)])
-    parts += _chapter(f"The law: {page['law']}") + _docstring(getattr(loop.controller, "law", loop.controller))
+    parts += _chapter(f"The law: {page['law']}") + _docstring(
+        getattr(loop.controller, "law", loop.controller)
+    )
     if hasattr(loop.controller, "law"):
         parts += ["", *_docstring(loop.controller)]
     parts += _chapter(f"The observer: {page['observer']}") + _docstring(loop.observer)
     parts += _chapter("What is tuned")
-    parts += [grid(_tuned(case, preset), ["parameter", "value", "published", "unit", "range", "what it is"], (26, 18, 12, 8, 14))]
-    limited = (f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}" for m, v in page["limits"].items())
+    parts += [
+        grid(
+            _tuned(case, preset),
+            ["parameter", "value", "published", "unit", "range", "what it is"],
+            (26, 18, 12, 8, 14),
+        )
+    ]
+    limited = (
+        f"{m} at {'least' if MEASURES[m].sense < 0 else 'most'} {v}"
+        for m, v in page["limits"].items()
+    )
     parts += ["", *textwrap.wrap("limits of tune: " + (", ".join(limited) or "none"), WIDTH)]
-    parts += textwrap.wrap("objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()), WIDTH)
+    parts += textwrap.wrap(
+        "objective of tune: " + " + ".join(f"{w:g} {m}" for m, w in page["objective"].items()),
+        WIDTH,
+    )
     if case.scenarios:
         parts += textwrap.wrap("judged by: " + "; ".join(s.name for s in case.scenarios), WIDTH)
     parts += _chapter("Every parameter")
-    parts += [grid(_every(page), ["parameter", "value", "unit", "tunable in", "what it is"], (30, 18, 11, 13)), ""]
+    parts += [
+        grid(
+            _every(page),
+            ["parameter", "value", "unit", "tunable in", "what it is"],
+            (30, 18, 11, 13),
+        ),
+        "",
+    ]
     parts += _sentences(
         [
             "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
-            "controller.model.* and observer.model.* are the plant that controller and observer compute with, "
-            "by the same names; --set plant.* changes the rig and leaves them, in a rig file they follow "
-            "plant.* unless they are set.",
+            (
+                "controller.model.* and observer.model.* are the plant that controller and observer"
+                " compute with, by the same names; --set plant.* changes the rig and leaves them,"
+                " in a rig file they follow plant.* unless they are set."
+            ),
         ]
     )
-    parts += _chapter("What is measured") + [grid(_measures(case), ["measure", "unit", "of each", "what it is"], (22, 9, 8))]
+    parts += _chapter("What is measured") + [
+        grid(_measures(case), ["measure", "unit", "of each", "what it is"], (22, 9, 8))
+    ]
     if preset and preset.published:
-        parts += _chapter(f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)")
-        parts += [grid(_published(case, preset), ["published", "value", "here", "where"], (34, 22, 16))]
+        parts += _chapter(
+            f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
+        )
+        parts += [
+            grid(_published(case, preset), ["published", "value", "here", "where"], (34, 22, 16))
+        ]
     if preset and (preset.uncertain or case.uncertain):
         parts += _chapter("What is uncertain")
-        parts += _sentences(f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in preset.uncertain.items())
+        parts += _sentences(
+            f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in preset.uncertain.items()
+        )
     if page["departures"]:
         parts += ["", "departures from the paper", *_sentences(page["departures"])]
     return "\n".join(parts)
 
 
 def grid(rows, head, widths):
-    """Rows as a table whose cells are wrapped: widths of all columns but the last, which has what is left of WIDTH."""
+    """Rows as a table whose cells are wrapped: widths of all columns but the last, which has what
+    is left of WIDTH.
+    """
     rows = [[str(c) for c in row] for row in rows]
     widths = [min(w, max(len(row[i]) for row in [head, *rows])) for i, w in enumerate(widths)]
     widths = [*widths, WIDTH - sum(widths) - 2 * len(widths)]
@@ -228,7 +302,11 @@ def grid(rows, head, widths):
     for row in rows:
         cells = [textwrap.wrap(cell, w) or [""] for cell, w in zip(row, widths)]
         for i in range(max(map(len, cells))):
-            lines.append("  ".join((c[i] if i < len(c) else "").ljust(w) for c, w in zip(cells, widths)).rstrip())
+            lines.append(
+                "  ".join(
+                    (c[i] if i < len(c) else "").ljust(w) for c, w in zip(cells, widths)
+                ).rstrip()
+            )
     return "\n".join(lines)
 
 
@@ -242,11 +320,15 @@ def _sentences(found):
 
 
 def _item(sentence):
-    return textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False)
+    return textwrap.wrap(
+        sentence, WIDTH, initial_indent="- ", subsequent_indent="  ", break_on_hyphens=False
+    )
 
 
 def _docstring(part):
-    """The docstring of a component's class: prose wrapped anew, equations (indented lines) as they stand."""
+    """The docstring of a component's class: prose wrapped anew, equations (indented lines) as they
+    stand.
+    """
     lines, prose = [], []
 
     def flush():
@@ -259,7 +341,9 @@ def _docstring(part):
             lines.extend(
                 [line.rstrip()]
                 if len(line) <= WIDTH
-                else textwrap.wrap(line.strip(), WIDTH, initial_indent="    ", subsequent_indent="        ")
+                else textwrap.wrap(
+                    line.strip(), WIDTH, initial_indent="    ", subsequent_indent="        "
+                )
             )
         else:
             prose.append(line.strip())
@@ -275,7 +359,14 @@ def _law(law):
 def _tuned(case, preset):
     """What the case tunes, then what else could be: value, published, unit, range, what it is."""
     page, rows = json_of(case)["parameters"], []
-    ranges = {**case.free, **{n: f for n, f in (preset.tunable if preset else {}).items() if n not in case.free and n in page}}
+    ranges = {
+        **case.free,
+        **{
+            n: f
+            for n, f in (preset.tunable if preset else {}).items()
+            if n not in case.free and n in page
+        },
+    }
     for name, spec in ranges.items():
         free, own = Free(*spec), page.get(name.split("[")[0])
         if own is None or own["value"] is None:
@@ -283,27 +374,48 @@ def _tuned(case, preset):
         printed = preset.published.get(name) if preset else None
         shown = "" if printed is None else _plain(printed.value)
         words = "" if name in case.free else " (not by this case)"
-        rows.append([name, _shown(own["value"], False), shown, own["unit"], f"{free.low:g} : {free.high:g}", own["about"] + words])
+        rows.append(
+            [
+                name,
+                _shown(own["value"], False),
+                shown,
+                own["unit"],
+                f"{free.low:g} : {free.high:g}",
+                own["about"] + words,
+            ]
+        )
     return rows or [["none", "", "", "", "", ""]]
 
 
 def _every(page):
     rows = []
     for name, p in page["parameters"].items():
-        if name.startswith(BELIEFS) or (isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])):
+        if name.startswith(BELIEFS) or (
+            isinstance(p["value"], (list, tuple)) and (p["static"] or not p["value"])
+        ):
             continue  # topology is told by the equations, and a rig without pipes has none to set
         span = f"{p['low']:g} : {p['high']:g}" if p["low"] is not None else ""
-        rows.append([name + "*" * p["static"], _shown(p["value"], p["static"]), p["unit"], span, p["about"]])
+        rows.append(
+            [name + "*" * p["static"], _shown(p["value"], p["static"]), p["unit"], span, p["about"]]
+        )
     return rows
 
 
 def _measures(case):
     """The measures that a run of the case has."""
-    poured, stepped = hasattr(case.loop.disturbance, "since"), hasattr(case.loop.reference, "windows")
+    poured, stepped = (
+        hasattr(case.loop.disturbance, "since"),
+        hasattr(case.loop.reference, "windows"),
+    )
     known = {
-        m: s for m, s in MEASURES.items() if m not in TIMES.values() and (poured or not s.pours) and (stepped or not s.windows)
+        m: s
+        for m, s in MEASURES.items()
+        if m not in TIMES.values() and (poured or not s.pours) and (stepped or not s.windows)
     }
-    return [[m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc] for m, s in known.items()]
+    return [
+        [m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc]
+        for m, s in known.items()
+    ]
 
 
 def _published(case, preset):
@@ -311,17 +423,32 @@ def _published(case, preset):
     page, rows = json_of(case)["parameters"], []
     for name, p in preset.published.items():
         own = page.get(name)
-        here = _shown(own["value"], False) if own is not None and own["value"] is not None and not own["static"] else ""
+        here = (
+            _shown(own["value"], False)
+            if own is not None and own["value"] is not None and not own["static"]
+            else ""
+        )
         here = here or ("" if own is None or own["value"] is None else str(own["value"]))
         why = f"; {p.reason}" if p.reason else ""
-        rows.append([name, f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip(), here, p.where + why])
+        rows.append(
+            [
+                name,
+                f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip(),
+                here,
+                p.where + why,
+            ]
+        )
     return rows
 
 
 def _plain(value):
     if isinstance(value, (tuple, list)):
         return " ".join(_plain(v) for v in value)
-    return tables.number(value, 6) if isinstance(value, (int, float)) and not isinstance(value, bool) else str(value)
+    return (
+        tables.number(value, 6)
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+        else str(value)
+    )
 
 
 def _shown(value, is_static):

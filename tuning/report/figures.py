@@ -1,4 +1,6 @@
-"""Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the limits. What says nothing is not drawn."""
+"""Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the
+limits. What says nothing is not drawn.
+"""
 
 import sys
 
@@ -9,16 +11,24 @@ from jaxtank.core.units import local
 
 
 def failed(name, error, *figures):
-    """Report on stderr that the picture `name` could not be made, and close its figures: the rest of a result is given without it."""
+    """Report on stderr that the picture `name` could not be made, and close its figures: the rest
+    of a result is given without it.
+    """
     import matplotlib.pyplot as plt
 
     for figure in figures:
         plt.close(figure)
-    print(f"jaxtank: note: {name} could not be drawn ({type(error).__name__}: {one_line(error, 200)})", file=sys.stderr)
+    print(
+        f"jaxtank: note: {name} could not be drawn ({type(error).__name__}:"
+        f" {one_line(error, 200)})",
+        file=sys.stderr,
+    )
 
 
 def rig(loop, run=None, title=""):
-    """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant that is no network of tanks."""
+    """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant
+    that is no network of tanks.
+    """
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import responses
@@ -32,7 +42,11 @@ def rig(loop, run=None, title=""):
     with responses.styled():
         figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
-        levels, setpoints = (None, None) if run is None or not np.all(np.isfinite(run.x[-1])) else (run.x[-1], run.r[-1])
+        levels, setpoints = (
+            (None, None)
+            if run is None or not np.all(np.isfinite(run.x[-1]))
+            else (run.x[-1], run.r[-1])
+        )
         schematic(ax, loop.plant, levels, setpoints)
         ax.set_title(responses.plain(title))
     return {"rig": figure}
@@ -50,7 +64,11 @@ def inner(loop, runs):
     tanks = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs]
     if len(tanks) < 2:
         return {}
-    styles = [(responses.AFTER, "-")] if len(runs) == 1 else [(responses.BEFORE, "--"), (responses.AFTER, "-")]
+    styles = (
+        [(responses.AFTER, "-")]
+        if len(runs) == 1
+        else [(responses.BEFORE, "--"), (responses.AFTER, "-")]
+    )
     drawn = {name: (run, *style) for (name, run), style in zip(runs.items(), styles)}
     with responses.styled():
         figure, ax = plt.subplots(figsize=(5.0, 4.0), layout="constrained")
@@ -60,7 +78,9 @@ def inner(loop, runs):
 
 
 def saturation(loop, runs):
-    """{"saturation": when each pump was commanded past its limits}; {} where none ever was. runs: {name: Trajectory}."""
+    """{"saturation": when each pump was commanded past its limits}; {} where none ever was. runs:
+    {name: Trajectory}.
+    """
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -69,14 +89,18 @@ def saturation(loop, runs):
     if not any(np.any(run.command > high) or np.any(run.command < low) for run in runs.values()):
         return {}
     with responses.styled():
-        figure, ax = plt.subplots(figsize=(6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps), layout="constrained")
+        figure, ax = plt.subplots(
+            figsize=(6.4, 1.4 + 0.62 * len(runs) * loop.plant.pumps), layout="constrained"
+        )
         diagnostics.saturation(ax, runs, low, high)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return {"saturation": figure}
 
 
 def estimates(loop, clock, run, title=""):
-    """{"estimates": levels and disturbances as the observer saw them}; {} where levels are taken as they are measured."""
+    """{"estimates": levels and disturbances as the observer saw them}; {} where levels are taken as
+    they are measured.
+    """
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -88,11 +112,18 @@ def estimates(loop, clock, run, title=""):
     known = None
     if loop.disturbance is not None:
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
-        known = np.stack([np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1) / np.asarray(loop.plant.area)
+        known = np.stack(
+            [np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1
+        ) / np.asarray(loop.plant.area)
     rows = 2 if disturbed else 1
     with responses.styled():
         figure, axes = plt.subplots(
-            rows, tanks, figsize=(max(6.4, 3.2 * tanks), 2.3 * rows + 0.5), sharex=True, squeeze=False, layout="constrained"
+            rows,
+            tanks,
+            figsize=(max(6.4, 3.2 * tanks), 2.3 * rows + 0.5),
+            sharex=True,
+            squeeze=False,
+            layout="constrained",
         )
         for i in range(tanks):
             diagnostics.estimate(axes[0, i], run, i, length)
@@ -102,8 +133,12 @@ def estimates(loop, clock, run, title=""):
             axes[-1, i].set_xlabel("time [s]")
         handles = {}
         for ax in axes[:, 0]:
-            handles |= dict(zip(ax.get_legend_handles_labels()[1], ax.get_legend_handles_labels()[0]))
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+            handles |= dict(
+                zip(ax.get_legend_handles_labels()[1], ax.get_legend_handles_labels()[0])
+            )
+        figure.legend(
+            handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles)
+        )
         figure.suptitle(responses.plain(title), fontsize=10)
     return {"estimates": figure}
 
@@ -117,13 +152,17 @@ def margins(rows):
     if not rows:
         return {}
     with responses.styled():
-        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY)), layout="constrained")
+        figure, ax = plt.subplots(
+            figsize=(6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY)), layout="constrained"
+        )
         diagnostics.margins(ax, rows)
     return {"margins": figure}
 
 
 def tradeoff(found, unit, cost_unit):
-    """{"tradeoff": the least objective over a limit}; {} where none was asked. found: of `tuning.tradeoff`, or None."""
+    """{"tradeoff": the least objective over a limit}; {} where none was asked. found: of
+    `tuning.tradeoff`, or None.
+    """
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses

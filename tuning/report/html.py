@@ -1,6 +1,7 @@
 """One HTML page of a result: self-contained, to be read on a phone, printed and kept.
 
-Pictures are inside as SVG; nothing is asked of the network, and there is no script. Whatever came from a user is escaped.
+Pictures are inside as SVG; nothing is asked of the network, and there is no script. Whatever came
+from a user is escaped.
 """
 
 import html
@@ -20,7 +21,9 @@ LONG = 60
 """Characters of a cell above which it is text that is wrapped."""
 
 WIDE = 480.0
-"""Width of a picture [pt] above which it is not squeezed into a narrower window than it can be read in."""
+"""Width of a picture [pt] above which it is not squeezed into a narrower window than it can be read
+in.
+"""
 
 STYLE = """
 :root { color-scheme: light; }
@@ -75,17 +78,33 @@ def escape(text):
     return html.escape(str(text), quote=True)
 
 
-def document(title, subtitle, status, good, facts, said, pictures, parts, command=None, provenance=None, files=None):
+def document(
+    title,
+    subtitle,
+    status,
+    good,
+    facts,
+    said,
+    pictures,
+    parts,
+    command=None,
+    provenance=None,
+    files=None,
+):
     """The whole page as text; the same arguments give the same bytes.
 
-    title, subtitle: of the page; status: how it ended, good: True, or False for a warning; facts: [(what, value)] to be read first; said: a list
-    of sentences; pictures: [(name, SVG of `svg`, caption)], names unique; parts: texts and tables (`report.Table`) as the command prints
-    them; command: the line that made it, None where none did; provenance: {name: value}; files: {name: text} to be looked at on request.
+    title, subtitle: of the page; status: how it ended, good: True, or False for a warning; facts:
+    [(what, value)] to be read first; said: a list of sentences; pictures: [(name, SVG of `svg`,
+    caption)], names unique; parts: texts and tables (`report.Table`) as the command prints them;
+    command: the line that made it, None where none did; provenance: {name: value}; files: {name:
+    text} to be looked at on request.
     """
     body = [f"<h1>{escape(title)}</h1>", f"<p>{escape(subtitle)}</p>" if subtitle else ""]
     body.append(f'<p class="status{"" if good else " warn"}">{escape(status)}</p>')
     if facts:
-        cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in facts)
+        cells = "".join(
+            f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in facts
+        )
         body.append(f'<dl class="facts">{cells}</dl>')
     if said:
         body += ["<h2>In words</h2>", _list(said)]
@@ -95,7 +114,9 @@ def document(title, subtitle, status, good, facts, said, pictures, parts, comman
     if parts:
         body += ["<h2>Numbers</h2>", *(_part(p) for p in _grouped(parts))]
     for name, text in (files or {}).items():
-        body.append(f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>")
+        body.append(
+            f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>"
+        )
     body.append("<h2>How it was made</h2>")
     if command:
         body.append(f'<pre class="command">{escape(command)}</pre>')
@@ -121,7 +142,10 @@ def _figure(name, drawing, caption):
     wide = (
         ' class="wide"' if width and float(width[1]) > WIDE else ""
     )  # on a phone it is pushed aside rather than made too small to read
-    return f'<figure id="{identifier(name)}"{wide}>{drawing}<figcaption>{escape(caption)}</figcaption></figure>'
+    return (
+        "<figure"
+        f' id="{identifier(name)}"{wide}>{drawing}<figcaption>{escape(caption)}</figcaption></figure>'
+    )
 
 
 def _grouped(parts):
@@ -138,11 +162,15 @@ def _grouped(parts):
 
 
 def _part(part):
-    """A table as a table, lines that begin with a dash as a list, lines set in columns as they are, others as paragraphs."""
+    """A table as a table, lines that begin with a dash as a list, lines set in columns as they are,
+    others as paragraphs.
+    """
     if hasattr(part, "rows"):
         return _table(part.head, part.rows)
     lines = str(part).splitlines()
-    if any(line and not line.strip("-") for line in lines) or any("   " in line.strip() for line in lines):
+    if any(line and not line.strip("-") for line in lines) or any(
+        "   " in line.strip() for line in lines
+    ):
         return f"<pre>{escape(part)}</pre>"
     out, items = [], []
     for line in [*lines, ""]:
@@ -161,18 +189,35 @@ NUMBER = re.compile(r"[-+<>=≤≥ ]*[-+]?\d[\d.,e+\-: %]*( ?(s|cm|m|V))?|-")
 
 
 def _table(head, rows):
-    texts = any(len(str(value)) > LONG and not NUMBER.fullmatch(str(value)) for row in rows for value in row)
+    texts = any(
+        len(str(value)) > LONG and not NUMBER.fullmatch(str(value)) for row in rows for value in row
+    )
 
     def cell(value, heading):
         text = str(value)
-        kind = "number" if NUMBER.fullmatch(text) and len(text) <= LONG // 2 else "long" if len(text) > LONG else ""
-        attributes = (f' class="{kind}"' if kind else "") + (f' data-head="{escape(heading)}"' if texts and heading else "")
+        kind = (
+            "number"
+            if NUMBER.fullmatch(text) and len(text) <= LONG // 2
+            else "long"
+            if len(text) > LONG
+            else ""
+        )
+        attributes = (f' class="{kind}"' if kind else "") + (
+            f' data-head="{escape(heading)}"' if texts and heading else ""
+        )
         return f"<td{attributes}>{escape(text)}</td>"
 
-    top = "<thead><tr>" + "".join(f"<th>{escape(h)}</th>" for h in head) + "</tr></thead>" if any(head or ()) else ""
+    top = (
+        "<thead><tr>" + "".join(f"<th>{escape(h)}</th>" for h in head) + "</tr></thead>"
+        if any(head or ())
+        else ""
+    )
     heads = list(head or ()) or [""] * max(map(len, rows), default=0)
     body = "".join("<tr>" + "".join(map(cell, row, heads)) + "</tr>" for row in rows)
-    return f'<div class="scroll{" texts" if texts and top else ""}"><table>{top}<tbody>{body}</tbody></table></div>'
+    return (
+        "<div"
+        f' class="scroll{" texts" if texts and top else ""}"><table>{top}<tbody>{body}</tbody></table></div>'
+    )
 
 
 def identifier(name):
@@ -181,7 +226,9 @@ def identifier(name):
 
 
 def drawings(drawn, captions):
-    """[(name, SVG, caption)] of {name: figure}; a figure that cannot be drawn is taken out of it, with a note on stderr."""
+    """[(name, SVG, caption)] of {name: figure}; a figure that cannot be drawn is taken out of it,
+    with a note on stderr.
+    """
     found = []
     for name, figure in list(drawn.items()):
         try:
@@ -193,10 +240,11 @@ def drawings(drawn, captions):
 
 
 def svg(figure, name, caption=""):
-    """A matplotlib figure as an <svg> element: no dates, no names of fonts to fetch, ids that begin with `name` and so clash with no other's.
+    """A matplotlib figure as an <svg> element: no dates, no names of fonts to fetch, ids that begin
+    with `name` and so clash with no other's.
 
-    A picture of more than LARGEST characters has its dense lines made of dots. The figure is left open, its layout as it is now: what is
-    drawn of it later need not be laid out again.
+    A picture of more than LARGEST characters has its dense lines made of dots. The figure is left
+    open, its layout as it is now: what is drawn of it later need not be laid out again.
     """
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
@@ -217,11 +265,15 @@ def svg(figure, name, caption=""):
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)  # HTML knows what an svg is
     used = set(re.findall(r'url\(#([^)]+)\)|href="#([^"]+)"', text))
     used = {a or b for a, b in used}
-    text = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", text)
+    text = re.sub(
+        r' id="([^"]*)"', lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else "", text
+    )
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", text)
     text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', text)
     text = re.sub(r"<g>\s*</g>|<defs>\s*</defs>", "", text)
-    return text.replace("<svg", f'<svg role="img" aria-label="{escape(caption or name)}"', 1).strip()
+    return text.replace(
+        "<svg", f'<svg role="img" aria-label="{escape(caption or name)}"', 1
+    ).strip()
 
 
 def _saved(figure, name):
@@ -235,7 +287,12 @@ def _saved(figure, name):
         "path.simplify_threshold": 0.3,
     }
     with matplotlib.rc_context(settings):
-        figure.savefig(out, format="svg", dpi=130, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+        figure.savefig(
+            out,
+            format="svg",
+            dpi=130,
+            metadata={"Date": None, "Creator": None, "Format": None, "Type": None},
+        )
     return out.getvalue()
 
 

@@ -21,11 +21,16 @@ FEW = 0.5
 def channel_names(found):
     """[(name, unit)] of the channels."""
     length = found.case.loop.units[0]
-    return [(f"h{tank + 1}", "V" if volts else length) for tank, volts in found.estimation.record.channels]
+    return [
+        (f"h{tank + 1}", "V" if volts else length)
+        for tank, volts in found.estimation.record.channels
+    ]
 
 
 def untold(direction):
-    """What the data leave open: one parameter (its name), or several that stand in for each other ("apart", by how much)."""
+    """What the data leave open: one parameter (its name), or several that stand in for each other
+    ("apart", by how much).
+    """
     names = list(direction["parameters"])
     return names[0] if len(names) == 1 else f"apart {direction['words']}"
 
@@ -38,31 +43,44 @@ def message(found):
     ended = stopped(found.case.loop, found.parameters)
     if found.status == "not_converged" and ended:
         words.append(
-            f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the search: ranges (--free), units or columns of the log "
-            "are not this rig's"
+            f"{', '.join(ended)} {'ends' if len(ended) == 1 else 'end'} at the bound of the search:"
+            " ranges (--free), units or columns of the log are not this rig's"
         )
     if found.status == "not_converged" and found.fit.status <= 0:
-        words.append("the best search had not converged when its iterations ended: more of them with --iterations")
+        words.append(
+            "the best search had not converged when its iterations ended: more of them with"
+            " --iterations"
+        )
     for d in found.directions:
         whom = next(iter(d["parameters"])) if len(d["parameters"]) == 1 else "apart"
-        words.append(f"the data cannot tell {whom}: {d['words']} changes no reading that could be seen")
+        words.append(
+            f"the data cannot tell {whom}: {d['words']} changes no reading that could be seen"
+        )
     if found.status == "not_identifiable":
         words.append("of the values that fit alike some near to the case's own are printed")
     agree = sum(s["agrees"] for s in found.starts)
     words.append(f"{agree} of {len(found.starts)} starts ended in the same place")
     q = found.quality
-    for (name, unit), rmse, share, rho in zip(names, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]):
+    for (name, unit), rmse, share, rho in zip(
+        names, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]
+    ):
         fit = "" if share is None else f", fit {share:.1f} %"
-        words.append(f"{name}: residual {rmse:.3g} {unit} RMS{fit}, correlation from sample to sample {rho:.2f}")
+        words.append(
+            f"{name}: residual {rmse:.3g} {unit} RMS{fit}, correlation from sample to sample"
+            f" {rho:.2f}"
+        )
     if q["widened"] > 1.05:
         words.append(
-            f"residuals are correlated, so that the model and not the noise limits the fit: intervals are widened {q['widened']:.1f} times for it"
+            "residuals are correlated, so that the model and not the noise limits the fit:"
+            f" intervals are widened {q['widened']:.1f} times for it"
         )
     for n, p in found.parameters.items():
         if p["at_bound"]:
             words.append(f"{n} ends at its bound, {p['value']:.4g} {p['unit']}: no interval")
     if identifiable(found) and found.case.reachable and (why := rigs.unreachable(found.identified)):
-        words.append(f"{why}; rig.toml says reachable = false for it: choose other setpoints before tuning")
+        words.append(
+            f"{why}; rig.toml says reachable = false for it: choose other setpoints before tuning"
+        )
     if identifiable(found) and found.law:
         words.append(_proposal(found))
     return "; ".join(words)
@@ -76,7 +94,10 @@ def _proposal(found):
     law, (length, drive) = case.loop.controller, case.loop.units
     Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (law.Kc, law.Ti))
     unit = local("V/cm", (length, drive))
-    return f"proposed: PI with controller.Kc = {Kc} {unit}, controller.Ti = {Ti} s, from the identified model (T-sum rule), to be tuned"
+    return (
+        f"proposed: PI with controller.Kc = {Kc} {unit}, controller.Ti = {Ti} s, from the"
+        " identified model (T-sum rule), to be tuned"
+    )
 
 
 def identifiable(found):
@@ -92,7 +113,11 @@ def _table(found):
             if p["interval95"]
             else "none: " + ("at a bound" if p["at_bound"] else "not identifiable")
         )
-        sd = f"{100 * p['sd'] / abs(p['value']):.2g} %" if p["sd"] is not None and p["value"] else "-"
+        sd = (
+            f"{100 * p['sd'] / abs(p['value']):.2g} %"
+            if p["sd"] is not None and p["value"]
+            else "-"
+        )
         rows.append([n, p["unit"], f"{p['before']:.5g}", f"{p['value']:.5g}", interval, sd])
     return tables.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
 
@@ -108,13 +133,17 @@ def parts_of(found):
     readings = int(est.mask.sum())
     steps = np.concatenate([np.diff(one.t) for one in est.logs])
     even = np.ptp(steps) < 1e-6 * steps.mean()
-    pace = f"every {np.median(steps):g} s" if even else f"{steps.min():g} to {steps.max():g} s apart"
+    pace = (
+        f"every {np.median(steps):g} s" if even else f"{steps.min():g} to {steps.max():g} s apart"
+    )
     missing = sum(one.y.size for one in est.logs) - readings
     lines = [
         f"{found.case.name}: {found.status.replace('_', ' ')}",
-        f"{', '.join(one.name for one in est.logs)}: {sum(one.samples for one in est.logs)} samples {pace}, {readings} readings"
+        f"{', '.join(one.name for one in est.logs)}: {sum(one.samples for one in est.logs)} samples"
+        f" {pace}, {readings} readings"
         + (f" ({missing} missing)" if missing else "")
-        + f", {est.size} unknowns, {est.substeps} Runge-Kutta step{'s' if est.substeps > 1 else ''} a sample",
+        + f", {est.size} unknowns, {est.substeps} Runge-Kutta step{'s' if est.substeps > 1 else ''}"
+        " a sample",
         "",
         _table(found),
         "",
@@ -147,8 +176,14 @@ def _levels(found):
         said = []
         for i, level in enumerate(row):
             ends = level["interval95"]
-            said.append(f"h{i + 1} {level['value']:.4g}" + (f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""))
-        rows.append(f"levels at the first sample{f' of log {e + 1}' if len(found.levels) > 1 else ''} [{unit}]: " + ", ".join(said))
+            said.append(
+                f"h{i + 1} {level['value']:.4g}"
+                + (f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else "")
+            )
+        rows.append(
+            f"levels at the first sample{f' of log {e + 1}' if len(found.levels) > 1 else ''}"
+            f" [{unit}]: " + ", ".join(said)
+        )
     return "\n".join(rows)
 
 
@@ -157,8 +192,18 @@ def _validation(found):
     for c, (name, unit) in enumerate(channel_names(found)):
         for side, words in (("fitted", "fitted to"), ("held_back", "held back")):
             rmse, share = v[side]["rmse"][c], v[side]["nrmse_percent"][c]
-            rows.append([name, words, "-" if rmse is None else f"{rmse:.4g} {unit}", "-" if share is None else f"{share:.1f} %"])
-    head = f"fit to the first {', '.join(map(str, v['samples']))} samples, the rest predicted from the same start"
+            rows.append(
+                [
+                    name,
+                    words,
+                    "-" if rmse is None else f"{rmse:.4g} {unit}",
+                    "-" if share is None else f"{share:.1f} %",
+                ]
+            )
+    head = (
+        f"fit to the first {', '.join(map(str, v['samples']))} samples, the rest predicted from the"
+        " same start"
+    )
     return [head, tables.table(rows, ["reading", "part", "RMS", "fit"])]
 
 
@@ -172,18 +217,29 @@ def json_of(found):
         "success": found.status == "converged",
         "message": message(found),
         "parameters": {n: tables.clean(p) for n, p in found.parameters.items()},
-        "fit": tables.clean({k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}),
-        "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in zip(channel_names(found), quality["noise"])],
+        "fit": tables.clean(
+            {k: quality[k] for k in ("rmse", "nrmse_percent", "residual_autocorrelation")}
+        ),
+        "channels": [
+            {"name": n, "unit": u, "noise": s}
+            for (n, u), s in zip(channel_names(found), quality["noise"])
+        ],
         "intervals_widened": quality["widened"],
         "initial_levels": [[tables.clean(v) for v in row] for row in found.levels],
-        "covariance": {"names": list(found.covariance[0]), "matrix": np.asarray(found.covariance[1]).tolist()},
+        "covariance": {
+            "names": list(found.covariance[0]),
+            "matrix": np.asarray(found.covariance[1]).tolist(),
+        },
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
         "free_combinations": tables.clean(found.directions),
         "remedies": found.remedies,
         "validation": tables.clean(found.validation),
         "profile": tables.clean(found.profile),
         "starts": tables.clean(found.starts),
-        "data": [{"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())} for one in est.logs],
+        "data": [
+            {"name": one.name, "samples": one.samples, "readings": int(np.isfinite(one.y).sum())}
+            for one in est.logs
+        ],
         "substeps": est.substeps,
         "wall_s": found.wall_s,
         "provenance": provenance.provenance(found.case, found.seed),
@@ -198,7 +254,9 @@ def correlation_of(found):
 
 
 def figures(found):
-    """{"fit" or "fit_1" ..: readings and inputs of each log; "residuals", "correlation", "profile"}: matplotlib Figures."""
+    """{"fit" or "fit_1" ..: readings and inputs of each log; "residuals", "correlation",
+    "profile"}: matplotlib Figures.
+    """
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import fit as record_plots
@@ -210,13 +268,21 @@ def figures(found):
     with responses.styled():
         for e, one in enumerate(est.logs):
             count = len(names) + 1
-            figure, axes = plt.subplots(count, 1, figsize=(7.0, 1.0 + 1.7 * count), sharex=True, layout="constrained")
+            figure, axes = plt.subplots(
+                count, 1, figsize=(7.0, 1.0 + 1.7 * count), sharex=True, layout="constrained"
+            )
             for c, (name, unit) in enumerate(names):
                 held = None
                 if found.validation and found.validation["samples"][e] < one.samples:
                     held = one.t[found.validation["samples"][e]]
                 record_plots.measured(
-                    axes[c], one.t, est.record.y[e, : one.samples, c], told[e, : one.samples, c], name, unit, held
+                    axes[c],
+                    one.t,
+                    est.record.y[e, : one.samples, c],
+                    told[e, : one.samples, c],
+                    name,
+                    unit,
+                    held,
                 )
                 if c == 0:
                     axes[c].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3)
@@ -224,30 +290,50 @@ def figures(found):
             if one.u.shape[1] > 1:
                 axes[-1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=one.u.shape[1])
             figure.align_ylabels(axes)
-            title = responses.plain(f"{found.case.name}: {one.name}, measured and simulated with the fitted rig")
+            title = responses.plain(
+                f"{found.case.name}: {one.name}, measured and simulated with the fitted rig"
+            )
             figure.suptitle(title, fontsize=9)
             made["fit" if len(est.logs) == 1 else f"fit_{e + 1}"] = figure
         left = idf.residuals_of(est, found.fit)
-        figure, axes = plt.subplots(len(names), 2, figsize=(8.4, 0.9 + 1.9 * len(names)), squeeze=False, layout="constrained")
+        figure, axes = plt.subplots(
+            len(names),
+            2,
+            figsize=(8.4, 0.9 + 1.9 * len(names)),
+            squeeze=False,
+            layout="constrained",
+        )
         for c, (name, unit) in enumerate(names):
             one = est.logs[0]
-            record_plots.residual(axes[c, 0], one.t, left[0, : one.samples, c], name, unit, found.quality["noise"][c])
+            record_plots.residual(
+                axes[c, 0], one.t, left[0, : one.samples, c], name, unit, found.quality["noise"][c]
+            )
             acf = idf.autocorrelation(left[..., c])
-            record_plots.autocorrelation(axes[c, 1], acf, int(np.isfinite(left[..., c]).sum()), name)
+            record_plots.autocorrelation(
+                axes[c, 1], acf, int(np.isfinite(left[..., c]).sum()), name
+            )
             for ax in axes[c] if c < len(names) - 1 else ():
                 ax.set_xlabel("")
         for ax in axes[0]:
             ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98))
         figure.align_ylabels(axes)
-        more = f" (the first of {len(est.logs)} logs; correlations of all)" if len(est.logs) > 1 else ""
-        figure.suptitle(responses.plain(f"{found.case.name}: measured less simulated{more}"), fontsize=9)
+        more = (
+            f" (the first of {len(est.logs)} logs; correlations of all)"
+            if len(est.logs) > 1
+            else ""
+        )
+        figure.suptitle(
+            responses.plain(f"{found.case.name}: measured less simulated{more}"), fontsize=9
+        )
         made["residuals"] = figure
         kept, matrix = correlation_of(found)
         if len(kept) > 1:
             side = 2.6 + 0.42 * len(kept)
             figure, ax = plt.subplots(figsize=(side + 1.0, side), layout="constrained")
             record_plots.correlation(ax, kept, matrix)
-            figure.suptitle(responses.plain(f"{found.case.name}: correlation of the estimates"), fontsize=9)
+            figure.suptitle(
+                responses.plain(f"{found.case.name}: correlation of the estimates"), fontsize=9
+            )
             made["correlation"] = figure
         if found.profile:
             figure, ax = plt.subplots(figsize=(5.2, 3.4), layout="constrained")
@@ -263,7 +349,11 @@ def fit_csv(found):
     told = est.predicted(est.unknowns(found.fit))
     names = channel_names(found)
     out = io.StringIO()
-    heads = ["log", "t [s]", *(f"pump{j + 1} [{found.case.loop.units[1]}]" for j in range(est.record.u.shape[2]))]
+    heads = [
+        "log",
+        "t [s]",
+        *(f"pump{j + 1} [{found.case.loop.units[1]}]" for j in range(est.record.u.shape[2])),
+    ]
     for name, unit in names:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
     out.write(",".join(heads) + "\n")
@@ -278,23 +368,44 @@ def fit_csv(found):
 
 
 CAPTIONS = {
-    "fit": "What was measured (dots) and what the fitted rig says (line), with what the pumps were given.",
-    "residuals": "What the fitted rig leaves of the readings: over time, and from sample to sample. Beyond the band it is not noise.",
-    "correlation": "Correlation of the estimates: near 1 or -1, the record tells a combination of the two better than each.",
-    "profile": "How much worse the record fits when one parameter is held away from its estimate and all others are fitted again.",
+    "fit": (
+        "What was measured (dots) and what the fitted rig says (line), with what the pumps were"
+        " given."
+    ),
+    "residuals": (
+        "What the fitted rig leaves of the readings: over time, and from sample to sample. Beyond"
+        " the band it is not noise."
+    ),
+    "correlation": (
+        "Correlation of the estimates: near 1 or -1, the record tells a combination of the two"
+        " better than each."
+    ),
+    "profile": (
+        "How much worse the record fits when one parameter is held away from its estimate and all"
+        " others are fitted again."
+    ),
     "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
 }
 
 
 def page_of(found, drawn, command=None):
-    """The page report.html of an identification, with `drawn`, figures by name; command: the line that made it."""
+    """The page report.html of an identification, with `drawn`, figures by name; command: the line
+    that made it.
+    """
     told = sum(p["interval95"] is not None for p in found.parameters.values())
     facts = [
         ("parameters with an interval", f"{told} of {len(found.parameters)}"),
         ("samples", str(sum(one.samples for one in found.estimation.logs))),
     ]
-    for (name, unit), rmse, share in zip(channel_names(found), found.quality["rmse"], found.quality["nrmse_percent"]):
-        facts.append((f"residual of {name}", f"{rmse:.3g} {unit}" + ("" if share is None else f" ({share:.1f} %)")))
+    for (name, unit), rmse, share in zip(
+        channel_names(found), found.quality["rmse"], found.quality["nrmse_percent"]
+    ):
+        facts.append(
+            (
+                f"residual of {name}",
+                f"{rmse:.3g} {unit}" + ("" if share is None else f" ({share:.1f} %)"),
+            )
+        )
     captions = {n: CAPTIONS[n.split("_")[0]] for n in drawn}
     said = message(found)
     return html.document(
@@ -308,12 +419,17 @@ def page_of(found, drawn, command=None):
         [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
         command,
         provenance.provenance(found.case, found.seed),
-        {} if found.status == "not_identifiable" else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)},
+        (
+            {}
+            if found.status == "not_identifiable"
+            else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)}
+        ),
     )
 
 
 def save(found, folder, command=None):
-    """Write result.json, fit.csv, pictures, report.html and, where every parameter is identified, rig.toml to `folder`; returns their paths.
+    """Write result.json, fit.csv, pictures, report.html and, where every parameter is identified,
+    rig.toml to `folder`; returns their paths.
 
     command: the line that made it, for the report, where there is one.
     """
@@ -326,14 +442,18 @@ def save(found, folder, command=None):
     def draw():
         return figures(found) | pictures.rig(found.identified.loop, None, found.case.name)
 
-    return artifacts.write_result(folder, files, draw, lambda drawn: page_of(found, drawn, command), stale)
+    return artifacts.write_result(
+        folder, files, draw, lambda drawn: page_of(found, drawn, command), stale
+    )
 
 
 def _left_over(folder, files):
-    """What an earlier identification wrote to the folder and this one does not: a rig that this one refuses must not be taken for its own."""
+    """What an earlier identification wrote to the folder and this one does not: a rig that this one
+    refuses must not be taken for its own.
+    """
     if not (folder / "fit.csv").exists():
         return []
-    ours = [folder / name for name in ("rig.toml", "fit.png", "correlation.png", "profile.png")] + sorted(
-        folder.glob("fit_[0-9]*.png")
-    )
+    ours = [
+        folder / name for name in ("rig.toml", "fit.png", "correlation.png", "profile.png")
+    ] + sorted(folder.glob("fit_[0-9]*.png"))
     return [path for path in ours if path.name not in files and path.is_file()]

@@ -1,4 +1,6 @@
-"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict and the reason for a difference."""
+"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict and the
+reason for a difference.
+"""
 
 import numbers
 import textwrap
@@ -24,14 +26,18 @@ QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "no
 
 
 def runner(paper):
-    """run(case name, values={}, save_every=1) -> (Case with `values` set, Trajectory as host arrays); each run is made once."""
+    """run(case name, values={}, save_every=1) -> (Case with `values` set, Trajectory as host
+    arrays); each run is made once.
+    """
     preset, known = presets.load(paper), {}
 
     def run(name, values=None, save_every=1):
         key = (name, repr(values), save_every)
         if key not in known:
             case = rig.set_values(preset.cases[name], values or {})
-            found = lp.simulate(case.loop, case.clock, jax.random.key(0) if noisy(case) else None, save_every)
+            found = lp.simulate(
+                case.loop, case.clock, jax.random.key(0) if noisy(case) else None, save_every
+            )
             known[key] = case, type(found)(*(np.asarray(a) for a in found))
         return known[key]
 
@@ -39,7 +45,9 @@ def runner(paper):
 
 
 def verdict(published, measured):
-    """(verdict, measured value or text) of one published quantity; measured: number, tuple, Claim or None."""
+    """(verdict, measured value or text) of one published quantity; measured: number, tuple, Claim
+    or None.
+    """
     if isinstance(measured, Claim):
         return measured.verdict, measured.text
     if measured is None:
@@ -47,27 +55,37 @@ def verdict(published, measured):
     if published.tolerance is None:
         return QUOTED, measured
     printed, found = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
-    near = printed.shape == found.shape and np.all(np.abs(found - printed) <= published.tolerance * np.abs(printed))
+    near = printed.shape == found.shape and np.all(
+        np.abs(found - printed) <= published.tolerance * np.abs(printed)
+    )
     return (REPRODUCED if near else DIFFERS), measured
 
 
 def measure(paper):
-    """The comparison of a paper: {"paper", "citation", "rows": [{quantity, unit, where, published, measured, verdict, reason}]}.
+    """The comparison of a paper: {"paper", "citation", "rows": [{quantity, unit, where, published,
+    measured, verdict, reason}]}.
 
-    A parameter that the paper prints is compared with the value in the preset's first case that has it. Raises InputError for an unknown
-    paper, and KeyError if the preset measures something that it does not list as published.
+    A parameter that the paper prints is compared with the value in the preset's first case that has
+    it. Raises InputError for an unknown paper, and KeyError if the preset measures something that
+    it does not list as published.
     """
     preset = presets.load(paper)
     found = preset.measured(runner(paper))
     stray = set(found) - set(preset.published)
     if stray:
-        raise KeyError(f"{paper} measures what is not in its published quantities: {', '.join(sorted(stray))}")
+        raise KeyError(
+            f"{paper} measures what is not in its published quantities: {', '.join(sorted(stray))}"
+        )
     rows = []
     for name, printed in preset.published.items():
         value = found.get(name)
         word, value = verdict(printed, _set_in(preset, name) if value is None else value)
         reason = printed.reason
-        if word == QUOTED and isinstance(printed.value, numbers.Number | tuple) and not _same(printed.value, value):
+        if (
+            word == QUOTED
+            and isinstance(printed.value, numbers.Number | tuple)
+            and not _same(printed.value, value)
+        ):
             word = DIFFERS
         if word in (QUOTED, REPRODUCED):
             reason = ""
@@ -86,7 +104,9 @@ def measure(paper):
 
 
 def _set_in(preset, name):
-    """The value of parameter `name` in the first case that has it, or None where it is no parameter."""
+    """The value of parameter `name` in the first case that has it, or None where it is no
+    parameter.
+    """
     for case in preset.cases.values():
         if name.startswith("clock."):
             return getattr(case.clock, name.removeprefix("clock."), None)
@@ -112,9 +132,11 @@ def _cell(value):
     return (
         value
         if isinstance(value, str)
-        else ", ".join(tables.number(v, 4) for v in np.unique(np.ravel(value)))
-        if _flat(value)
-        else (", ".join(tables.number(v, 4) for v in np.ravel(value)))
+        else (
+            ", ".join(tables.number(v, 4) for v in np.unique(np.ravel(value)))
+            if _flat(value)
+            else (", ".join(tables.number(v, 4) for v in np.ravel(value)))
+        )
     )
 
 
@@ -124,8 +146,14 @@ def _flat(value):
 
 def text(page):
     """The page of `jaxtank compare PAPER`."""
-    rows = [[r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]] for r in page["rows"]]
-    wrapped = [[row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]] for row in rows]
+    rows = [
+        [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]]
+        for r in page["rows"]
+    ]
+    wrapped = [
+        [row[0], row[1], *(textwrap.shorten(c, 60, placeholder=" ...") for c in row[2:4]), row[4]]
+        for row in rows
+    ]
     lines = [
         page["citation"],
         f"notes: {presets.load(page['paper']).notes}",
@@ -133,14 +161,18 @@ def text(page):
         tables.table(wrapped, ["quantity", "unit", "published", "measured", "verdict"]),
     ]
     for row, cells in zip(page["rows"], rows):
-        note = "; ".join(filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]]))
+        note = "; ".join(
+            filter(None, [cells[3] if isinstance(row["measured"], str) else "", row["reason"]])
+        )
         if note:
             lines.append(f"- {row['quantity']} ({row['where']}): {note}")
     return "\n".join(lines)
 
 
 def save(pages, folder, command=None):
-    """Write result.json and report.html of {paper: page}, and a picture of the rig of each paper, to `folder`; returns their paths."""
+    """Write result.json and report.html of {paper: page}, and a picture of the rig of each paper,
+    to `folder`; returns their paths.
+    """
     check_folder(folder)
     captions = {}
 
@@ -150,7 +182,14 @@ def save(pages, folder, command=None):
             seen = []
             for name, case in presets.load(paper).cases.items():
                 plant = cast(TankNetwork, case.loop.plant)  # as every preset's
-                drawing = (plant.links, plant.pipes, plant.feeds, plant.spills, plant.outputs, np.asarray(plant.rim).tolist())
+                drawing = (
+                    plant.links,
+                    plant.pipes,
+                    plant.feeds,
+                    plant.spills,
+                    plant.outputs,
+                    np.asarray(plant.rim).tolist(),
+                )
                 if drawing not in seen:  # cases of one paper share their rig, but for some
                     seen.append(drawing)
                     of = f"rig-{paper}" + ("" if len(seen) == 1 else f"-{len(seen)}")
@@ -166,7 +205,8 @@ def save(pages, folder, command=None):
         return document(
             f"{', '.join(pages)}: published and measured",
             "What is printed beside what the same rigs and laws do here, and why they differ.",
-            f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured quantities and claims reproduced",
+            f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured"
+            " quantities and claims reproduced",
             True,
             [(word, str(n)) for word, n in count.most_common()],
             [],
@@ -179,20 +219,39 @@ def save(pages, folder, command=None):
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
     stale = artifacts.earlier(folder, old)
     table = pages if len(pages) > 1 else next(iter(pages.values()))
-    return artifacts.write_result(folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale)
+    return artifacts.write_result(
+        folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale
+    )
 
 
 def _in_full(found):
-    """The table of a page with room for what does not fit a line: where it is printed, and the reason for a difference."""
+    """The table of a page with room for what does not fit a line: where it is printed, and the
+    reason for a difference.
+    """
     rows = [
-        [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"], r["where"], r["reason"]]
+        [
+            r["quantity"],
+            r["unit"],
+            _cell(r["published"]),
+            _cell(r["measured"]),
+            r["verdict"],
+            r["where"],
+            r["reason"],
+        ]
         for r in found["rows"]
     ]
-    return [tables.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"])]
+    return [
+        tables.table(
+            rows,
+            ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"],
+        )
+    ]
 
 
 def markdown(pages):
-    """The table of tests/benchmarks/README.md: every measured quantity of {paper: page}; parameters that are only quoted are left out."""
+    """The table of tests/benchmarks/README.md: every measured quantity of {paper: page}; parameters
+    that are only quoted are left out.
+    """
     lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, page in pages.items():
         for r in page["rows"]:
@@ -203,6 +262,11 @@ def markdown(pages):
             theirs = _cell(r["published"]) + ("" if isinstance(r["published"], str) else unit)
             why = f": {r['reason']}" if r["reason"] and r["verdict"] != REPRODUCED else ""
             lines.append(
-                "| " + " | ".join(c.replace("|", "\\|") for c in (paper, r["quantity"], theirs, mine, r["verdict"] + why)) + " |"
+                "| "
+                + " | ".join(
+                    c.replace("|", "\\|")
+                    for c in (paper, r["quantity"], theirs, mine, r["verdict"] + why)
+                )
+                + " |"
             )
     return "\n".join(lines)

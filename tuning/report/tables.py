@@ -32,7 +32,11 @@ def clean(value) -> Any:
         return {k: clean(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [clean(v) for v in value]
-    if isinstance(value, (np.ndarray, np.generic)) or hasattr(value, "__jax_array__") or type(value).__module__.startswith("jax"):
+    if (
+        isinstance(value, (np.ndarray, np.generic))
+        or hasattr(value, "__jax_array__")
+        or type(value).__module__.startswith("jax")
+    ):
         return clean(np.asarray(value).tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
@@ -53,7 +57,10 @@ def _unserved():
 
 def measures_json(measures):
     """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
-    return {**dict.fromkeys(_unserved()), **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()})}
+    return {
+        **dict.fromkeys(_unserved()),
+        **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()}),
+    }
 
 
 def dumps(table):
@@ -62,12 +69,16 @@ def dumps(table):
 
 
 def units(rig_units):
-    """{measure: unit} of everything that is reported, on a rig with these (length, pump input) units."""
+    """{measure: unit} of everything that is reported, on a rig with these (length, pump input)
+    units.
+    """
     return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
 class Table(str):
-    """Aligned columns as text, which still knows its `head` and `rows`, so that a page may set them in its own way."""
+    """Aligned columns as text, which still knows its `head` and `rows`, so that a page may set them
+    in its own way.
+    """
 
     head: list
     rows: list
@@ -79,7 +90,11 @@ def table(rows, head=None):
     rows = ([head] if head else []) + body
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths)).rstrip() for row in rows]
-    found = Table("\n".join(lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines))
+    found = Table(
+        "\n".join(
+            lines[:1] + ["-" * min(100, len(max(lines, key=len)))] + lines[1:] if head else lines
+        )
+    )
     found.head, found.rows = head or [], body
     return found
 

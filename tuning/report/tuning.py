@@ -4,7 +4,17 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.problem.problem import TAIL
-from tuning.report.tables import clean, measures_json, number, numbers, objective_unit, reasons, table, units, wrap
+from tuning.report.tables import (
+    clean,
+    measures_json,
+    number,
+    numbers,
+    objective_unit,
+    reasons,
+    table,
+    units,
+    wrap,
+)
 
 
 def json_of(result):
@@ -18,7 +28,10 @@ def json_of(result):
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
-        "measures": {"before": measures_json(result.measures["before"]), "after": measures_json(result.measures["after"])},
+        "measures": {
+            "before": measures_json(result.measures["before"]),
+            "after": measures_json(result.measures["after"]),
+        },
         "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
         "units": units(result.tuned.loop.units),
         "constraints": clean(result.constraints),
@@ -47,8 +60,11 @@ def parts_of(result):
     """What `text` says but for the message: a list of lines and Tables."""
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
     head = [
-        f"{result.tuned.name}: {result.status} ({result.method}, {result.evaluations['simulations']} simulations, "
-        f"{result.evaluations['gradients']} of them with gradients, {result.wall_s:.1f} s)",
+        (
+            f"{result.tuned.name}: {result.status} ({result.method},"
+            f" {result.evaluations['simulations']} simulations, {result.evaluations['gradients']}"
+            f" of them with gradients, {result.wall_s:.1f} s)"
+        ),
         "",
     ]
     rows = [
@@ -59,14 +75,38 @@ def parts_of(result):
             number(p["after"]),
             f"{number(p['lower'])} : {number(p['upper'])}",
             "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
-            "not exercised, kept" if not p["exercised"] else f"at {p['at_bound']} bound" if p["at_bound"] else "",
+            (
+                "not exercised, kept"
+                if not p["exercised"]
+                else f"at {p['at_bound']} bound"
+                if p["at_bound"]
+                else ""
+            ),
         ]
         for n, p in result.parameters.items()
     ]
-    parts = [table(rows, ["parameter", "unit", "before", "after", "range", "10 % of it moves the objective by", ""]), ""]
-    rows = [["objective", unit, number(result.objective["before"]), number(result.objective["after"])]]
+    parts = [
+        table(
+            rows,
+            [
+                "parameter",
+                "unit",
+                "before",
+                "after",
+                "range",
+                "10 % of it moves the objective by",
+                "",
+            ],
+        ),
+        "",
+    ]
+    rows = [
+        ["objective", unit, number(result.objective["before"]), number(result.objective["after"])]
+    ]
     for m in ms.placed("shown"):
-        if m in result.measures["after"] and not (m == "rms_error_total" and set(result.objective["terms"]) == {m}):
+        if m in result.measures["after"] and not (
+            m == "rms_error_total" and set(result.objective["terms"]) == {m}
+        ):
             rows.append(
                 [
                     m,
@@ -75,7 +115,11 @@ def parts_of(result):
                     numbers(result.measures["after"][m], 5 if "level" in m else 4),
                 ]
             )
-    parts += [table(rows, ["measure", "unit", "before", "after"]), *_whose(result, len(rows) > 1), ""]
+    parts += [
+        table(rows, ["measure", "unit", "before", "after"]),
+        *_whose(result, len(rows) > 1),
+        "",
+    ]
     if result.constraints:
         shown = worst_of_scenarios(result.constraints)
         rows = [
@@ -89,21 +133,13 @@ def parts_of(result):
             ]
             for c in shown
         ]
-        parts += [
-            table(
-                rows,
-                [
-                    "limit",
-                    "unit",
-                    "limit",
-                    "value",
-                    "margin",
-                    "reached at",
-                ],
-            ),
-            "",
-        ]
-    parts += _scenario_table(result) + _validation_table(result) + _choice_table(result) + _tradeoff_table(result)
+        parts += [table(rows, ["limit", "unit", "limit", "value", "margin", "reached at"]), ""]
+    parts += (
+        _scenario_table(result)
+        + _validation_table(result)
+        + _choice_table(result)
+        + _tradeoff_table(result)
+    )
     if result.bound is not None:
         parts += [result.bound.text(), ""]
     if result.tuned.loop.plant.overflow:
@@ -111,12 +147,17 @@ def parts_of(result):
     elif any(limit.measure == "max_level" for limit in result.problem.limits):
         rims = "rims are limits: a level may rise past one"
     else:
-        rims = "rims are neither physics nor limits here: a level may rise past one, and nothing holds it"
+        rims = (
+            "rims are neither physics nor limits here: a level may rise past one, and nothing"
+            " holds it"
+        )
     return [*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s"]
 
 
 def _whose(result, others):
-    """Whose the rows of the table of measures are, where the objective is of other runs than the rest; others: whether there is a rest."""
+    """Whose the rows of the table of measures are, where the objective is of other runs than the
+    rest; others: whether there is a rest.
+    """
     problem = result.problem
     if not problem.scenarios:
         return []
@@ -132,7 +173,9 @@ def _whose(result, others):
 
 
 def worst_of_scenarios(constraints):
-    """The rows of `constraints`, of those that differ by their scenario alone the one with the least margin."""
+    """The rows of `constraints`, of those that differ by their scenario alone the one with the
+    least margin.
+    """
     worst = {}
     for c in constraints:
         same = (c["measure"], c["tank"], c["name"].removesuffix(f" in {c['scenario']}"))
@@ -142,7 +185,9 @@ def worst_of_scenarios(constraints):
 
 
 def scenario_rows(result):
-    """One dict for each scenario: {name, weight, objective {before, after}, limits_held {before, after}}; [] for the case's own run alone."""
+    """One dict for each scenario: {name, weight, objective {before, after}, limits_held {before,
+    after}}; [] for the case's own run alone.
+    """
     problem = result.problem
     if not problem.scenarios:
         return []
@@ -155,7 +200,9 @@ def scenario_rows(result):
                 "name": lane.name,
                 "weight": lane.weight,
                 "objective": clean({k: problem.cost(row) for k, row in sides.items()}),
-                "limits_held": {k: all(limit.margin(row) >= 0 for limit in mine) for k, row in sides.items()},
+                "limits_held": {
+                    k: all(limit.margin(row) >= 0 for limit in mine) for k, row in sides.items()
+                },
             }
         )
     return rows
@@ -167,12 +214,18 @@ COSTLIEST = 5
 def _scenario_table(result):
     scenarios = scenario_rows(result)
     many = len(scenarios) > 12
-    worst = sorted(scenarios, key=lambda s: -np.inf if s["objective"]["after"] is None else -s["objective"]["after"])
+    worst = sorted(
+        scenarios,
+        key=lambda s: -np.inf if s["objective"]["after"] is None else -s["objective"]["after"],
+    )
     rows = [
         [
             s["name"],
             number(s["weight"], 3),
-            *(number(s["objective"][k]) if s["objective"][k] is not None else "-" for k in ("before", "after")),
+            *(
+                number(s["objective"][k]) if s["objective"][k] is not None else "-"
+                for k in ("before", "after")
+            ),
             ("yes" if s["limits_held"]["after"] else "no") if result.problem.limits else "-",
         ]
         for s in (worst[:COSTLIEST] if many else scenarios)
@@ -188,7 +241,10 @@ def _validation_table(result):
     found = result.validation
     if not found:
         return []
-    spread = ", ".join(n if s is None else f"{n} +-{100 * s:g} %" for n, s in found["spread"].items()) or "the plant as it is"
+    spread = (
+        ", ".join(n if s is None else f"{n} +-{100 * s:g} %" for n, s in found["spread"].items())
+        or "the plant as it is"
+    )
     noise = ", fresh noise" if found["noise"] else ""
     rows = [
         [
@@ -201,7 +257,14 @@ def _validation_table(result):
     ]
     if not rows:
         return [f"held-out runs: all {found['samples']} failed", ""]
-    head = [f"on {found['samples']} held-out runs", "mean objective", "5 %", "median", "95 %", "all limits held in"]
+    head = [
+        f"on {found['samples']} held-out runs",
+        "mean objective",
+        "5 %",
+        "median",
+        "95 %",
+        "all limits held in",
+    ]
     if not result.problem.limits:  # nothing to hold
         head, rows = head[:-1], [row[:-1] for row in rows]
     failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
@@ -210,13 +273,17 @@ def _validation_table(result):
 
 
 def _better(found):
-    """In how many held-out runs tuning gained: a lower cost than that of a run which breaks a limit is no gain, and a higher no loss."""
+    """In how many held-out runs tuning gained: a lower cost than that of a run which breaks a limit
+    is no gain, and a higher no loss.
+    """
     if found["comparable"] == 1.0:
         return f"tuned is better in {100 * found['better_share']:.0f} % of them"
     part = f"before and after both hold every limit in {100 * found['comparable']:.3g} % of them"
     if found["better_share_of_comparable"] is None:
         return f"{part}, so their objectives are not to be compared"
-    return f"{part}, and of those tuned is better in {100 * found['better_share_of_comparable']:.0f} %"
+    return (
+        f"{part}, and of those tuned is better in {100 * found['better_share_of_comparable']:.0f} %"
+    )
 
 
 def _choice_table(result):
@@ -247,4 +314,9 @@ def _tradeoff_table(result):
         ]
         for p in result.tradeoff["points"]
     ]
-    return [table(rows, [f"limit of {result.tradeoff['measure']} [{unit}]", "status", "objective", "at"]), ""]
+    return [
+        table(
+            rows, [f"limit of {result.tradeoff['measure']} [{unit}]", "status", "objective", "at"]
+        ),
+        "",
+    ]

@@ -18,7 +18,11 @@ def result_key(result):
     """The key of the sensor noise of the case's own run, None where it has none."""
     import jax
 
-    return jax.random.key(result.problem.seed) if bool(np.any(np.asarray(result.case.loop.sensor.noise) > 0)) else None
+    return (
+        jax.random.key(result.problem.seed)
+        if bool(np.any(np.asarray(result.case.loop.sensor.noise) > 0))
+        else None
+    )
 
 
 def figures(result, runs=None):
@@ -29,10 +33,20 @@ def figures(result, runs=None):
     from tuning.report import figures as pictures
 
     key = result_key(result)
-    runs = runs or {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    runs = runs or {
+        "before": run_for_people(result.case, key),
+        "after": run_for_people(result.tuned, key),
+    }
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
-    tanks = {limit.index: limit.value for limit in result.problem.limits if limit.measure == "max_level" and limit.lane == 0}
-    limits = [tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i]) for i in range(result.tuned.loop.plant.tanks)]
+    tanks = {
+        limit.index: limit.value
+        for limit in result.problem.limits
+        if limit.measure == "max_level" and limit.lane == 0
+    }
+    limits = [
+        tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i])
+        for i in range(result.tuned.loop.plant.tanks)
+    ]
     told = {"before": "", "after": ""}
     if result.problem.limits:
         told = {
@@ -40,22 +54,29 @@ def figures(result, runs=None):
             for k, t in result.tables.items()
         }
     title = (
-        f"{result.tuned.name}: objective {number(result.objective['before'], 4)}{told['before']} -> "
+        f"{result.tuned.name}: objective"
+        f" {number(result.objective['before'], 4)}{told['before']} -> "
         f"{number(result.objective['after'], 4)}{'' if unit == '-' else f' {unit}'}{told['after']}\n("
         + ", ".join(
-            f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)} {p['unit']}"
+            f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
+            f" {p['unit']}"
             for n, p in list(result.parameters.items())[:4]
         )
         + ")"
     )
     drawn = {
         "responses": responses.responses(result.tuned.loop, runs, title, limits),
-        **pictures.rig(result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"),
+        **pictures.rig(
+            result.tuned.loop, runs["after"], f"{result.tuned.name} at the end of the tuned run"
+        ),
         **pictures.margins(worst_of_scenarios(result.constraints)),
         **pictures.inner(result.tuned.loop, runs),
         **pictures.saturation(result.tuned.loop, runs),
         **pictures.estimates(
-            result.tuned.loop, result.tuned.clock, runs["after"], f"{result.tuned.name}, tuned: what its observer saw"
+            result.tuned.loop,
+            result.tuned.clock,
+            runs["after"],
+            f"{result.tuned.name}, tuned: what its observer saw",
         ),
     }
     with responses.styled():
@@ -75,28 +96,51 @@ def figures(result, runs=None):
 
 
 CAPTIONS = {
-    "responses": "The run before tuning (orange, dashed) and after (blue): controlled levels with their setpoints, tracking errors, the other "
-    "tanks, and what the pumps were given. Shaded: past a limit.",
-    "margins": "Room that the tuned run leaves to each limit; a bar to the left of zero is a limit that is broken.",
-    "inner": "The tanks that are not controlled, one against the other, from the dot to the square.",
-    "saturation": "When pumps were commanded past their limits: up past the upper, down past the lower, as tall as the share of the time.",
+    "responses": (
+        "The run before tuning (orange, dashed) and after (blue): controlled levels with their"
+        " setpoints, tracking errors, the other tanks, and what the pumps were given. Shaded: past"
+        " a limit."
+    ),
+    "margins": (
+        "Room that the tuned run leaves to each limit; a bar to the left of zero is a limit that is"
+        " broken."
+    ),
+    "inner": (
+        "The tanks that are not controlled, one against the other, from the dot to the square."
+    ),
+    "saturation": (
+        "When pumps were commanded past their limits: up past the upper, down past the lower, as"
+        " tall as the share of the time."
+    ),
     "estimates": "What the observer believed beside what was true, in the tuned run.",
-    "clouds": "Runs that the search never saw, on perturbed plants and fresh noise where the case has them: a dot each, before across, after up.",
+    "clouds": (
+        "Runs that the search never saw, on perturbed plants and fresh noise where the case has"
+        " them: a dot each, before across, after up."
+    ),
     "convergence": "Every evaluation of the search in its order.",
     "landscape": "The objective around the answer, at the case's own step.",
     "tradeoff": "The least objective that each value of the limit leaves.",
-    "rig": "The rig, drawn from its own topology; triangles are setpoints, a heavier outline is a tank that is controlled.",
+    "rig": (
+        "The rig, drawn from its own topology; triangles are setpoints, a heavier outline is a tank"
+        " that is controlled."
+    ),
 }
 
 
 def page_of(result, drawn, command=None):
-    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the line that made it."""
+    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the
+    line that made it.
+    """
     from tuning.report import html
 
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
     broken, (rig_text, _) = [c for c in result.constraints if c["margin"] < 0], rig_of(result)
-    limits = f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold" if result.constraints else "none"
+    limits = (
+        f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold"
+        if result.constraints
+        else "none"
+    )
     facts = [
         ("objective before", f"{number(before)} {unit}".strip()),
         ("objective after", f"{number(after)} {unit}".strip()),
@@ -110,7 +154,8 @@ def page_of(result, drawn, command=None):
     return html.document(
         f"{result.tuned.name}: tuned",
         result.case.title,
-        result.status.replace("_", " ") + ("; every limit holds" if result.constraints and not broken else ""),
+        result.status.replace("_", " ")
+        + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
         facts,
         result.message.split("; "),
@@ -123,7 +168,9 @@ def page_of(result, drawn, command=None):
 
 
 def _clouds(plt, result, unit):
-    """The runs that the search never saw, before against after: the objective, and the level that comes nearest to its limit."""
+    """The runs that the search never saw, before against after: the objective, and the level that
+    comes nearest to its limit.
+    """
     from jaxtank.plots import responses
 
     found, length = result.cloud, result.tuned.loop.units[0]
@@ -133,16 +180,25 @@ def _clouds(plt, result, unit):
     responses.cloud(right, found["level"], found["held"], name, length, found["limit"])
     handles, labels = right.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(responses.plain(f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"), fontsize=10)
+    figure.suptitle(
+        responses.plain(
+            f"{result.tuned.name}: {len(found['objective'])} runs that the search never saw"
+        ),
+        fontsize=10,
+    )
     return figure
 
 
 def _landscape(ax, result, unit):
-    """The objective around the answer at the case's own step: along one parameter, or over the two that it feels most."""
+    """The objective around the answer at the case's own step: along one parameter, or over the two
+    that it feels most.
+    """
     from jaxtank.plots import responses
 
     problem = result.problem
-    z = np.array([float(b.to_unit(p["after"])) for b, p in zip(problem.bounds, result.parameters.values())])
+    z = np.array(
+        [float(b.to_unit(p["after"])) for b, p in zip(problem.bounds, result.parameters.values())]
+    )
     z0 = problem.start()
     if len(z) == 1:
         grid = np.linspace(0.0, 1.0, 128)
@@ -161,7 +217,11 @@ def _landscape(ax, result, unit):
             (result.parameters[b.name]["after"], result.objective["after"]),
             b.scale == "log",
         )
-    first, second = sorted(np.argsort([-(p["felt_percent"] or 0.0) for p in result.parameters.values()], kind="stable")[:2])
+    first, second = sorted(
+        np.argsort(
+            [-(p["felt_percent"] or 0.0) for p in result.parameters.values()], kind="stable"
+        )[:2]
+    )
     side = np.linspace(0.0, 1.0, 24)
     a, c = np.meshgrid(side, side)
     points = np.tile(z, (a.size, 1))
@@ -200,11 +260,13 @@ def rig_of(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and report.html; returns their paths.
+    """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and
+    report.html; returns their paths.
 
-    command: the line that made the result, for the report, where there is one. A case that no rig file
-    can describe (with a plant or a controller class of one's own) has no rig.toml: a UserWarning,
-    result.json and the report give the reason, and the rig.toml of an earlier result is removed.
+    command: the line that made the result, for the report, where there is one. A case that no rig
+    file can describe (with a plant or a controller class of one's own) has no rig.toml: a
+    UserWarning, result.json and the report give the reason, and the rig.toml of an earlier result
+    is removed.
     """
     check_folder(folder)
     folder = Path(folder)
@@ -222,5 +284,12 @@ def save(result, folder, command=None):
     }
     stale = earlier(folder, CAPTIONS)
     if not rig_text and (folder / "result.json").is_file():
-        stale.append(folder / "rig.toml")  # of another result: its gains must not be taken for these
-    return write_result(folder, files, lambda: figures(result, runs), lambda drawn: page_of(result, drawn, command), stale)
+        # of another result: its gains must not be taken for these
+        stale.append(folder / "rig.toml")
+    return write_result(
+        folder,
+        files,
+        lambda: figures(result, runs),
+        lambda drawn: page_of(result, drawn, command),
+        stale,
+    )

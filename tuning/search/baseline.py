@@ -14,7 +14,9 @@ def own_values(problem):
 
 
 def run_measures(loop, clock, key):
-    """{measure: value} of everything that is reported of a run, and when the highest and lowest levels were reached."""
+    """{measure: value} of everything that is reported of a run, and when the highest and lowest
+    levels were reached.
+    """
     names = tuple(m for m in REPORTED if ms.serves(m, loop))
     values = lp.evaluate(loop, clock, (*names, *ms.TIMES.values()), key)
     return {m: np.asarray(v) for m, v in values.items()}

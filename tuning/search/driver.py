@@ -5,26 +5,41 @@ import numpy as np
 from tuning.problem.problem import EXPLODED
 
 BACKOFF = 1e-6
-"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not above by round-off [-]."""
+"""Share of its limit by which a search keeps a measure inside it, so that the reported value is not
+above by round-off [-].
+"""
 
 SETTLED = 0.02
-"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as converged."""
+"""KKT residual, of the scaled cost per unit of z, below which a first-order method counts as
+converged.
+"""
 
 
 class Search:
-    """A problem as a solver sees it: scaled cost, margins, memory of the last points, the best one so far."""
+    """A problem as a solver sees it: scaled cost, margins, memory of the last points, the best one
+    so far.
+    """
 
     def __init__(self, problem, reference, report, tolerance=1e-8):
         self.problem, self.report, self.tolerance = problem, report, tolerance
         # a cost can be a scale where its slopes are not to be used
         self.scale = reference.cost if 0 < reference.cost < EXPLODED else 1.0
         self.room = problem.rooms
-        # a limit of exactly zero is often the least a measure can be: there is no room to keep off it
+        # a limit of exactly zero is often the least a measure can be: there is no room to keep off
+        # it
         # a search ends within its tolerance of a limit, on either side
-        self.backoff = max(BACKOFF, tolerance) * np.array([limit.value != 0 for limit in problem.limits], dtype=float)
+        self.backoff = max(BACKOFF, tolerance) * np.array(
+            [limit.value != 0 for limit in problem.limits], dtype=float
+        )
         self.best_start = None
         self.exhausted = False  # whether the last local search used up its iterations
-        self.best, self.history, self.memory, self.last_finite, self.start = None, [], {}, reference, 0
+        self.best, self.history, self.memory, self.last_finite, self.start = (
+            None,
+            [],
+            {},
+            reference,
+            0,
+        )
 
     def point(self, z):
         """The Point at z, clipped into the box; remembered."""
@@ -50,7 +65,9 @@ class Search:
         self.report(self)
 
     def violation(self, point):
-        """Largest amount by which a limit is broken, as a share of its `objective.room_of` [-]; 0 where all hold."""
+        """Largest amount by which a limit is broken, as a share of its `objective.room_of` [-]; 0
+        where all hold.
+        """
         return float(max(0.0, *(-point.margins / self.room))) if len(point.margins) else 0.0
 
     def better(self, a, b):
@@ -59,7 +76,9 @@ class Search:
         return va < vb if max(va, vb) > 0 and va != vb else a.cost < b.cost
 
     def cost(self, z):
-        """(scaled cost, gradient). A point that is not finite costs ten times the start and points back to the last good one."""
+        """(scaled cost, gradient). A point that is not finite costs ten times the start and points
+        back to the last good one.
+        """
         point = self.point(z)
         if point.finite:
             return point.cost / self.scale, point.gradient / self.scale
@@ -73,7 +92,9 @@ class Search:
 
 
 class Rough(Search):
-    """The same problem at a tenth of the samples, on the same scale: what it finds is a start, and enters no race."""
+    """The same problem at a tenth of the samples, on the same scale: what it finds is a start, and
+    enters no race.
+    """
 
     def __init__(self, search):
         super().__init__(search.problem, search.last_finite, search.report)

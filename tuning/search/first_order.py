@@ -6,18 +6,24 @@ from tuning.search.driver import SETTLED
 from tuning.search.kkt import optimality
 
 STEEPEST = 10.0
-"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff should turn it back, not throw it."""
+"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff
+should turn it back, not throw it.
+"""
 
 
 def lbfgs(search, z, iterations):
-    """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into the box."""
+    """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into
+    the box.
+    """
     import optax
 
     return _augmented(search, z, iterations, optax.scale_by_lbfgs(memory_size=8), descend=True)
 
 
 def adam(search, z, iterations):
-    """optax's Adam, limits by augmented Lagrangian, projected into the box. Its steps are small: five to an iteration."""
+    """optax's Adam, limits by augmented Lagrangian, projected into the box. Its steps are small:
+    five to an iteration.
+    """
     import optax
 
     steps = 5 * iterations
@@ -26,8 +32,10 @@ def adam(search, z, iterations):
 
 
 def minibatches(search, z, iterations, batch, rng):
-    """optax's Adam on the mean of `batch` scenarios drawn afresh for every step, limits of those by a quadratic penalty. All scenarios
-    are looked at ten times on the way, and they decide what is best."""
+    """optax's Adam on the mean of `batch` scenarios drawn afresh for every step, limits of those by
+    a quadratic penalty. All scenarios are looked at ten times on the way, and they decide what is
+    best.
+    """
     import optax
 
     steps = 5 * iterations

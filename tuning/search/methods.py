@@ -1,4 +1,6 @@
-"""Local searches from one start. Each takes a Search, which counts, remembers and shields; each may stop early, none may fail."""
+"""Local searches from one start. Each takes a Search, which counts, remembers and shields; each may
+stop early, none may fail.
+"""
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
@@ -9,7 +11,9 @@ from tuning.search.first_order import adam, lbfgs
 from tuning.search.kkt import LOWER_BY
 
 STILL, LONG = 1e-9, 25
-"""Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a line search never ends by itself [-]."""
+"""Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a
+line search never ends by itself [-].
+"""
 
 ITERATION_LIMIT = 9
 """Status of scipy's SLSQP that has used up its iterations."""
@@ -25,7 +29,13 @@ def slsqp(search, z, iterations, tolerance=None):
         return _epigraph(search, z, iterations, tolerance)
     constraints = []
     if search.problem.limits:
-        constraints = [{"type": "ineq", "fun": lambda z: search.margins(z)[0], "jac": lambda z: search.margins(z)[1]}]
+        constraints = [
+            {
+                "type": "ineq",
+                "fun": lambda z: search.margins(z)[0],
+                "jac": lambda z: search.margins(z)[1],
+            }
+        ]
     try:
         done = scipy.optimize.minimize(
             _Watch(search),
@@ -39,7 +49,8 @@ def slsqp(search, z, iterations, tolerance=None):
     except _Settled:
         return True
     search.exhausted = done.status == ITERATION_LIMIT
-    # 8: no further descent along the search direction, which is how a solver ends at the precision of a kinked cost
+    # 8: no further descent along the search direction, which is how a solver ends at the precision
+    # of a kinked cost
     return bool(done.success) or done.status == 8
 
 
@@ -58,7 +69,9 @@ class _Watch:
         point = self.search.point(z)
         if point.finite:
             held = self.search.violation(point) == 0
-            better = held and found[0] < self.least - STILL * abs(self.least if np.isfinite(self.least) else 0.0)
+            better = held and found[0] < self.least - STILL * abs(
+                self.least if np.isfinite(self.least) else 0.0
+            )
             self.since = 0 if better or not np.isfinite(self.least) else self.since + 1
             self.least = min(self.least, found[0]) if held else self.least
         if self.since > LONG:
@@ -67,7 +80,9 @@ class _Watch:
 
 
 def _epigraph(search, z, iterations, tolerance):
-    """`slsqp` of the worst scenario: t made small under cost_i <= t, which is smooth where the largest cost is not."""
+    """`slsqp` of the worst scenario: t made small under cost_i <= t, which is smooth where the
+    largest cost is not.
+    """
 
     def known(z):
         point = search.point(z)
@@ -97,8 +112,10 @@ def _epigraph(search, z, iterations, tolerance):
 
 
 def trf(search, z, iterations, tolerance=1e-10):
-    """Bounded Gauss-Newton trust region on P + 1 residuals that have the cost's value, slope and second derivative (the latter without
-    the residuals' own curvature). Limits are not looked at. Returns True if it converged."""
+    """Bounded Gauss-Newton trust region on P + 1 residuals that have the cost's value, slope and
+    second derivative (the latter without the residuals' own curvature). Limits are not looked at.
+    Returns True if it converged.
+    """
     squared = search.problem.model == "square"
     weight = search.problem.objective[ROOT] if squared else 1.0
 
@@ -110,16 +127,21 @@ def trf(search, z, iterations, tolerance=1e-10):
         if squared:
             value, slope = cost**2, cost * point.gradient / search.scale
             normal = 0.5 * weight**2 * point.gauss_newton / search.scale**2
-        else:  # the residuals' squares sum to the cost and one more, so that a steep cost near 0 fits too
-            value, slope, normal = cost + 1.0, 0.5 * point.gradient / search.scale, 0.5 * point.gauss_newton / search.scale
+        # the residuals' squares sum to the cost and one more, so that a steep cost near 0 fits too
+        else:
+            value, slope, normal = (
+                cost + 1.0,
+                0.5 * point.gradient / search.scale,
+                0.5 * point.gauss_newton / search.scale,
+            )
         root = np.linalg.cholesky(normal + 1e-12 * (np.trace(normal) + 1e-12) * np.eye(len(z)))
         head = np.linalg.solve(root, slope)
         excess = max(
             1.0, float(head @ head) / max(value, 1e-300)
         )  # terms without squares may slope more than the model's curvature allows
-        return np.append(head / excess**0.5, max(value - head @ head / excess, 0.0) ** 0.5), np.vstack(
-            [root.T * excess**0.5, 0 * z]
-        )
+        return np.append(
+            head / excess**0.5, max(value - head @ head / excess, 0.0) ** 0.5
+        ), np.vstack([root.T * excess**0.5, 0 * z])
 
     done = scipy.optimize.least_squares(
         lambda z: model(z)[0],
@@ -137,8 +159,10 @@ def trf(search, z, iterations, tolerance=1e-10):
 
 
 def coarse_first(search, z, iterations):
-    """`trf` at a tenth of the samples, then at all of them from where that ended: most of the way is gone where a step is cheap. Where
-    the rough runs mislead (at ten times the step a loop may chatter), the second part begins at z. Limits are not looked at."""
+    """`trf` at a tenth of the samples, then at all of them from where that ended: most of the way
+    is gone where a step is cheap. Where the rough runs mislead (at ten times the step a loop may
+    chatter), the second part begins at z. Limits are not looked at.
+    """
     rough = Rough(search)
     began = rough.point(z)
     trf(rough, z, iterations, tolerance=ROUGHLY)
@@ -149,7 +173,9 @@ def coarse_first(search, z, iterations):
 
 
 def gauss_newton_first(search, z, iterations):
-    """`trf` as if there were no limits; where it ends outside one, `slsqp` from where it began. The cheapest way where limits are slack."""
+    """`trf` as if there were no limits; where it ends outside one, `slsqp` from where it began. The
+    cheapest way where limits are slack.
+    """
     mark = len(search.history)
     converged = trf(search, z, iterations, tolerance=1e-6)
     mine = [h for h in search.history[mark:] if np.isfinite(h[1])]
@@ -159,8 +185,9 @@ def gauss_newton_first(search, z, iterations):
 
 
 def restore(search, z, iterations):
-    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with every margin at least -t. True if it came to
-    its end."""
+    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with
+    every margin at least -t. True if it came to its end.
+    """
     if not search.problem.limits:
         return True
 
@@ -187,8 +214,9 @@ def restore(search, z, iterations):
 def approach(search):
     """Move the best feasible point towards a lower infeasible one, by halving the distance.
 
-    Only where each limit that is broken there has no slope at the feasible point: a measure that changes
-    in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along its boundary.
+    Only where each limit that is broken there has no slope at the feasible point: a measure that
+    changes in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along
+    its boundary.
     """
     best = search.best
     if best is None or search.violation(best) > 0:
@@ -197,7 +225,10 @@ def approach(search):
     outside = [
         p
         for p in search.memory.values()
-        if p.finite and p.cost < best.cost * (1 - LOWER_BY) and search.violation(p) < NEAR and np.all(p.margins[~blind] >= 0)
+        if p.finite
+        and p.cost < best.cost * (1 - LOWER_BY)
+        and search.violation(p) < NEAR
+        and np.all(p.margins[~blind] >= 0)
     ]
     if not outside:
         return
@@ -214,4 +245,11 @@ NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
 
-METHODS = {"slsqp": slsqp, "trf": trf, "lbfgs": lbfgs, "adam": adam, "trf-slsqp": gauss_newton_first, "coarse-trf": coarse_first}
+METHODS = {
+    "slsqp": slsqp,
+    "trf": trf,
+    "lbfgs": lbfgs,
+    "adam": adam,
+    "trf-slsqp": gauss_newton_first,
+    "coarse-trf": coarse_first,
+}

@@ -1,4 +1,6 @@
-"""What a limit costs: the problem solved again for a row of values of one limit, each search begun where a neighbour's ended."""
+"""What a limit costs: the problem solved again for a row of values of one limit, each search begun
+where a neighbour's ended.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -33,19 +35,21 @@ def tradeoff(
     start: Any = None,
     progress: Callable | None = None,
 ) -> dict[str, Any]:
-    """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint method), the loosest first.
+    """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint
+    method), the loosest first.
 
-    Each value is searched from the answer of the next looser one (from the first point too, where that leads to none that keeps the
-    limit) and from that of the next tighter one, and the best is kept: a tighter limit's answer holds a looser one too, so that the
-    objective never falls as the limit is drawn in. Where one of `screening` Sobol points, or a point
-    that was evaluated for another value, keeps the limit at a lower objective, the search is begun
-    again from it.
+    Each value is searched from the answer of the next looser one (from the first point too, where
+    that leads to none that keeps the limit) and from that of the next tighter one, and the best is
+    kept: a tighter limit's answer holds a looser one too, so that the objective never falls as the
+    limit is drawn in. Where one of `screening` Sobol points, or a point that was evaluated for
+    another value, keeps the limit at a lower objective, the search is begun again from it.
 
-    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit holds for every
-    entry of the measure, the other limits stay; start: {name: value} to begin at, the case's own where
-    None; progress: called after every evaluation. Returns {"measure", "points": [{"limit", "status"
-    ("converged", "not_converged" or "infeasible"), "objective", "violation", "parameters"}]}. Raises
-    InputError for an unknown measure and for values that are not finite.
+    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit
+    holds for every entry of the measure, the other limits stay; start: {name: value} to begin at,
+    the case's own where None; progress: called after every evaluation. Returns {"measure",
+    "points": [{"limit", "status" ("converged", "not_converged" or "infeasible"), "objective",
+    "violation", "parameters"}]}. Raises InputError for an unknown measure and for values that are
+    not finite.
     """
     ms.check_names([measure])
     values = [float(v) for v in values]
@@ -53,7 +57,14 @@ def tradeoff(
         raise InputError(f"tradeoff of {measure}: must have 1 to {MANY} finite values of its limit")
     others = {m: v for m, v in (case.limits if limits is None else limits).items() if m != measure}
     values = sorted(values, reverse=ms.MEASURES[measure].sense > 0)
-    problem = Problem(case, free=free, objective=objective, limits={**others, measure: values[0]}, scenarios=scenarios, seed=seed)
+    problem = Problem(
+        case,
+        free=free,
+        objective=objective,
+        limits={**others, measure: values[0]},
+        scenarios=scenarios,
+        seed=seed,
+    )
     z = problem.start()
     if start is not None:
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
@@ -79,12 +90,16 @@ def tradeoff(
             found[k] = _Answer(search, slsqp(search, other, iterations))
         approach(search)
         known.update(search.memory)
-    return {"measure": measure, "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)]}
+    return {
+        "measure": measure,
+        "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)],
+    }
 
 
 def _candidates(problem, known, screening, seed):
-    """Return (zs, costs, margins under the problem's limits) of screened points and of the finite Points
-    among `known`."""
+    """Return (zs, costs, margins under the problem's limits) of screened points and of the finite
+    Points among `known`.
+    """
     zs, costs, margins, _ = screen(problem, screening, seed)
     points = [p for p in known.values() if p.finite]
     old = [problem.margins(p.measures) for p in points]
@@ -134,7 +149,9 @@ def _told(problem, value, answer, z):
     best, broken = answer.best, answer.broken
     return {
         "limit": value,
-        "status": "infeasible" if broken > 0 else "converged" if answer.converged else "not_converged",
+        "status": (
+            "infeasible" if broken > 0 else "converged" if answer.converged else "not_converged"
+        ),
         "objective": np.nan if best is None else float(best.cost),
         "violation": float(broken),
         "parameters": problem.values(z if best is None else best.z),

@@ -27,10 +27,23 @@ def fingerprint(problem, method, options):
         "free": repr([tuple(b) for b in problem.bounds]),
         "objective": repr(problem.objective),
         "limits": repr([tuple(limit) for limit in problem.limits]),
-        "scenarios": repr([(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]),
+        "scenarios": repr(
+            [(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]
+        ),
         "method": method,
         "risk": problem.risk,
-        **{n: repr(options[n]) for n in ("starts", "seed", "screening", "iterations", "batch", "validation", "tolerance")},
+        **{
+            n: repr(options[n])
+            for n in (
+                "starts",
+                "seed",
+                "screening",
+                "iterations",
+                "batch",
+                "validation",
+                "tolerance",
+            )
+        },
         "jaxtank": jaxtank.__version__,
         "jax": jax.__version__,
         "xla_option": repr(KEY in os.environ.get("XLA_FLAGS", "")),

@@ -1,4 +1,6 @@
-"""Where to start: Sobol points at a coarse step, and which of them only the coarse step makes unstable."""
+"""Where to start: Sobol points at a coarse step, and which of them only the coarse step makes
+unstable.
+"""
 
 import functools
 
@@ -20,22 +22,30 @@ TRIED = 3
 best: the coarse step may rate many too low."""
 
 LARGEST_STATE = 60
-"""Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their cube."""
+"""Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their
+cube.
+"""
 
 
 def sobol(count, dimensions, seed):
     """(count, dimensions) scrambled Sobol points in the unit cube; count should be a power of 2."""
-    return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(count)
+    return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
+        count
+    )
 
 
 def spectral_radius(problem, zs, clock):
-    """(points,) largest modulus of the eigenvalues of one sample of the loop, linearised at the reference's plateaus.
+    """(points,) largest modulus of the eigenvalues of one sample of the loop, linearised at the
+    reference's plateaus.
 
-    Above 1, the sampled loop is unstable there: it chatters between the limits of the pumps however good its gains would be at a
-    smaller step. Points (points, P); NaN where no plateau has a steady state, or a transport delay makes the state too long to ask.
+    Above 1, the sampled loop is unstable there: it chatters between the limits of the pumps however
+    good its gains would be at a smaller step. Points (points, P); NaN where no plateau has a steady
+    state, or a transport delay makes the state too long to ask.
     """
     steady = []
-    plateaus = problem.loop.reference.plateaus() if hasattr(problem.loop.reference, "plateaus") else []
+    plateaus = (
+        problem.loop.reference.plateaus() if hasattr(problem.loop.reference, "plateaus") else []
+    )
     for r in plateaus:
         try:
             steady.append((r, *equilibrium(problem.loop.plant, r)))
@@ -44,7 +54,13 @@ def spectral_radius(problem, zs, clock):
     if not steady:
         return np.full(len(zs), np.nan)
     r, x, u = (jnp.asarray(np.array(column)) for column in zip(*steady))
-    if sum(np.size(v) for v in jax.tree.leaves(jax.eval_shape(lambda: initial(problem.loop, clock)))) > LARGEST_STATE:
+    if (
+        sum(
+            np.size(v)
+            for v in jax.tree.leaves(jax.eval_shape(lambda: initial(problem.loop, clock)))
+        )
+        > LARGEST_STATE
+    ):
         return np.full(len(zs), np.nan)
     values = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(problem.bounds)}
     steps = np.asarray(_one_step_jacobians(problem.loop, clock, values, r, x, u))
@@ -53,7 +69,9 @@ def spectral_radius(problem, zs, clock):
 
 @functools.partial(jax.jit, static_argnames=("clock",))
 def _one_step_jacobians(loop, clock, values, r, x, u):
-    """(points, plateaus, n, n) derivative of the loop's state after a sample by the state before it."""
+    """(points, plateaus, n, n) derivative of the loop's state after a sample by the state before
+    it.
+    """
 
     def jacobian(values, r, x, u):
         here = with_values(loop, {**values, "x0": x, "actuator.initial": u})
@@ -62,7 +80,9 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
         moves = [jnp.issubdtype(jnp.result_type(v), jnp.floating) for v in leaves]
         zero = jnp.zeros_like(r)
         d = None if loop.disturbance is None else tuple(jnp.zeros(loop.plant.tanks))
-        plan = here.controller.prepare(tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None]))
+        plan = here.controller.prepare(
+            tuple(r[:, None]), tuple(zero[:, None]), tuple(zero[:, None])
+        )
         now = Inputs(
             r=tuple(r),
             dr=tuple(zero),
@@ -79,7 +99,9 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
         def after(flat):
             floats, rest = iter(unravel(flat)), iter([v for v, m in zip(leaves, moves) if not m])
-            state = jax.tree.unflatten(structure, [next(floats) if m else next(rest) for m in moves])
+            state = jax.tree.unflatten(
+                structure, [next(floats) if m else next(rest) for m in moves]
+            )
             out = jax.tree.leaves(step(here, clock, state, now)[0])
             return jnp.concatenate([jnp.ravel(v) for v, m in zip(out, moves) if m])
 
@@ -92,26 +114,35 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 def screen(problem, count, seed):
     """(zs, costs, margins, redone): `count` Sobol points, costs in the order of zs.
 
-    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run again at the true step;
-    `redone` counts the first.
+    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run
+    again at the true step; `redone` counts the first.
     """
     zs = sobol(count, len(problem.bounds), seed)
     clock = coarse_clock(problem.clock)
     costs, margins = problem.screen(zs, coarse=True)
     unstable = np.zeros(count, dtype=bool)
     if clock != problem.clock:
-        unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(spectral_radius(problem, zs, problem.clock) > 1.0)
+        unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(
+            spectral_radius(problem, zs, problem.clock) > 1.0
+        )
         suspect = unstable | ~np.isfinite(costs)
         if suspect.any():
             # always the same number of lanes, so that one compiled program serves every search
-            again = np.concatenate([zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)])
+            again = np.concatenate(
+                [zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)]
+            )
             true_costs, true_margins = problem.screen(again)
-            costs[suspect], margins[suspect] = true_costs[: suspect.sum()], true_margins[: suspect.sum()]
+            costs[suspect], margins[suspect] = (
+                true_costs[: suspect.sum()],
+                true_margins[: suspect.sum()],
+            )
     return zs, costs, margins, int(unstable.sum())
 
 
 def distinct_starts(zs, merits, count, first):
-    """Up to `count` points: `first`, then those of lowest merit that keep their distance from all taken so far."""
+    """Up to `count` points: `first`, then those of lowest merit that keep their distance from all
+    taken so far.
+    """
     taken = [np.asarray(first, dtype=float)]
     apart = 0.5 / max(2, count) * np.sqrt(len(first))
     order = [i for i in np.argsort(merits, kind="stable") if np.isfinite(merits[i])]
@@ -126,13 +157,21 @@ def distinct_starts(zs, merits, count, first):
 def best_screened(search, zs, costs, margins):
     """Return the screened point (P,) that keeps the limits and is better than the best of a Search.
 
-    None where none is, at the true step. zs (points, P), costs (points,) and margins (points, limits) as
-    `screen` returns them. A point that is run again enters the Search.
+    None where none is, at the true step. zs (points, P), costs (points,) and margins (points,
+    limits) as `screen` returns them. A point that is run again enters the Search.
     """
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
-    new = [i for i in np.argsort(costs, kind="stable") if held[i] and zs[i].tobytes() not in search.memory]
+    new = [
+        i
+        for i in np.argsort(costs, kind="stable")
+        if held[i] and zs[i].tobytes() not in search.memory
+    ]
     for i in new[:TRIED]:
-        if search.best is not None and search.violation(search.best) == 0 and costs[i] >= search.best.cost:
+        if (
+            search.best is not None
+            and search.violation(search.best) == 0
+            and costs[i] >= search.best.cost
+        ):
             return None
         if search.point(zs[i]) is search.best:
             return zs[i]

@@ -67,23 +67,25 @@ def tune(
 ) -> TuningResult:
     """Better values for the free parameters of a case, under its limits.
 
-    case: presets Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its own (and its seed, unless another
-    is given); method: solver options (SQP, TRF, LBFGS, Adam), or
-    "auto" (trf where the cost has squares and no limit is in the way, else slsqp), "slsqp", "trf", "coarse-trf"
-    (trf at a tenth of the samples, then at all), "lbfgs" or "adam"; free: {name: (low, high) or Free}; objective: {measure: weight};
+    case: presets Case, or a Problem of one, which has free, objective, limits, scenarios and risk
+    of its own (and its seed, unless another is given); method: solver options (SQP, TRF, LBFGS,
+    Adam), or "auto" (trf where the cost has squares and no limit is in the way, else slsqp),
+    "slsqp", "trf", "coarse-trf" (trf at a tenth of the samples, then at all), "lbfgs" or "adam";
+    free: {name: (low, high) or Free}; objective: {measure: weight};
     limits: {measure: value}, {} for none, held in every
-    scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what their costs come to, "mean", "cvar" (the
-    mean of the worst 5 %) or "worst"; choices: {static name: [values]}, each combination of which is tuned, the best taken; starts:
-    local searches, from the case's own values and the best distinct ones of `screening` Sobol
-    points (and one more from the best of these points, where it is better than what those searches
-    reached);
-    seed: of the Sobol points and the sensor noise; iterations: of each local search; batch: scenarios drawn for each step of
-    adam, None for all; validation: runs on perturbed plants and fresh noise that the answer is judged on, 0 for none; tolerance: change of the
-    objective, as a share of its first value, below which a search under limits has arrived, None for 1e-8 and a polish of the best to 1e-12;
-    checkpoint (or log): folder for
-    the log of evaluations, with which a killed search is continued by resume=True, to the same bits; progress: called with a dict after
-    every evaluation. Ctrl-C ends the search with the best point so far. Returns a TuningResult. Raises InputError for anything it
-    cannot use, before anything is run.
+    scenario; scenarios: tuple of presets.Scenario, () for the case's own run alone; risk: what
+    their costs come to, "mean", "cvar" (the mean of the worst 5 %) or "worst"; choices: {static
+    name: [values]}, each combination of which is tuned, the best taken; starts: local searches,
+    from the case's own values and the best distinct ones of `screening` Sobol points (and one more
+    from the best of these points, where it is better than what those searches reached);
+    seed: of the Sobol points and the sensor noise; iterations: of each local search; batch:
+    scenarios drawn for each step of adam, None for all; validation: runs on perturbed plants and
+    fresh noise that the answer is judged on, 0 for none; tolerance: change of the objective, as a
+    share of its first value, below which a search under limits has arrived, None for 1e-8 and a
+    polish of the best to 1e-12; checkpoint (or log): folder for the log of evaluations, with which
+    a killed search is continued by resume=True, to the same bits; progress: called with a dict
+    after every evaluation. Ctrl-C ends the search with the best point so far. Returns a
+    TuningResult. Raises InputError for anything it cannot use, before anything is run.
     """
     log = folder_of(checkpoint, log=log)
     options = dict(
@@ -116,19 +118,29 @@ def tune(
         validation=validation,
         tolerance=tolerance,
     )
-    problem = Problem(case, free=free, objective=objective, limits=limits, scenarios=scenarios, seed=seed, risk=risk)
+    problem = Problem(
+        case,
+        free=free,
+        objective=objective,
+        limits=limits,
+        scenarios=scenarios,
+        seed=seed,
+        risk=risk,
+    )
     key = jax.random.key(seed) if noisy(case) else None
     lp.check(case.loop, case.clock, key)
     method = _method(method, problem, batch)
     first = problem.start()
-    before = run_measures(case.loop, case.clock, key)  # a start that is not finite is an input error, told by evaluate
+    # a start that is not finite is an input error, told by evaluate
+    before = run_measures(case.loop, case.clock, key)
     _check_objective(problem, before)
     if log is not None:
         problem.memo = Log(log, fingerprint(problem, method, options), resume)
 
     search, outcomes, interrupted, redone, polished, curved = None, [], False, 0, False, None
     idle = np.zeros(len(first), dtype=bool)  # parameters that no run exercises
-    least, settled = False, False  # whether the least violation was found; whether nothing lower lies along a slope that is left
+    # whether the least violation was found; whether nothing lower lies along a slope that is left
+    least, settled = False, False
     report = _reporter(progress, problem, starts)
     try:
         reference = problem.point(first)
@@ -142,7 +154,9 @@ def tune(
             if batch is None:
                 converged = METHODS[method](search, z, iterations)
             else:
-                converged = minibatches(search, z, iterations, batch, np.random.default_rng([seed, search.start]))
+                converged = minibatches(
+                    search, z, iterations, batch, np.random.default_rng([seed, search.start])
+                )
             outcomes.append(_outcome(search, z, count, converged))
 
         for z in distinct_starts(zs, merits, starts, first):
@@ -178,18 +192,29 @@ def tune(
     after = run_measures(tuned.loop, tuned.clock, key)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
-        tables = {"before": diagnostics.table_of(problem, own_values(problem)), "after": diagnostics.table_of(problem, values)}
+        tables = {
+            "before": diagnostics.table_of(problem, own_values(problem)),
+            "after": diagnostics.table_of(problem, values),
+        }
     checked = constraint_rows(problem, tables["after"])
     holds = all(c["margin"] >= 0 for c in checked)
-    status = "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
-    mirrored = None if interrupted or best is None else diagnostics.mirror_of(problem, outcomes, values)
+    status = (
+        "interrupted" if interrupted else _status(outcomes, holds, search, polished, least, settled)
+    )
+    mirrored = (
+        None if interrupted or best is None else diagnostics.mirror_of(problem, outcomes, values)
+    )
     validated, cloud = None, None
     if (
         validation
         and not interrupted
-        and (case.uncertain or case.covariance or any(lane.key is not None for lane in problem.lanes))
+        and (
+            case.uncertain or case.covariance or any(lane.key is not None for lane in problem.lanes)
+        )
     ):
-        validated, cloud = diagnostics.validate(problem, own_values(problem), values, validation, seed)
+        validated, cloud = diagnostics.validate(
+            problem, own_values(problem), values, validation, seed
+        )
     result = TuningResult(
         case=case,
         tuned=tuned,
@@ -209,7 +234,11 @@ def tune(
             }
             for b, v, f, still in zip(problem.bounds, z, felt, idle.tolist())
         },
-        objective={"before": problem.total(tables["before"]), "after": problem.total(tables["after"]), "terms": problem.objective},
+        objective={
+            "before": problem.total(tables["before"]),
+            "after": problem.total(tables["after"]),
+            "terms": problem.objective,
+        },
         measures={"before": before, "after": after},
         tables=tables,
         constraints=checked,
@@ -230,16 +259,23 @@ def tune(
         provenance=provenance(case, seed),
         problem=problem,
     )
-    result = result.replace(message=message(result, z, felt, redone, of_answer(problem, tuned, values, key)))
+    result = result.replace(
+        message=message(result, z, felt, redone, of_answer(problem, tuned, values, key))
+    )
     if log is not None:
         problem.memo = cast(Log, problem.memo).memo()
     return result
 
 
 def _settled(search, outcomes, iterations):
-    """True once the best point is one that first-order conditions hold at: a search with a wide tolerance also ends where a step of its line
-    search happened to be short, and is begun again from there, a few times."""
-    if _status(outcomes, True, search, False) == "converged" and optimality(search, search.best)[1] < SETTLED:
+    """True once the best point is one that first-order conditions hold at: a search with a wide
+    tolerance also ends where a step of its line search happened to be short, and is begun again
+    from there, a few times.
+    """
+    if (
+        _status(outcomes, True, search, False) == "converged"
+        and optimality(search, search.best)[1] < SETTLED
+    ):
         return True
     for _ in range(RENEWED):
         done = slsqp(search, search.best.z, iterations)
@@ -249,10 +285,14 @@ def _settled(search, outcomes, iterations):
 
 
 def _find_feasible(search, zs, margins, iterations):
-    """Where no search met the limits: least violations from the best so far and from the screened points that come nearest to them. True if
-    one of these searches for the least came to its end."""
+    """Where no search met the limits: least violations from the best so far and from the screened
+    points that come nearest to them. True if one of these searches for the least came to its end.
+    """
     shortfall = np.maximum(0.0, -margins / search.room).max(axis=1)
-    nearest = [zs[i] for i in np.argsort(np.where(np.isfinite(shortfall), shortfall, np.inf), kind="stable")[:2]]
+    nearest = [
+        zs[i]
+        for i in np.argsort(np.where(np.isfinite(shortfall), shortfall, np.inf), kind="stable")[:2]
+    ]
     ended = []
     for z in (search.best.z, *nearest):
         ended.append(restore(search, z, iterations))
@@ -265,7 +305,8 @@ def _find_feasible(search, zs, margins, iterations):
 def _check_precision():
     if jax.numpy.result_type(float) != np.float64:
         raise InputError(
-            "tune needs float64 (a limit held to 1e-3 cm is lost in float32): jax.config.update('jax_enable_x64', True)"
+            "tune needs float64 (a limit held to 1e-3 cm is lost in float32):"
+            " jax.config.update('jax_enable_x64', True)"
         )
 
 
@@ -273,7 +314,8 @@ def _check_objective(problem, before):
     for measure in problem.objective:
         if measure not in before or not np.all(np.isfinite(before[measure])):
             raise InputError(
-                f"objective {measure} is not a number at the starting values (it cannot be measured on this run), so it cannot be tuned"
+                f"objective {measure} is not a number at the starting values (it cannot be measured"
+                " on this run), so it cannot be tuned"
             )
 
 
@@ -289,10 +331,14 @@ def _method(method, problem, batch):
     if method not in OFFERED:
         raise InputError(f"method = {method!r}: must be one of auto, {', '.join(OFFERED)}")
     if method in FREELY and problem.limits:
-        raise InputError(f"method {method} cannot hold limits: use slsqp (or auto), or drop them with --limit none")
+        raise InputError(
+            f"method {method} cannot hold limits: use slsqp (or auto), or drop them with --limit"
+            " none"
+        )
     if method in FREELY and not problem.model:
         raise InputError(
-            f"method {method} needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)}) in the objective: use slsqp"
+            f"method {method} needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)})"
+            " in the objective: use slsqp"
         )
     return method
 
@@ -328,8 +374,10 @@ def _at_rest(search, iterations):
 
 
 def _status(outcomes, holds, search, polished, least=False, settled=True):
-    """Converged means: the search that gave the answer came to its end, or the last polish of it did, and nothing lower lies along a slope that
-    is left (`settled`). Infeasible: the search for the least violation (`least`) came to its end, and some was left."""
+    """Converged means: the search that gave the answer came to its end, or the last polish of it
+    did, and nothing lower lies along a slope that is left (`settled`). Infeasible: the search for
+    the least violation (`least`) came to its end, and some was left.
+    """
     if search.best is None:
         return "not_converged"
     if not holds:

@@ -19,7 +19,9 @@ MARK, SIZE = b', "digest": "', 16
 """What stands before the digest that closes a line, and the digest's length."""
 
 BROKEN = (ValueError, KeyError, TypeError, RecursionError)
-"""What reading a line of JSON raises that is not one of ours; the last where it is nested without end."""
+"""What reading a line of JSON raises that is not one of ours; the last where it is nested without
+end.
+"""
 
 
 def folder_of(checkpoint, **former):
@@ -37,14 +39,18 @@ def folder_of(checkpoint, **former):
 
 
 class Memo:
-    """Results by what was asked. A search asks in an order that its results alone decide, so one that is started again and finds its
-    earlier results here walks the same path, and goes on where the log ends."""
+    """Results by what was asked. A search asks in an order that its results alone decide, so one
+    that is started again and finds its earlier results here walks the same path, and goes on where
+    the log ends.
+    """
 
     def __init__(self):
         self.found = {}
 
     def recall(self, kind, asked, compute):
-        """compute(), or what it gave when the same was asked before. asked: list of arrays and plain values."""
+        """compute(), or what it gave when the same was asked before. asked: list of arrays and
+        plain values.
+        """
         key = _digest(kind, asked)
         if key not in self.found:
             self.found[key] = self.keep(kind, key, compute())
@@ -56,16 +62,21 @@ class Memo:
 
 
 class Log(Memo):
-    """A Memo that is also a file, a line per evaluation, numbers in hexadecimal so that not a bit is lost.
+    """A Memo that is also a file, a line per evaluation, numbers in hexadecimal so that not a bit
+    is lost.
 
-    The first line says what problem it belongs to, and every other one ends with a digest of itself and that problem: a line that was changed,
-    by hand or by a bad disk, or that comes from another log is refused. One that a kill cut short is dropped. Raises InputError for those,
-    for a log of another problem, and for what is no log.
+    The first line says what problem it belongs to, and every other one ends with a digest of itself
+    and that problem: a line that was changed, by hand or by a bad disk, or that comes from another
+    log is refused. One that a kill cut short is dropped. Raises InputError for those, for a log of
+    another problem, and for what is no log.
     """
 
     def __init__(self, folder, problem, resume=False):
         super().__init__()
-        self.path, head = Path(folder) / NAME, json.dumps({"jaxtank": 2, "problem": problem}, sort_keys=True)
+        self.path, head = (
+            Path(folder) / NAME,
+            json.dumps({"jaxtank": 2, "problem": problem}, sort_keys=True),
+        )
         self.head = head.encode()
         whole = self._read(head) if resume else b""
         with self._told():
@@ -80,16 +91,28 @@ class Log(Memo):
     def _read(self, head):
         try:
             if why := refusal(self.path, LARGEST):
-                raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} {why}, so it is no log of this program")
+                raise InputError(
+                    f"--resume: {NAME} in {str(self.path.parent)!r} {why}, so it is no log of this"
+                    " program"
+                )
             data = self.path.read_bytes()
         except FileNotFoundError:
             if untouched(self.path.parent):  # a kill came before the first line
                 return b""
             done = (self.path.parent / "result.json").exists()
-            why = "that run had ended, and its answer is in result.json" if done else f"there is no {NAME}"
-            raise InputError(f"--resume: {str(self.path.parent)!r} cannot be read as a search to go on with: {why}") from None
+            why = (
+                "that run had ended, and its answer is in result.json"
+                if done
+                else f"there is no {NAME}"
+            )
+            raise InputError(
+                f"--resume: {str(self.path.parent)!r} cannot be read as a search to go on with:"
+                f" {why}"
+            ) from None
         except OSError as error:
-            raise InputError(f"--resume: {NAME} in {str(self.path.parent)!r} cannot be read ({error.strerror})") from None
+            raise InputError(
+                f"--resume: {NAME} in {str(self.path.parent)!r} cannot be read ({error.strerror})"
+            ) from None
         lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)
         if not lines:
             return b""
@@ -100,7 +123,8 @@ class Log(Memo):
         if mine != theirs:
             other = [k for k in mine if not isinstance(theirs, dict) or mine[k] != theirs.get(k)]
             raise InputError(
-                f"--resume: the run in {str(self.path.parent)!r} was of another problem; what differs: {', '.join(other)}"
+                f"--resume: the run in {str(self.path.parent)!r} was of another problem; what"
+                f" differs: {', '.join(other)}"
             )
         for i, line in enumerate(lines[1:]):
             try:
@@ -111,12 +135,15 @@ class Log(Memo):
                 self.found[entry["key"]] = tuple(_read(v) for v in entry["result"])
             except BROKEN:
                 raise InputError(
-                    f"--resume: line {i + 2} of {NAME} is not one of its entries, or was changed: without that line it is evaluated again"
+                    f"--resume: line {i + 2} of {NAME} is not one of its entries, or was changed:"
+                    " without that line it is evaluated again"
                 ) from None
         return b"".join(lines)
 
     def keep(self, kind, key, result):
-        body = json.dumps({"kind": kind, "key": key, "result": [_write(v) for v in result]}).encode()[:-1]
+        body = json.dumps(
+            {"kind": kind, "key": key, "result": [_write(v) for v in result]}
+        ).encode()[:-1]
         with self._told(), open(self.path, "ab") as file:
             file.write(body + MARK + self._tail(body))
         return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
@@ -127,11 +154,15 @@ class Log(Memo):
 
     @contextlib.contextmanager
     def _told(self):
-        """A log that cannot be written is an InputError: what it holds so far is good to go on from."""
+        """A log that cannot be written is an InputError: what it holds so far is good to go on
+        from.
+        """
         try:
             yield
         except OSError as error:
-            raise InputError(f"{str(self.path)!r} cannot be written ({error.strerror}): make room, then --resume") from None
+            raise InputError(
+                f"{str(self.path)!r} cannot be written ({error.strerror}): make room, then --resume"
+            ) from None
 
     def memo(self):
         """A Memo of what the log holds, for what is asked later and need not be kept."""
@@ -175,5 +206,7 @@ def _read(entry):
         return {k: _read(v) for k, v in entry["of"].items()}
     if "all" in entry:
         return tuple(_read(v) for v in entry["all"])
-    array = np.array([float.fromhex(v) for v in entry["hex"]], dtype=np.float64).reshape([int(n) for n in entry["shape"]])
+    array = np.array([float.fromhex(v) for v in entry["hex"]], dtype=np.float64).reshape(
+        [int(n) for n in entry["shape"]]
+    )
     return float(array) if array.ndim == 0 else array

@@ -11,19 +11,24 @@ from jaxtank.core.files import LOCK, check_folder, sweep
 
 try:
     import fcntl
-except ImportError:  # no such locks on this system: two runs in one folder are then the user's own care
+# no such locks on this system: two runs in one folder are then the user's own care
+except ImportError:
     fcntl = None
 
 PATIENCE = 0.2
-"""How long a lock may be in the way before it is a refusal [s]: one that lets go removes its file in less."""
+"""How long a lock may be in the way before it is a refusal [s]: one that lets go removes its file
+in less.
+"""
 
 
 @contextlib.contextmanager
 def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
-    """Hold `folder`, made if need be, against other runs; shared=True: against all but those that share it.
+    """Hold `folder`, made if need be, against other runs; shared=True: against all but those that
+    share it.
 
-    The lock is the system's own (flock on a file with the process id in it): it ends with its process however that ends, so that what a
-    kill left behind is taken over, unfinished files (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
+    The lock is the system's own (flock on a file with the process id in it): it ends with its
+    process however that ends, so that what a kill left behind is taken over, unfinished files
+    (`jaxtank.core.files.sweep`) included. A folder that was made for this and got nothing is
     removed again. folder None: nothing is held. Raises InputError where another run holds it.
     """
     if folder is None or fcntl is None:
@@ -38,7 +43,8 @@ def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
         """What is done where a signal ends the process."""
         if file is not None and not shared:
             sweep(folder)
-        with contextlib.suppress(OSError):  # without one of ours, a file that was made and not yet locked
+        # without one of ours, a file that was made and not yet locked
+        with contextlib.suppress(OSError):
             _let_go(folder / LOCK, *opened or [os.open(folder / LOCK, os.O_RDWR | os.O_NOFOLLOW)])
         tidy()
 
@@ -62,9 +68,15 @@ def hold(folder, shared=False, leaving: Callable = contextlib.nullcontext):
 
 
 def _locked(folder, shared, opened):
-    """The open lock file of a folder, None where there are no locks; opened: list that holds what is open meanwhile."""
+    """The open lock file of a folder, None where there are no locks; opened: list that holds what
+    is open meanwhile.
+    """
     assert fcntl is not None  # `hold` comes no further without it
-    path, kind, until = folder / LOCK, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, time.monotonic() + PATIENCE
+    path, kind, until = (
+        folder / LOCK,
+        fcntl.LOCK_SH if shared else fcntl.LOCK_EX,
+        time.monotonic() + PATIENCE,
+    )
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         opened[:] = [file]
@@ -75,8 +87,9 @@ def _locked(folder, shared, opened):
             os.close(file)
             if time.monotonic() > until:
                 raise InputError(
-                    f"{str(folder)!r}: another run{f' (process {owner})' if owner.isdigit() else ''} writes there: wait for it, or give "
-                    "another folder"
+                    f"{str(folder)!r}: another"
+                    f" run{f' (process {owner})' if owner.isdigit() else ''} writes there: wait for"
+                    " it, or give another folder"
                 ) from None
             time.sleep(0.02)
             continue
@@ -85,8 +98,10 @@ def _locked(folder, shared, opened):
             path.unlink(missing_ok=True)
             return None
         with contextlib.suppress(OSError):
-            if os.fstat(file).st_ino == os.stat(path).st_ino:  # else: removed by its last owner before we had it
-                with contextlib.suppress(OSError):  # a full disk: the lock holds without a name on it
+            # else: removed by its last owner before we had it
+            if os.fstat(file).st_ino == os.stat(path).st_ino:
+                # a full disk: the lock holds without a name on it
+                with contextlib.suppress(OSError):
                     os.ftruncate(file, 0)
                     os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
                 return file

@@ -1,4 +1,6 @@
-"""How a parameter varies. Each distribution has one method, `quantile`, so that random, Latin hypercube and Sobol draws all work."""
+"""How a parameter varies. Each distribution has one method, `quantile`, so that random, Latin
+hypercube and Sobol draws all work.
+"""
 
 import dataclasses
 import math
@@ -13,8 +15,10 @@ from jaxtank.core.tree import check_value, describe, get_value, is_real, shorten
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Uniform:
-    """Uniform between low and high, in the parameter's unit; or, with relative, between (1 - relative) and (1 + relative) times the
-    parameter's own value. tied: one factor (or value) for all entries of an array."""
+    """Uniform between low and high, in the parameter's unit; or, with relative, between (1 -
+    relative) and (1 + relative) times the parameter's own value. tied: one factor (or value) for
+    all entries of an array.
+    """
 
     low: float | None = None
     high: float | None = None
@@ -22,7 +26,9 @@ class Uniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
+        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
+        (...).
+        """
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
         assert self.low is not None and self.high is not None  # `check`
@@ -32,14 +38,21 @@ class Uniform:
         """Raise InputError unless the range is one."""
         _one_kind(self, name, ("low", "high"), "relative")
         if self.relative is not None and not self.relative > 0:
-            raise InputError(f"{name}: uniform of relative width {self.relative:g} must be wider than 0")
+            raise InputError(
+                f"{name}: uniform of relative width {self.relative:g} must be wider than 0"
+            )
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise InputError(f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below its high one")
+            raise InputError(
+                f"{name}: uniform from {self.low:g} to {self.high:g} must have its low end below"
+                " its high one"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogUniform:
-    """Uniform in the logarithm: between low and high, or with factor between 1/factor and factor times the parameter's own value."""
+    """Uniform in the logarithm: between low and high, or with factor between 1/factor and factor
+    times the parameter's own value.
+    """
 
     low: float | None = None
     high: float | None = None
@@ -47,7 +60,9 @@ class LogUniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
+        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
+        (...).
+        """
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
         assert self.low is not None and self.high is not None  # `check`
@@ -60,14 +75,16 @@ class LogUniform:
             raise InputError(f"{name}: log-uniform factor = {self.factor:g} must be above 1")
         if self.low is not None and self.high is not None and not 0 < self.low < self.high:
             raise InputError(
-                f"{name}: log-uniform from {self.low:g} to {self.high:g} must lie above 0, its low end below its high one"
+                f"{name}: log-uniform from {self.low:g} to {self.high:g} must lie above 0, its low"
+                " end below its high one"
             )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Normal:
-    """Normal with standard deviation sd (or relative times the parameter's own value) about mean (its own value where None), cut off
-    at `cut` standard deviations to either side."""
+    """Normal with standard deviation sd (or relative times the parameter's own value) about mean
+    (its own value where None), cut off at `cut` standard deviations to either side.
+    """
 
     mean: float | None = None
     sd: float | None = None
@@ -76,7 +93,9 @@ class Normal:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal` (...)."""
+        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
+        (...).
+        """
         tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
@@ -88,7 +107,10 @@ class Normal:
         width = self.sd if self.relative is None else self.relative
         assert width is not None  # `_one_kind`
         if not (width > 0 and self.cut > 0):
-            raise InputError(f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both must be above 0")
+            raise InputError(
+                f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both"
+                " must be above 0"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,7 +123,11 @@ class Discrete:
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Values (draws, ...) at probabilities p (draws, ...)."""
-        weights = np.ones(len(self.values)) if self.weights is None else np.asarray(self.weights, dtype=float)
+        weights = (
+            np.ones(len(self.values))
+            if self.weights is None
+            else np.asarray(self.weights, dtype=float)
+        )
         edges = np.cumsum(weights / weights.sum())[:-1]
         return np.asarray(self.values, dtype=float)[np.searchsorted(edges, p, side="right")]
 
@@ -110,15 +136,20 @@ class Discrete:
         good = len(self.values) > 0 and all(math.isfinite(v) for v in self.values)
         weights = self.weights or (1.0,) * len(self.values)
         if not good or len(weights) != len(self.values) or min(weights) < 0 or not sum(weights) > 0:
-            raise InputError(f"{name}: a discrete distribution needs finite values and a weight of at least 0 for each")
+            raise InputError(
+                f"{name}: a discrete distribution needs finite values and a weight of at least 0"
+                " for each"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Correlated:
-    """Several scalars that vary together: normal with a covariance, as an identification gives it, or by its Cholesky factor.
+    """Several scalars that vary together: normal with a covariance, as an identification gives it,
+    or by its Cholesky factor.
 
-    names: (n,) dotted names of scalars or entries; covariance: (n, n) in their units; cut: as in Normal, of each independent part. What would
-    leave the range that a parameter allows is held at its end. Its key in a dict of distributions is free to choose.
+    names: (n,) dotted names of scalars or entries; covariance: (n, n) in their units; cut: as in
+    Normal, of each independent part. What would leave the range that a parameter allows is held at
+    its end. Its key in a dict of distributions is free to choose.
     """
 
     names: tuple
@@ -131,7 +162,9 @@ class Correlated:
         return np.linalg.cholesky(np.asarray(self.covariance, dtype=float))
 
     def check(self, name: str) -> None:
-        """Raise InputError unless the covariance is symmetric and positive definite, one row for each name."""
+        """Raise InputError unless the covariance is symmetric and positive definite, one row for
+        each name.
+        """
         try:
             matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)
         except (TypeError, ValueError):
@@ -161,11 +194,13 @@ KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discre
 
 
 def stated(distributions):
-    """{name: distribution} of what a study was given: a bare number is a share, uniform to either side, as a case's `uncertain` has it.
-    Raises InputError for what is neither."""
+    """{name: distribution} of what a study was given: a bare number is a share, uniform to either
+    side, as a case's `uncertain` has it. Raises InputError for what is neither.
+    """
     if not isinstance(distributions, Mapping):
         raise InputError(
-            f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as tuning.Normal(relative=0.05)"
+            f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as"
+            " tuning.Normal(relative=0.05)"
         )
     found = {}
     for name, given in distributions.items():
@@ -173,18 +208,21 @@ def stated(distributions):
             given = Uniform(relative=float(given))
         if not isinstance(given, (*KINDS.values(), Correlated)):
             raise InputError(
-                f"uncertain {name} = {shortened(given)}: must be a distribution, as tuning.Normal(relative=0.05), or a share between 0 and 1"
+                f"uncertain {name} = {shortened(given)}: must be a distribution, as"
+                " tuning.Normal(relative=0.05), or a share between 0 and 1"
             )
         found[name] = given
     return found
 
 
 class Draws:
-    """The distributions of a case as a map from the unit cube: `dimensions` probabilities in, {name: (draws, ...)} out.
+    """The distributions of a case as a map from the unit cube: `dimensions` probabilities in,
+    {name: (draws, ...)} out.
 
-    distributions: {dotted name: distribution} (an array's entries vary each on its own, unless tied; zeros of a relative spread stay
-    zero and take no dimension). Raises InputError for an unknown name, one given twice, and a distribution that can leave the range that
-    its parameter allows.
+    distributions: {dotted name: distribution} (an array's entries vary each on its own, unless
+    tied; zeros of a relative spread stay zero and take no dimension). Raises InputError for an
+    unknown name, one given twice, and a distribution that can leave the range that its parameter
+    allows.
     """
 
     def __init__(self, loop, distributions):
@@ -197,10 +235,17 @@ class Draws:
             correlated = isinstance(distribution, Correlated)
             for one in map(_spelled, distribution.names if correlated else (name,)):
                 base = split_index(one)[0]
-                if one in taken or base in taken or (not split_index(one)[1] and any(split_index(t)[0] == base for t in taken)):
+                if (
+                    one in taken
+                    or base in taken
+                    or (not split_index(one)[1] and any(split_index(t)[0] == base for t in taken))
+                ):
                     raise InputError(f"uncertain {one} is given twice")
                 if describe(loop, one)["kind"] == "static":
-                    raise InputError(f"uncertain {one}: is part of the compiled program and cannot vary from draw to draw")
+                    raise InputError(
+                        f"uncertain {one}: is part of the compiled program and cannot vary from"
+                        " draw to draw"
+                    )
                 taken.append(one)
             if correlated:
                 nominal = np.array([float(get_value(loop, one)) for one in distribution.names])
@@ -213,17 +258,24 @@ class Draws:
                 labels = [name] if whole else [f"{name}[{','.join(map(str, i))}]" for i in where]
             if correlated:
                 self.ends[name] = [_ends(describe(loop, one)) for one in distribution.names]
-            self.parts.append((name, distribution, nominal, slice(self.dimensions, self.dimensions + count)))
+            self.parts.append(
+                (name, distribution, nominal, slice(self.dimensions, self.dimensions + count))
+            )
             self.dimensions += count
             self.labels += labels
-        together = {one for d in distributions.values() if isinstance(d, Correlated) for one in d.names}  # held within their ranges
+        # held within their ranges
+        together = {
+            one for d in distributions.values() if isinstance(d, Correlated) for one in d.names
+        }
         for corner in (np.zeros, np.ones):
             for name, value in self.values(corner((1, self.dimensions))).items():
                 if name not in together:
                     check_value(f"uncertain {name}", value[0], describe(loop, name))
         for name, d in distributions.items():
             if isinstance(d, Discrete):
-                check_value(f"uncertain {name}", np.asarray(d.values, dtype=float), describe(loop, name))
+                check_value(
+                    f"uncertain {name}", np.asarray(d.values, dtype=float), describe(loop, name)
+                )
 
     def values(self, p):
         """{name: (draws, ...)} at probabilities p (draws, dimensions)."""
@@ -233,9 +285,18 @@ class Draws:
             if isinstance(distribution, Correlated):
                 tail = scipy.special.ndtr(-distribution.cut)
                 mean = nominal if distribution.mean is None else np.asarray(distribution.mean)
-                drawn = mean + scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * mine) @ distribution.factor().T
+                drawn = (
+                    mean
+                    + scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * mine)
+                    @ distribution.factor().T
+                )
                 ends = self.ends[name]
-                found.update({one: np.clip(drawn[:, i], *ends[i]) for i, one in enumerate(distribution.names)})
+                found.update(
+                    {
+                        one: np.clip(drawn[:, i], *ends[i])
+                        for i, one in enumerate(distribution.names)
+                    }
+                )
                 continue
             if nominal.ndim == 0 or distribution.tied:
                 shaped = mine.reshape(-1, *([1] * nominal.ndim)) + np.zeros(nominal.shape)
@@ -260,13 +321,18 @@ def _ends(meta):
 
 def _moves(distribution, nominal):
     """Which entries a distribution moves: a relative spread leaves zeros alone."""
-    relative = getattr(distribution, "relative", None) is not None or getattr(distribution, "factor", None) is not None
+    relative = (
+        getattr(distribution, "relative", None) is not None
+        or getattr(distribution, "factor", None) is not None
+    )
     return nominal != 0 if relative else np.ones(nominal.shape, dtype=bool)
 
 
 def parse(name, text):
-    """The distribution of a command line: "uniform:LOW:HIGH", "uniform:5%", "loguniform:LOW:HIGH", "loguniform:FACTOR", "normal:5%",
-    "normal:MEAN:SD", "discrete:V1:V2:..."; "tied" at the end gives all entries of an array one draw."""
+    """The distribution of a command line: "uniform:LOW:HIGH", "uniform:5%", "loguniform:LOW:HIGH",
+    "loguniform:FACTOR", "normal:5%", "normal:MEAN:SD", "discrete:V1:V2:..."; "tied" at the end
+    gives all entries of an array one draw.
+    """
     kind, *parts = [p.strip() for p in text.split(":")]
     tied = bool(parts) and parts[-1] == "tied"
     parts = parts[:-1] if tied else parts
@@ -287,8 +353,9 @@ def parse(name, text):
         found = Discrete(values=tuple(numbers), tied=tied)
     else:
         raise InputError(
-            f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH, loguniform:FACTOR, normal:5%, normal:MEAN:SD "
-            "or discrete:V1:V2, with :tied for one draw of a whole array"
+            f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH,"
+            " loguniform:FACTOR, normal:5%, normal:MEAN:SD or discrete:V1:V2, with :tied for one"
+            " draw of a whole array"
         )
     found.check(name)
     return found

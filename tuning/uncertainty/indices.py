@@ -1,8 +1,9 @@
 """Sensitivity of any function on the unit cube: designs and estimators, plain arrays in and out.
 
-Elementary effects: Morris, Technometrics 33(2) 1991, 161; their absolute mean: Campolongo, Cariboni and Saltelli, Environ. Model. Softw.
-22(10) 2007, 1509. Shares of the variance: Saltelli et al., Comput. Phys. Commun. 181(2) 2010, 259, first order by its table 2 (b), total
-order by Jansen's estimator, its table 2 (f).
+Elementary effects: Morris, Technometrics 33(2) 1991, 161; their absolute mean: Campolongo, Cariboni
+and Saltelli, Environ. Model. Softw. 22(10) 2007, 1509. Shares of the variance: Saltelli et al.,
+Comput. Phys. Commun. 181(2) 2010, 259, first order by its table 2 (b), total order by Jansen's
+estimator, its table 2 (f).
 """
 
 import numpy as np
@@ -18,15 +19,21 @@ BLOCK = 1 << 22
 """Bootstrap weights held at once."""
 
 FLAT = 1e-10
-"""Spread of an output, as a share of its size, that is rounding rather than an answer to the parameters [-]."""
+"""Spread of an output, as a share of its size, that is rounding rather than an answer to the
+parameters [-].
+"""
 
 
 def sobol_points(dimensions, samples, seed):
-    """(samples, D + 2, D) points for `sobol_indices`: in each row A, then A with one column of B for each of the D columns, then B.
+    """(samples, D + 2, D) points for `sobol_indices`: in each row A, then A with one column of B
+    for each of the D columns, then B.
 
-    A and B are the two halves of a scrambled Sobol sequence in 2 D dimensions; samples is best a power of 2.
+    A and B are the two halves of a scrambled Sobol sequence in 2 D dimensions; samples is best a
+    power of 2.
     """
-    base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(samples)
+    base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
+        samples
+    )
     a, b = base[:, :dimensions], base[:, dimensions:]
     points = np.repeat(a[:, None], dimensions + 2, axis=1)
     points[:, -1] = b
@@ -36,27 +43,37 @@ def sobol_points(dimensions, samples, seed):
 
 
 def sobol_indices(y, seed=0):
-    """Shares of the variance of y (samples, D + 2), the outputs at `sobol_points`, that each input has: alone and in all.
+    """Shares of the variance of y (samples, D + 2), the outputs at `sobol_points`, that each input
+    has: alone and in all.
 
-    S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance over A and B. A row with an output that
-    is not finite is left out whole, so that what remains stays paired. Returns {"first", "total": (D,), "first_interval95",
-    "total_interval95": (D, 2), "kept": rows used, "sd": standard deviation of y}; shares are NaN where y does not vary or fewer than 2
-    rows remain. The intervals are quantiles of a bootstrap over rows; for Sobol points, more even than random ones, they are on the wide
-    side.
+    S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
+    over A and B. A row with an output that is not finite is left out whole, so that what remains
+    stays paired. Returns {"first", "total": (D,), "first_interval95",
+    "total_interval95": (D, 2), "kept": rows used, "sd": standard deviation of y}; shares are NaN
+    where y does not vary or fewer than 2 rows remain. The intervals are quantiles of a bootstrap
+    over rows; for Sobol points, more even than random ones, they are on the wide side.
     """
     y = np.asarray(y, dtype=float)
     dimensions = y.shape[1] - 2
     kept = y[np.isfinite(y).all(axis=1)]
     unknown = np.full(dimensions, np.nan)
     ends = np.full((dimensions, 2), np.nan)
-    nothing = {"first": unknown, "total": unknown, "first_interval95": ends, "total_interval95": ends, "kept": len(kept)}
+    nothing = {
+        "first": unknown,
+        "total": unknown,
+        "first_interval95": ends,
+        "total_interval95": ends,
+        "kept": len(kept),
+    }
     if len(kept) < 2:
         return {**nothing, "sd": np.nan}
     size = np.abs(kept).max() or 1.0
     kept = kept / size  # what is squared must not overflow
     kept = kept - kept.mean()  # an output far from 0 would spoil the first-order products
     a, mixed, b = kept[:, :1], kept[:, 1:-1], kept[:, -1:]
-    terms = np.hstack([b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)])
+    terms = np.hstack(
+        [b * (mixed - a), 0.5 * (a - mixed) ** 2, 0.5 * (a + b), 0.5 * (a * a + b * b)]
+    )
 
     def shares(means):
         variance = means[..., -1:] - means[..., -2:-1] ** 2
@@ -89,19 +106,26 @@ def bootstrap_means(terms, seed, resamples=RESAMPLES):
 
 
 def morris_points(dimensions, trajectories, seed, levels=LEVELS):
-    """(trajectories, D + 1, D) points for `morris_effects`: from a random point of the grid, each coordinate in a random order steps once
-    by levels / (2 (levels - 1)), to the side that stays inside. levels is even."""
+    """(trajectories, D + 1, D) points for `morris_effects`: from a random point of the grid, each
+    coordinate in a random order steps once by levels / (2 (levels - 1)), to the side that stays
+    inside. levels is even.
+    """
     rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
     base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
     moved = np.clip(np.where(base < 0.5, base + step, base - step), 0.0, 1.0)
-    turn = rng.permuted(np.tile(np.arange(dimensions), (trajectories, 1)), axis=1)  # when each coordinate moves
-    return np.where(np.arange(dimensions + 1)[:, None] > turn[:, None, :], moved[:, None, :], base[:, None, :])
+    # when each coordinate moves
+    turn = rng.permuted(np.tile(np.arange(dimensions), (trajectories, 1)), axis=1)
+    return np.where(
+        np.arange(dimensions + 1)[:, None] > turn[:, None, :], moved[:, None, :], base[:, None, :]
+    )
 
 
-@np.errstate(over="ignore", invalid="ignore")  # outputs near the largest number come out as not finite
+# outputs near the largest number come out as not finite
+@np.errstate(over="ignore", invalid="ignore")
 def morris_effects(points, y):
-    """(trajectories, D) elementary effects of outputs y (trajectories, D + 1) at `morris_points`: change of y over the step, per unit of
-    the cube; NaN where an end of the step is not finite."""
+    """(trajectories, D) elementary effects of outputs y (trajectories, D + 1) at `morris_points`:
+    change of y over the step, per unit of the cube; NaN where an end of the step is not finite.
+    """
     y = np.where(np.isfinite(y), y, np.nan)
     change = np.diff(points, axis=1)
     mover = np.abs(change).argmax(axis=2)
@@ -111,13 +135,16 @@ def morris_effects(points, y):
     return effects
 
 
-@np.errstate(over="ignore", invalid="ignore")  # outputs near the largest number come out as not finite
+# outputs near the largest number come out as not finite
+@np.errstate(over="ignore", invalid="ignore")
 def morris_indices(effects):
-    """Mean, mean size and standard deviation of the elementary effects (trajectories, D) of each input.
+    """Mean, mean size and standard deviation of the elementary effects (trajectories, D) of each
+    input.
 
-    Returns {"mu", "mu_star", "sigma": (D,), "mu_interval95", "mu_star_interval95": (D, 2), "kept": (D,) effects used}: mu near mu_star in
-    size says that the effect has one sign, sigma near mu_star that it depends on the other inputs or is curved. Effects that are not
-    finite are left out; the intervals are Student's, trajectories being independent; NaN below 2 effects.
+    Returns {"mu", "mu_star", "sigma": (D,), "mu_interval95", "mu_star_interval95": (D, 2), "kept":
+    (D,) effects used}: mu near mu_star in size says that the effect has one sign, sigma near
+    mu_star that it depends on the other inputs or is curved. Effects that are not finite are left
+    out; the intervals are Student's, trajectories being independent; NaN below 2 effects.
     """
     dimensions = effects.shape[1]
     found = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
@@ -131,6 +158,9 @@ def morris_indices(effects):
         found["sigma"][j] = mine.std(ddof=1)
         for name, values in (("mu", mine), ("mu_star", np.abs(mine))):
             found[name][j] = mean = values.mean()
-            found[f"{name}_interval95"][j] = mean - half * values.std(ddof=1), mean + half * values.std(ddof=1)
+            found[f"{name}_interval95"][j] = (
+                mean - half * values.std(ddof=1),
+                mean + half * values.std(ddof=1),
+            )
     found["mu_star_interval95"] = np.maximum(found["mu_star_interval95"], 0.0)
     return found

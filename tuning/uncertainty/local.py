@@ -18,7 +18,9 @@ NORMAL_WIDTH = 2.0
 
 
 class Column(NamedTuple):
-    """One entry of one measure and what it feels: `felt` is {quantity: (D,) or (D, 2)} in the order of the parameters."""
+    """One entry of one measure and what it feels: `felt` is {quantity: (D,) or (D, 2)} in the order
+    of the parameters.
+    """
 
     measure: str
     label: str
@@ -36,32 +38,47 @@ def entries_of(case, names):
     for m in names:
         per = ms.MEASURES[m].per
         for i in range(ms.entries(m, case.loop.plant)):
-            found.append((m, m if per == "run" else f"{m} of {per} {i + 1}", ms.unit(m, case.loop.units)))
+            found.append(
+                (m, m if per == "run" else f"{m} of {per} {i + 1}", ms.unit(m, case.loop.units))
+            )
     return found
 
 
 def local_columns(case, draws, names, key, progress=None):
-    """(Columns by derivatives at the case's own values, {parameter: half-width}): forward mode, at most CHUNK numbers at once.
+    """(Columns by derivatives at the case's own values, {parameter: half-width}): forward mode, at
+    most CHUNK numbers at once.
 
-    felt: "effect", derivative times half-width; "derivative", NaN where entries are tied; "elasticity", percent of the measure for each
-    percent of the parameter. A parameter whose entries are tied moves all of them by their own half-widths. Raises NonFiniteError.
+    felt: "effect", derivative times half-width; "derivative", NaN where entries are tied;
+    "elasticity", percent of the measure for each percent of the parameter. A parameter whose
+    entries are tied moves all of them by their own half-widths. Raises NonFiniteError.
     """
     widths = half_widths(draws)
     scalars = list(dict.fromkeys(name for width in widths for name in width))
     slopes = []
     for start in range(0, len(scalars), CHUNK):
-        values = {name: float(get_value(case.loop, name)) for name in scalars[start : start + CHUNK]}
+        values = {
+            name: float(get_value(case.loop, name)) for name in scalars[start : start + CHUNK]
+        }
         measures, rates, _, broken = lp.sensitivities(case.loop, case.clock, names, values, key)
         if broken:
-            raise NonFiniteError(f"{case.name}: a level stops being finite at the case's own values, so there are no derivatives")
-        slopes.append(np.concatenate([np.asarray(rates[m]).reshape(-1, len(values)) for m in names]))
+            raise NonFiniteError(
+                f"{case.name}: a level stops being finite at the case's own values, so there are no"
+                " derivatives"
+            )
+        slopes.append(
+            np.concatenate([np.asarray(rates[m]).reshape(-1, len(values)) for m in names])
+        )
         if progress is not None:
             progress(min(start + CHUNK, len(scalars)), len(scalars))
     nominal = np.concatenate([np.ravel(measures[m]) for m in names])
     slopes, where = np.concatenate(slopes, axis=1), {name: i for i, name in enumerate(scalars)}
-    effects = np.stack([sum(slopes[:, where[n]] * w for n, w in width.items()) for width in widths], axis=1)
+    effects = np.stack(
+        [sum(slopes[:, where[n]] * w for n, w in width.items()) for width in widths], axis=1
+    )
     alone = [next(iter(width)) if len(width) == 1 else None for width in widths]
-    derivatives = np.stack([slopes[:, where[n]] if n else np.full(len(nominal), np.nan) for n in alone], axis=1)
+    derivatives = np.stack(
+        [slopes[:, where[n]] if n else np.full(len(nominal), np.nan) for n in alone], axis=1
+    )
     own = np.array([float(get_value(case.loop, n)) if n else np.nan for n in alone])
     elasticities = derivatives * own / np.where(nominal == 0, np.nan, nominal)[:, None]
     columns = []
@@ -69,32 +86,57 @@ def local_columns(case, draws, names, key, progress=None):
         felt = {"effect": effects[k], "derivative": derivatives[k], "elasticity": elasticities[k]}
         good = np.isfinite(effects[k]).all()
         columns.append(
-            Column(measure, label, unit, float(nominal[k]), int(not good), felt, "" if good else "its slope is not finite")
+            Column(
+                measure,
+                label,
+                unit,
+                float(nominal[k]),
+                int(not good),
+                felt,
+                "" if good else "its slope is not finite",
+            )
         )
-    half = [next(iter(width.values())) if len(width) == 1 else list(width.values()) for width in widths]
+    half = [
+        next(iter(width.values())) if len(width) == 1 else list(width.values()) for width in widths
+    ]
     return columns, dict(zip(draws.labels, half))
 
 
 def half_widths(draws):
-    """For each dimension {name of a scalar that it moves: by how much}: half the range of the distribution, or NORMAL_WIDTH standard
-    deviations of a normal one (of each by itself, where several are correlated)."""
+    """For each dimension {name of a scalar that it moves: by how much}: half the range of the
+    distribution, or NORMAL_WIDTH standard deviations of a normal one (of each by itself, where
+    several are correlated).
+    """
     found = []
     for name, d, nominal, _ in draws.parts:
         if isinstance(d, Correlated):
-            found += [{one: NORMAL_WIDTH * float(np.sqrt(d.covariance[i][i]))} for i, one in enumerate(d.names)]
+            found += [
+                {one: NORMAL_WIDTH * float(np.sqrt(d.covariance[i][i]))}
+                for i, one in enumerate(d.names)
+            ]
             continue
         width = _half_width(d, nominal) + np.zeros(nominal.shape)
         if nominal.ndim == 0:
             found.append({name: abs(float(width))})
             continue
-        entries = {f"{name}[{','.join(map(str, i))}]": float(width[i]) for i in np.ndindex(nominal.shape)}
-        found += [entries] if d.tied else [{one: abs(w)} for one, w in entries.items() if one in draws.labels]
+        entries = {
+            f"{name}[{','.join(map(str, i))}]": float(width[i]) for i in np.ndindex(nominal.shape)
+        }
+        found += (
+            [entries]
+            if d.tied
+            else [{one: abs(w)} for one, w in entries.items() if one in draws.labels]
+        )
     return found
 
 
 def _half_width(d, nominal):
     if isinstance(d, Normal):
-        return min(NORMAL_WIDTH, d.cut) * (cast(float, d.sd) if d.relative is None else d.relative * np.abs(nominal))
+        return min(NORMAL_WIDTH, d.cut) * (
+            cast(float, d.sd) if d.relative is None else d.relative * np.abs(nominal)
+        )
     if isinstance(d, Discrete):
         return 0.5 * (max(d.values) - min(d.values))
-    return 0.5 * (d.quantile(np.ones(nominal.shape), nominal) - d.quantile(np.zeros(nominal.shape), nominal))
+    return 0.5 * (
+        d.quantile(np.ones(nominal.shape), nominal) - d.quantile(np.zeros(nominal.shape), nominal)
+    )

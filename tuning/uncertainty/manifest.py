@@ -1,4 +1,6 @@
-"""What the shards of an ensemble are of, as JSON in their manifest: enough to join them without saying it again."""
+"""What the shards of an ensemble are of, as JSON in their manifest: enough to join them without
+saying it again.
+"""
 
 import dataclasses
 from typing import Any, cast
@@ -11,22 +13,42 @@ from tuning.storage import batch_store
 from tuning.uncertainty import distributions as ds
 
 KINDS = {c.__name__: c for c in (ds.Uniform, ds.LogUniform, ds.Normal, ds.Discrete, ds.Correlated)}
-WORDS = {"samples": int, "key": int, "lanes": int, "draws": str, "measures": list, "distributions": dict}
+WORDS = {
+    "samples": int,
+    "key": int,
+    "lanes": int,
+    "draws": str,
+    "measures": list,
+    "distributions": dict,
+}
 
 
 def told(case, limits):
-    """What the manifest says of a case and its limits: {"rig": text of a rig file, or None where no file describes it, "limits": dict}."""
+    """What the manifest says of a case and its limits: {"rig": text of a rig file, or None where no
+    file describes it, "limits": dict}.
+    """
     try:
         text = rig.dump(case)
     except InputError:
         text = None
-    return {"rig": text, "limits": {m: v if isinstance(v, str) else np.asarray(v).tolist() for m, v in limits.items()}}
+    return {
+        "rig": text,
+        "limits": {
+            m: v if isinstance(v, str) else np.asarray(v).tolist() for m, v in limits.items()
+        },
+    }
 
 
 def to_json(distributions):
     """{name: {"kind", fields}} of {name: distribution}."""
     return {
-        n: {"kind": type(d).__name__, **{k: np.asarray(v).tolist() if np.ndim(v) else v for k, v in dataclasses.asdict(d).items()}}
+        n: {
+            "kind": type(d).__name__,
+            **{
+                k: np.asarray(v).tolist() if np.ndim(v) else v
+                for k, v in dataclasses.asdict(d).items()
+            },
+        }
         for n, d in distributions.items()
     }
 
@@ -51,20 +73,25 @@ def _tuples(value) -> Any:
 
 
 def restore(folder):
-    """(Case, options of `ensemble`) of the shards in a folder. Raises InputError where the manifest does not say them.
+    """(Case, options of `ensemble`) of the shards in a folder. Raises InputError where the manifest
+    does not say them.
 
-    Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit for bit, that of the shards
-    (`ensemble` compares their digests).
+    Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit
+    for bit, that of the shards (`ensemble` compares their digests).
     """
     manifest = batch_store.read_manifest(folder)
     bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
     asked = manifest.get("told")
     if bad or not isinstance(asked, dict) or not isinstance(asked.get("limits"), dict):
         raise InputError(
-            f"{str(folder)!r}: the manifest does not say what its shards are of; give the case and the options as theirs"
+            f"{str(folder)!r}: the manifest does not say what its shards are of; give the case and"
+            " the options as theirs"
         )
     if not isinstance(asked.get("rig"), str):
-        raise InputError(f"{str(folder)!r}: no rig file describes the case of these shards; merge them from Python")
+        raise InputError(
+            f"{str(folder)!r}: no rig file describes the case of these shards; merge them from"
+            " Python"
+        )
     case = rig.loads(asked["rig"], f"manifest of {str(folder)!r}")
     options = {n: manifest[n] for n in ("samples", "key", "lanes", "draws")}
     named = all(isinstance(m, str) for m in manifest["measures"])

@@ -1,4 +1,6 @@
-"""The same loop over many draws of what is uncertain: fixed-size batches, running measures only, on one device or many."""
+"""The same loop over many draws of what is uncertain: fixed-size batches, running measures only, on
+one device or many.
+"""
 
 import dataclasses
 import functools
@@ -48,9 +50,10 @@ FAN_DRAWS, FAN_ROWS = 512, 240
 class Ensemble:
     """What `ensemble` gives: N draws and what each came to.
 
-    values: {name: (N, ...)} drawn parameters; measures: {name: (N, ...)}; failed: (N,) True where the run left the numbers; infeasible: (N,)
-    True where some plateau of the reference has no steady state below the rims and within the pumps' limits, None where that is not
-    known in closed form; fan: {"t", "r", "x", "u": quantiles (5, rows, ...)} of the first draws, or None.
+    values: {name: (N, ...)} drawn parameters; measures: {name: (N, ...)}; failed: (N,) True where
+    the run left the numbers; infeasible: (N,) True where some plateau of the reference has no
+    steady state below the rims and within the pumps' limits, None where that is not known in closed
+    form; fan: {"t", "r", "x", "u": quantiles (5, rows, ...)} of the first draws, or None.
     """
 
     case: Any
@@ -72,24 +75,34 @@ class Ensemble:
         return len(self.failed)
 
     def summary(self) -> dict[str, Any]:
-        """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose run is finite; one entry per output, tank
-        or pump where the measure has several. cvar95 is of the worse side: the lower one for a level's minimum. sd and the mean's
-        interval, which is cut at what the measure cannot pass, are None for a single draw."""
+        """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose
+        run is finite; one entry per output, tank or pump where the measure has several. cvar95 is
+        of the worse side: the lower one for a level's minimum. sd and the mean's interval, which is
+        cut at what the measure cannot pass, are None for a single draw.
+        """
         found = {}
         for name, values in self.measures.items():
             kept = values[~self.failed]
             sign = ms.MEASURES[name].sense
             if not len(kept):
-                found[name] = {k: None for k in ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")}
+                found[name] = {
+                    k: None
+                    for k in ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")
+                }
                 continue
             with np.errstate(invalid="ignore"):
                 worst = sign * np.sort(sign * kept, axis=0)[-max(1, math.ceil(TAIL * len(kept))) :]
-                mean, sd = kept.mean(axis=0), kept.std(axis=0, ddof=1) if len(kept) > 1 else np.zeros(kept.shape[1:])
+                mean, sd = (
+                    kept.mean(axis=0),
+                    (kept.std(axis=0, ddof=1) if len(kept) > 1 else np.zeros(kept.shape[1:])),
+                )
                 p05, p50, p95 = np.quantile(kept, (0.05, 0.5, 0.95), axis=0, method="inverted_cdf")
                 half = 1.959964 * sd / math.sqrt(len(kept))
                 found[name] = {
                     "mean": mean,
-                    "mean_interval95": [_within(name, kept, end) for end in (mean - half, mean + half)],
+                    "mean_interval95": [
+                        _within(name, kept, end) for end in (mean - half, mean + half)
+                    ],
                     "sd": sd,
                     "p05": p05,
                     "p50": p50,
@@ -102,8 +115,9 @@ class Ensemble:
         return found
 
     def violations(self) -> list[dict[str, Any]]:
-        """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run that failed counts as breaking it. The
-        intervals are those of Clopper and Pearson."""
+        """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run
+        that failed counts as breaking it. The intervals are those of Clopper and Pearson.
+        """
         rows = []
         for limit in self.limits:
             values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
@@ -133,7 +147,9 @@ class Ensemble:
         return figures(self)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, draws.csv, the pictures and report.html, which says the line `command`, to a folder."""
+        """Write result.json, draws.csv, the pictures and report.html, which says the line
+        `command`, to a folder.
+        """
         from tuning.report.uncertainty import save
 
         return save(self, folder, command)
@@ -145,7 +161,9 @@ class Ensemble:
 
 
 def _within(name, values, end):
-    """`end` of an interval of measure `name`, moved to what the measure cannot pass (a share 0 and 1, say); values: (N, ...) that it had."""
+    """`end` of an interval of measure `name`, moved to what the measure cannot pass (a share 0 and
+    1, say); values: (N, ...) that it had.
+    """
     low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
     end = (
         end if low is None else np.maximum(end, np.minimum(low, values.min(axis=0)))
@@ -174,26 +192,41 @@ def ensemble(
 ) -> Ensemble | None:
     """Run a case on `samples` draws of what is uncertain.
 
-    distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's own where None; key: seed of draws
-    and sensor noise (draw i has the noise of fold_in(key, i), whatever the layout); draws: "random", "latin" or "sobol"; measures:
-    names, those of a summary where None; limits as in `tune`; fan: keep quantiles of the first
-    draws' levels; lanes: draws in a batch;
-    devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into `folder` (`merge` joins them);
-    checkpoint (or folder): where finished batches are kept, with which resume=True goes on; merge: run nothing, only join what lies there, and
-    refuse an incomplete set; progress: called with the number of draws done. Under `jax.distributed` every process runs its share
-    of the batches and all get the whole. Numbers of a draw do not depend on any of it. Returns an Ensemble (None for a shard).
-    Raises InputError before anything is run.
+    distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's
+    own where None; key: seed of draws and sensor noise (draw i has the noise of fold_in(key, i),
+    whatever the layout); draws: "random", "latin" or "sobol"; measures: names, those of a summary
+    where None; limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in
+    a batch;
+    devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into
+    `folder` (`merge` joins them); checkpoint (or folder): where finished batches are kept, with
+    which resume=True goes on; merge: run nothing, only join what lies there, and refuse an
+    incomplete set; progress: called with the number of draws done. Under `jax.distributed` every
+    process runs its share of the batches and all get the whole. Numbers of a draw do not depend on
+    any of it. Returns an Ensemble (None for a shard). Raises InputError before anything is run.
     """
     began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
-    if shard is not None and not (isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]):
+    if shard is not None and not (
+        isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]
+    ):
         raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
     for name, value in (("samples", samples), ("key", key)):
-        if isinstance(value, bool) or not isinstance(value, int) or not (0 if name == "key" else 1) <= value <= 2**31 - 1:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to {2**31 - 1}")
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int)
+            or not (0 if name == "key" else 1) <= value <= 2**31 - 1
+        ):
+            raise InputError(
+                f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to"
+                f" {2**31 - 1}"
+            )
     distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
     held = resolve_limits(case, limits)
-    wanted = tuple(m for m in ms.placed("summary") if ms.serves(m, case.loop)) if measures is None else tuple(measures)
+    wanted = (
+        tuple(m for m in ms.placed("summary") if ms.serves(m, case.loop))
+        if measures is None
+        else tuple(measures)
+    )
     ms.check_names(wanted)
     wanted = tuple(dict.fromkeys([*wanted, *(limit.measure for limit in held)]))
     random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
@@ -206,13 +239,20 @@ def ensemble(
     if folder is not None:
         manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
         manifest["told"] = shards.told(case, case.limits if limits is None else limits)
-        store = batch_store.Store(folder, manifest, resume, shared=shard is not None or jax.process_count() > 1, anew=not merge)
+        store = batch_store.Store(
+            folder,
+            manifest,
+            resume,
+            shared=shard is not None or jax.process_count() > 1,
+            anew=not merge,
+        )
     mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
     mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
     todo = [k for k in mine if store is None or not store.has(k)]
     if merge and todo:
         raise InputError(
-            f"merge: {len(todo)} of {count} batches are missing in {str(folder)!r}, the first of them number {todo[0]}"
+            f"merge: {len(todo)} of {count} batches are missing in {str(folder)!r}, the first of"
+            f" them number {todo[0]}"
         )
     run = _Runner(case, wanted, key if random else None, devices)
     batches = {}
@@ -227,13 +267,19 @@ def ensemble(
             progress(min(samples, lanes * (len(mine) - len(todo) + len(batches))))
     if shard is not None:
         return None
-    shapes = {m: (lanes,) if ms.MEASURES[m].per == "run" else (lanes, ms.entries(m, case.loop.plant)) for m in wanted}
+    shapes = {
+        m: (lanes,) if ms.MEASURES[m].per == "run" else (lanes, ms.entries(m, case.loop.plant))
+        for m in wanted
+    }
     for k in mine:
         if k not in batches:
             batches[k] = cast(Any, store).get(k, {**shapes, "failed": (lanes,)})
     if jax.process_count() > 1:
         batches = _gather(batches, count)
-    whole = {name: np.concatenate([batches[k][name] for k in range(count)])[:samples] for name in batches[0]}
+    whole = {
+        name: np.concatenate([batches[k][name] for k in range(count)])[:samples]
+        for name in batches[0]
+    }
     values = space.values(p)
     return Ensemble(
         case=case,
@@ -244,7 +290,11 @@ def ensemble(
         failed=whole["failed"] > 0,
         infeasible=_infeasible(case, values),
         limits=held,
-        fan=_fan(case, {n: v[:FAN_DRAWS] for n, v in values.items()}, key if random else None) if fan else None,
+        fan=(
+            _fan(case, {n: v[:FAN_DRAWS] for n, v in values.items()}, key if random else None)
+            if fan
+            else None
+        ),
         wall_s=time.perf_counter() - began,
         seed=key,
         method=draws,
@@ -257,7 +307,8 @@ def check_devices(devices):
         raise InputError(f"devices = {devices!r}: must be a whole number of at least 1")
     if devices > jax.local_device_count():
         raise InputError(
-            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices before jax starts)"
+            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices"
+            " before jax starts)"
         )
 
 
@@ -273,8 +324,10 @@ def _rows(space, p, indices):
 
 
 class _Runner:
-    """A batch on each of `devices` at once, by the program that one device runs alone, on a thread of its own. One program partitioned over
-    the devices (shard_map) rounds the last bit differently from the program of a single device; this does not."""
+    """A batch on each of `devices` at once, by the program that one device runs alone, on a thread
+    of its own. One program partitioned over the devices (shard_map) rounds the last bit differently
+    from the program of a single device; this does not.
+    """
 
     def __init__(self, case, names, seed, devices):
         self.case, self.names, self.seed = case, names, seed
@@ -307,9 +360,14 @@ def _gather(batches, count):
 
     most = -(-count // jax.process_count())
     template = next(iter(batches.values()))
-    padded = {n: np.stack([batches.get(k, template)[n] for k in _share(count, most)]) for n in template}
+    padded = {
+        n: np.stack([batches.get(k, template)[n] for k in _share(count, most)]) for n in template
+    }
     everywhere = multihost_utils.process_allgather(padded)
-    return {k: {n: v[k % jax.process_count(), k // jax.process_count()] for n, v in everywhere.items()} for k in range(count)}
+    return {
+        k: {n: v[k % jax.process_count(), k // jax.process_count()] for n, v in everywhere.items()}
+        for k in range(count)
+    }
 
 
 def _share(count, most):
@@ -317,16 +375,25 @@ def _share(count, most):
 
 
 def _infeasible(case, values):
-    """(N,) True where a plateau of the reference has no steady state within rims and pumps; None where the plant has no closed form."""
+    """(N,) True where a plateau of the reference has no steady state within rims and pumps; None
+    where the plant has no closed form.
+    """
     plant = case.loop.plant
-    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs) or not hasattr(case.loop.reference, "plateaus"):
+    if (
+        getattr(plant, "pipes", None) != ()
+        or plant.pumps != len(plant.outputs)
+        or not hasattr(case.loop.reference, "plateaus")
+    ):
         return None
     plateaus = jnp.asarray(np.array(case.loop.reference.plateaus(case.clock.duration)))
     count = len(next(iter(values.values())))
     size, found = min(count, RESTS), []
-    for start in range(0, count, size):  # the last draw repeated past the end, so that every block is of one size
+    # the last draw repeated past the end, so that every block is of one size
+    for start in range(0, count, size):
         index = np.minimum(np.arange(start, start + size), count - 1)
-        found.append(np.asarray(_no_rest(case.loop, {n: v[index] for n, v in values.items()}, plateaus)))
+        found.append(
+            np.asarray(_no_rest(case.loop, {n: v[index] for n, v in values.items()}, plateaus))
+        )
     return np.concatenate(found)[:count]
 
 
@@ -339,7 +406,12 @@ def _no_rest(loop, values, plateaus):
             speeds, u = steady_flows(here.plant, y)
             levels = speeds * speeds / (2.0 * here.plant.gravity)
             high = levels > here.plant.rim * (1.0 + 1e-12)
-            return jnp.any(speeds < 0) | jnp.any(high) | jnp.any(u < here.actuator.low) | jnp.any(u > here.actuator.high)
+            return (
+                jnp.any(speeds < 0)
+                | jnp.any(high)
+                | jnp.any(u < here.actuator.low)
+                | jnp.any(u > here.actuator.high)
+            )
 
         return jnp.any(jax.vmap(at)(plateaus))
 
@@ -347,14 +419,17 @@ def _no_rest(loop, values, plateaus):
 
 
 def _fan(case, values, seed):
-    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that are finite, "of" how many}: quantiles
-    5, 25, 50, 75, 95 % at fixed times."""
+    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that
+    are finite, "of" how many}: quantiles 5, 25, 50, 75, 95 % at fixed times.
+    """
     every, lanes = max(1, (case.clock.samples - 1) // FAN_ROWS), 64
     size, found = len(next(iter(values.values()))), []
     for start in range(0, size, lanes):
         index = np.minimum(np.arange(start, start + lanes), size - 1)
         rows = {n: v[index] for n, v in values.items()}
-        t, r, x, u = _trajectories(case.loop, rows, index.astype(np.uint32), seed, case.clock, every)
+        t, r, x, u = _trajectories(
+            case.loop, rows, index.astype(np.uint32), seed, case.clock, every
+        )
         keep = min(lanes, size - start)
         found.append((np.asarray(x)[:keep], np.asarray(u)[:keep]))
     x, u = (np.concatenate(column) for column in zip(*found))

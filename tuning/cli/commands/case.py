@@ -1,4 +1,6 @@
-"""`jaxtank list`, `show`, `init`, `export`, `simulate`, `compare`, `bench`, `completion`: a case as it is."""
+"""`jaxtank list`, `show`, `init`, `export`, `simulate`, `compare`, `bench`, `completion`: a case as
+it is.
+"""
 
 import sys
 
@@ -13,7 +15,11 @@ def list_cases(args):
     from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    print(tables.dumps(cases) if args.json else tables.table([[n, t] for n, t in cases.items()], ["case", ""]))
+    print(
+        tables.dumps(cases)
+        if args.json
+        else tables.table([[n, t] for n, t in cases.items()], ["case", ""])
+    )
     return 0
 
 
@@ -45,13 +51,18 @@ def show(args):
 
 def init(args):
     if args.short and args.tanks:
-        raise InputError("--short and --tanks: the short file names its preset; give one of the two")
+        raise InputError(
+            "--short and --tanks: the short file names its preset; give one of the two"
+        )
     case = open_case(args)
     from jaxtank import rig
     from tuning.report import tables
 
     text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
-    print(tables.dumps({"case": case.name, "rig": text}) if args.json else text, end="\n" if args.json else "")
+    print(
+        tables.dumps({"case": case.name, "rig": text}) if args.json else text,
+        end="\n" if args.json else "",
+    )
     return 0
 
 
@@ -100,7 +111,11 @@ def simulate(args):
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
-    written = artifacts.save_run(case, artifacts.run_for_people(case, key), payload, args.out, args.gif) if args.out else []
+    written = (
+        artifacts.save_run(case, artifacts.run_for_people(case, key), payload, args.out, args.gif)
+        if args.out
+        else []
+    )
     if args.json:
         print(tables.dumps(payload))
     else:
@@ -135,7 +150,11 @@ def compare(args):
     if args.json:
         print(tables.dumps(found if args.paper == "all" else found[args.paper]))
     else:
-        print(compare.markdown(found) if args.markdown else "\n\n".join(compare.text(page) for page in found.values()))
+        print(
+            compare.markdown(found)
+            if args.markdown
+            else "\n\n".join(compare.text(page) for page in found.values())
+        )
     tell_written(written, args)
     return 0
 

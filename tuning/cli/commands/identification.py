@@ -1,4 +1,6 @@
-"""The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make. Imports nothing heavy before it runs."""
+"""The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make.
+Imports nothing heavy before it runs.
+"""
 
 import sys
 
@@ -17,48 +19,101 @@ STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupte
 def add(commands, parents):
     """Add the command to the parser's `commands`."""
     one = commands.add_parser(
-        "identify", parents=parents, help="plant parameters from a log, with intervals; --out DIR writes a rig to tune"
+        "identify",
+        parents=parents,
+        help="plant parameters from a log, with intervals; --out DIR writes a rig to tune",
     )
     one.add_argument(
-        "--data", action="append", default=[], metavar="CSV", help="a log; repeatable: several experiments with a start each"
+        "--data",
+        action="append",
+        default=[],
+        metavar="CSV",
+        help="a log; repeatable: several experiments with a start each",
     )
     one.add_argument(
         "--free",
         action="append",
         default=[],
         metavar="NAME=LOW:HIGH",
-        help="what to estimate, of plant, sensor, actuator, disturbance (default: pump gains, splits, orifices, pipes); repeatable",
+        help=(
+            "what to estimate, of plant, sensor, actuator, disturbance (default: pump gains,"
+            " splits, orifices, pipes); repeatable"
+        ),
     )
     one.add_argument(
         "--column",
         action="append",
         default=[],
         metavar="SLOT=HEADER[;UNIT]",
-        help="which column is t, pump1, .., h1, .., where its header does not say so; h3=none: leave that level out; repeatable",
+        help=(
+            "which column is t, pump1, .., h1, .., where its header does not say so; h3=none: leave"
+            " that level out; repeatable"
+        ),
     )
-    one.add_argument("--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,")
-    one.add_argument("--gap", default="1.5", metavar="X", help="longest step between samples, in median steps (default 1.5)")
-    one.add_argument("--resume", metavar="DIR", help="go on where a killed run with --out DIR ended, to the same answer")
-    one.add_argument("--start", default="free", metavar="HOW", help="first levels: free (default), measured, or case")
+    one.add_argument(
+        "--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,"
+    )
+    one.add_argument(
+        "--gap",
+        default="1.5",
+        metavar="X",
+        help="longest step between samples, in median steps (default 1.5)",
+    )
+    one.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="go on where a killed run with --out DIR ended, to the same answer",
+    )
+    one.add_argument(
+        "--start",
+        default="free",
+        metavar="HOW",
+        help="first levels: free (default), measured, or case",
+    )
     one.add_argument("--starts", default="8", metavar="N", help="searches (default 8)")
-    one.add_argument("--iterations", default="100", metavar="N", help="evaluations of each search (default 100)")
     one.add_argument(
-        "--hold-back", default="0.25", metavar="SHARE", help="end of the log to predict before all is fitted: share, or samples"
+        "--iterations", default="100", metavar="N", help="evaluations of each search (default 100)"
     )
     one.add_argument(
-        "--noise", metavar="SD", help="standard deviation of the readings, one or one per channel (default: from the log)"
+        "--hold-back",
+        default="0.25",
+        metavar="SHARE",
+        help="end of the log to predict before all is fitted: share, or samples",
     )
-    one.add_argument("--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber")
     one.add_argument(
-        "--law", metavar="KIND", help="write the rig under a controller to tune: pi, with gains from the identified model"
+        "--noise",
+        metavar="SD",
+        help="standard deviation of the readings, one or one per channel (default: from the log)",
     )
-    one.add_argument("--profile", action="store_true", help="also: profile likelihood of the parameter known worst")
-    one.add_argument("--plan", action="store_true", help="no log: compare experiments by the standard deviations they would leave")
+    one.add_argument(
+        "--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber"
+    )
+    one.add_argument(
+        "--law",
+        metavar="KIND",
+        help="write the rig under a controller to tune: pi, with gains from the identified model",
+    )
+    one.add_argument(
+        "--profile",
+        action="store_true",
+        help="also: profile likelihood of the parameter known worst",
+    )
+    one.add_argument(
+        "--plan",
+        action="store_true",
+        help="no log: compare experiments by the standard deviations they would leave",
+    )
     one.add_argument("--duration", metavar="S", help="of a planned experiment [s] (default 300)")
     one.add_argument(
-        "--voltage", metavar="V1,V2", help="pump inputs that a planned experiment works about (default: the case's own)"
+        "--voltage",
+        metavar="V1,V2",
+        help="pump inputs that a planned experiment works about (default: the case's own)",
     )
-    one.add_argument("--measure", metavar="H1,H2", help="tanks that are measured in a planned experiment (default all)")
+    one.add_argument(
+        "--measure",
+        metavar="H1,H2",
+        help="tanks that are measured in a planned experiment (default all)",
+    )
 
 
 def run(args):
@@ -68,35 +123,57 @@ def run(args):
     free = values.once("--free", [values.pair("--free", text, values.span) for text in args.free])
     if args.plan:
         return plan(args, case, free)
-    for option, given in (("--duration", args.duration), ("--voltage", args.voltage), ("--measure", args.measure)):
+    for option, given in (
+        ("--duration", args.duration),
+        ("--voltage", args.voltage),
+        ("--measure", args.measure),
+    ):
         if given is not None:
-            raise InputError(f"{option} {given!r}: is of an experiment that is planned, with --plan")
+            raise InputError(
+                f"{option} {given!r}: is of an experiment that is planned, with --plan"
+            )
     if not args.data:
-        raise InputError("identify needs --data CSV, a log of the rig (or --plan, to compare experiments before making one)")
+        raise InputError(
+            "identify needs --data CSV, a log of the rig (or --plan, to compare experiments before"
+            " making one)"
+        )
     from tuning.identification.csv_log import read_log
     from tuning.identification.fit import identify
     from tuning.report import identification, tables
     from tuning.storage.evaluation_log import discard
 
-    given = values.once("--column", [values.pair("--column", text, _column) for text in args.column])
+    given = values.once(
+        "--column", [values.pair("--column", text, _column) for text in args.column]
+    )
     columns = dict(case.log) | (given or {})
     logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
     hold = values.number("--hold-back", args.hold_back)
     if not 0 <= hold < min(one.samples for one in logs):
-        raise InputError(f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of samples of the log")
+        raise InputError(
+            f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of"
+            " samples of the log"
+        )
     noise = None
     if args.noise is not None:
         noise = values.parse_value(args.noise, "--noise")
         entries = noise if isinstance(noise, list) else [noise]
         if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
-            raise InputError(f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel")
+            raise InputError(
+                f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per"
+                " channel"
+            )
     gap = values.number("--gap", args.gap)
     if not gap >= 1:
         raise InputError(f"--gap {args.gap!r}: must be at least 1")
 
     def ready():  # not before: data that are refused get one line
         if not args.quiet:
-            print(f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)} samples", file=sys.stderr, flush=True)
+            print(
+                f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)}"
+                " samples",
+                file=sys.stderr,
+                flush=True,
+            )
 
     interrupts = Interrupts()
     found = identify(
@@ -125,12 +202,23 @@ def run(args):
     if args.out and found.status != "interrupted":
         discard(args.out)  # the result is whole: there is nothing left to go on with
     if written and not args.quiet:
-        print(f"written to {printable(args.out)}: " + ", ".join(p.name for p in written), file=sys.stderr)
+        print(
+            f"written to {printable(args.out)}: " + ", ".join(p.name for p in written),
+            file=sys.stderr,
+        )
         tell_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(f"cannot tell {identification.untold(d)}" for d in found.directions)
-        print(f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written; {_advice(found, free)}", file=sys.stderr)
-    elif any(path.name == "rig.toml" for path in written) and found.status == "converged" and not args.quiet:
+        print(
+            f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written;"
+            f" {_advice(found, free)}",
+            file=sys.stderr,
+        )
+    elif (
+        any(path.name == "rig.toml" for path in written)
+        and found.status == "converged"
+        and not args.quiet
+    ):
         print(_next(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
     return STATUS["interrupted" if interrupts.stop else found.status]
 
@@ -143,18 +231,31 @@ def _next(found, file):
     if case.free:
         return f"go on with: jaxtank tune {file} --robust cvar"
     return (
-        f"{file} has no controller to tune: identify with --law pi for a PI controller with gains from this model, "
-        "or give the file a [law], a [reference] that changes and [free] ranges"
+        f"{file} has no controller to tune: identify with --law pi for a PI controller with gains"
+        " from this model, or give the file a [law], a [reference] that changes and [free] ranges"
     )
 
 
 def _advice(found, free):
     """What to do about parameters that the data cannot tell."""
-    alone = [n for d in found.directions if len(d["parameters"]) == 1 for n in d["parameters"] if n in found.parameters]
+    alone = [
+        n
+        for d in found.directions
+        if len(d["parameters"]) == 1
+        for n in d["parameters"]
+        if n in found.parameters
+    ]
     if free is None:
         which = f"all but {', '.join(alone)}" if alone else "fewer than the usual"
-        return f"say with --free NAME=LOW:HIGH what to estimate ({which}), or take a log that moves {'it' if len(alone) == 1 else 'them'}"
-    return f"leave {', '.join(alone)} out of --free" if alone else "free fewer, or take a log that moves them"
+        return (
+            f"say with --free NAME=LOW:HIGH what to estimate ({which}), or take a log that moves"
+            f" {'it' if len(alone) == 1 else 'them'}"
+        )
+    return (
+        f"leave {', '.join(alone)} out of --free"
+        if alone
+        else "free fewer, or take a log that moves them"
+    )
 
 
 def run_interruptibly(args):
@@ -168,7 +269,9 @@ def run_interruptibly(args):
 def _samples(text):
     """A number of samples: a share below 1 has been taken already."""
     if not float(text).is_integer():
-        raise InputError(f"--hold-back {text!r}: must be a share from 0 to below 1, or a whole number of samples")
+        raise InputError(
+            f"--hold-back {text!r}: must be a share from 0 to below 1, or a whole number of samples"
+        )
     return int(float(text))
 
 
@@ -180,11 +283,16 @@ def _column(text):
 def plan(args, case, free):
     """Compare experiments; returns the exit code."""
     if args.data:
-        raise InputError(f"--plan compares experiments before there is a log: leave it out to fit --data {args.data[0]!r}")
+        raise InputError(
+            "--plan compares experiments before there is a log: leave it out to fit --data"
+            f" {args.data[0]!r}"
+        )
     if args.law:
         raise InputError(f"--plan identifies nothing: leave --law {args.law!r} out")
     if args.out:
-        raise InputError(f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)")
+        raise InputError(
+            f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)"
+        )
     import numpy as np
 
     from tuning.identification.design import compare_experiments, most_telling
@@ -192,7 +300,9 @@ def plan(args, case, free):
 
     duration = 300.0 if args.duration is None else values.number("--duration", args.duration)
     if not 0 < duration <= LONGEST:
-        raise InputError(f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s")
+        raise InputError(
+            f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s"
+        )
     dt = duration / 300
     tanks = None
     if args.measure:
@@ -208,20 +318,41 @@ def plan(args, case, free):
         if len(voltage) != high.size or not all(0 < v <= top for v, top in zip(voltage, high)):
             tops = ", ".join(f"{v:g}" for v in high)
             raise InputError(
-                f"--voltage {args.voltage!r}: must be {high.size} numbers above 0 and at most {tops} {case.loop.units[1]}"
+                f"--voltage {args.voltage!r}: must be {high.size} numbers above 0 and at most"
+                f" {tops} {case.loop.units[1]}"
             )
     length = case.loop.units[0]
     own = float(np.max(np.asarray(case.loop.sensor.noise)))
-    noise = values.number("--noise", args.noise) if args.noise else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
+    noise = (
+        values.number("--noise", args.noise)
+        if args.noise
+        else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
+    )
     if not noise > 0:
         raise InputError(f"--noise {args.noise!r}: must be above 0")
-    found = compare_experiments(case, free, noise=noise, duration=duration, dt=dt, levels=tanks, start="known", voltage=voltage)
+    found = compare_experiments(
+        case,
+        free,
+        noise=noise,
+        duration=duration,
+        dt=dt,
+        levels=tanks,
+        start="known",
+        voltage=voltage,
+    )
     best = most_telling(found)
     if args.json:
         print(
             tables.dumps(
                 tables.clean(
-                    {"case": case.name, "noise": noise, "duration": duration, "dt": dt, "experiments": found, "most_telling": best}
+                    {
+                        "case": case.name,
+                        "noise": noise,
+                        "duration": duration,
+                        "dt": dt,
+                        "experiments": found,
+                        "most_telling": best,
+                    }
                 )
             )
         )
@@ -232,13 +363,23 @@ def plan(args, case, free):
     for name in next(iter(found.values()))["sd"]:
         value = float(np.asarray(get_value(case.loop, name)))
         sds = [found[words]["sd"][name] for words in letters.values()]
-        shares = ["open" if sd is None else f"{100 * sd / abs(value):.2g} %" if value else f"{sd:.2g}" for sd in sds]
+        shares = [
+            "open" if sd is None else f"{100 * sd / abs(value):.2g} %" if value else f"{sd:.2g}"
+            for sd in sds
+        ]
         rows.append([name, f"{value:.5g}", *shares])
     conditions = [found[words]["condition"] for words in letters.values()]
-    rows.append(["condition of J'J", "", *("-" if c is None or c > 1e15 else f"{c:.3g}" for c in conditions)])
+    rows.append(
+        [
+            "condition of J'J",
+            "",
+            *("-" if c is None or c > 1e15 else f"{c:.3g}" for c in conditions),
+        ]
+    )
     measured = "every level" if tanks is None else ", ".join(f"h{i + 1}" for i in tanks)
     print(
-        f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with noise of {noise:g} {length} would leave\n"
+        f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with"
+        f" noise of {noise:g} {length} would leave\n"
     )
     print(tables.table(rows, ["parameter", "value", *letters]) + "\n")
     print("\n".join(f"{letter}  {words}" for letter, words in letters.items()))

@@ -18,30 +18,53 @@ def uncertainty(args):
             raise InputError(f"--shard {args.shard!r}: needs --out DIR, where the shares meet")
     args.out = args.resume or args.out
     devices = devices_of(args)
-    progress = None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
-    found = _ensemble(args, devices=devices, shard=shard, folder=args.out, resume=args.resume is not None, progress=progress)
+    progress = (
+        None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
+    )
+    found = _ensemble(
+        args,
+        devices=devices,
+        shard=shard,
+        folder=args.out,
+        resume=args.resume is not None,
+        progress=progress,
+    )
     if found is None:
         if not args.quiet:
-            print(f"shard {args.shard} is in {printable(args.out)}; `jaxtank merge` joins the shards when all are", file=sys.stderr)
+            print(
+                f"shard {args.shard} is in {printable(args.out)}; `jaxtank merge` joins the shards"
+                " when all are",
+                file=sys.stderr,
+            )
         return 0
     return _told(found, args)
 
 
 def merge(args):
-    """Of a folder alone, by what its manifest says; of a case with the options of its shards and --out DIR."""
+    """Of a folder alone, by what its manifest says; of a case with the options of its shards and
+    --out DIR.
+    """
     if args.out:
         return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
     if not os.path.isdir(args.case):
-        raise InputError(f"merge {args.case!r}: is no folder; give the one that the shards were written to (their --out DIR)")
+        raise InputError(
+            f"merge {args.case!r}: is no folder; give the one that the shards were written to"
+            " (their --out DIR)"
+        )
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from tuning.uncertainty.manifest import restore
     from tuning.uncertainty.study import ensemble
 
-    given = [a for a in ("values", "schedule", "dt", "spread", "vary", "measure") if getattr(args, a)]
+    given = [
+        a for a in ("values", "schedule", "dt", "spread", "vary", "measure") if getattr(args, a)
+    ]
     if given or args.samples != "1000" or args.draws != "random" or args.seed != "0":
-        raise InputError(f"merge {args.case!r}: the folder says what its shards are of; leave the other options out (but --limit)")
+        raise InputError(
+            f"merge {args.case!r}: the folder says what its shards are of; leave the other options"
+            " out (but --limit)"
+        )
     case, options = restore(args.case)
     if args.limit:
         options["limits"] = limits_of(args, case.replace(limits=options["limits"]))
@@ -82,7 +105,9 @@ def _shard(text):
     try:
         i, n = (int(part) for part in text.split("/"))
     except ValueError:
-        raise InputError(f"--shard {text!r}: must be I/N, as 1/4 for the first of four shares") from None
+        raise InputError(
+            f"--shard {text!r}: must be I/N, as 1/4 for the first of four shares"
+        ) from None
     if not 1 <= n <= 10**6:
         raise InputError(f"--shard {text!r}: there may be 1 to 1000000 shares")
     if not 1 <= i <= n:

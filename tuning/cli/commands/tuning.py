@@ -7,7 +7,15 @@ from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import choices_of, distributions_of, limits_of, scenarios_of, tell_unreachable, tell_written, tradeoff_of
+from tuning.cli.options import (
+    choices_of,
+    distributions_of,
+    limits_of,
+    scenarios_of,
+    tell_unreachable,
+    tell_written,
+    tradeoff_of,
+)
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
 
@@ -29,7 +37,10 @@ def _tune(args):
     from tuning.search import tuner
 
     free = once("--free", [pair("--free", text, span) for text in args.free])
-    objective = once("--objective", [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective])
+    objective = once(
+        "--objective",
+        [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective],
+    )
     if objective:
         objective = check_objective(objective)
     limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
@@ -43,14 +54,19 @@ def _tune(args):
     choices, varied = choices_of(args), distributions_of(args, case)
     only = (args.samples, args.fresh, args.back_off)
     if (varied is not None or any(v is not None for v in only)) and args.robust is None:
-        raise InputError("--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust")
+        raise InputError(
+            "--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust"
+        )
     finder = tuner.tune
     more: dict[str, Any] = {"choices": choices, "scenarios": scenarios}
     if args.robust is not None:
         from tuning.search.robust import tune_robust
 
         if choices or scenarios:
-            raise InputError("--robust makes scenarios of its own: no --choose and no --scenario but none beside it")
+            raise InputError(
+                "--robust makes scenarios of its own: no --choose and no --scenario but none"
+                " beside it"
+            )
         if scenarios == ():  # --scenario none: plants of the case's own run alone
             case = case.replace(scenarios=())
         finder = functools.partial(
@@ -62,7 +78,9 @@ def _tune(args):
             back_off=number("--back-off", args.back_off or "0"),
         )
         scenarios, more = None, {}
-    progress = Progress(tables.objective_unit(objective or case.objective, case.loop.units), args.quiet)
+    progress = Progress(
+        tables.objective_unit(objective or case.objective, case.loop.units), args.quiet
+    )
     result = finder(
         case,
         method=args.method,
@@ -86,14 +104,24 @@ def _tune(args):
         from tuning.search.pareto import tradeoff
 
         answer = {n: p["after"] for n, p in result.parameters.items()}
-        options = {"free": free, "objective": objective, "limits": limits, "scenarios": scenarios, "seed": seed}
+        options = {
+            "free": free,
+            "objective": objective,
+            "limits": limits,
+            "scenarios": scenarios,
+            "seed": seed,
+        }
         options["screening"] = whole("--screening", args.screening, 1, 65536)
         with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
-            result = result.replace(tradeoff=tradeoff(case, *sweep, start=answer, progress=progress.check, **options))
+            result = result.replace(
+                tradeoff=tradeoff(case, *sweep, start=answer, progress=progress.check, **options)
+            )
     if args.bound and not progress.stop and result.status != "interrupted":
         from tuning.optimal_input.perfect_information import bound
 
-        result = result.replace(bound=bound(result.tuned, objective, limits, progress=progress.check))
+        result = result.replace(
+            bound=bound(result.tuned, objective, limits, progress=progress.check)
+        )
     args.out = folder
     try:
         written = result.save(folder, args.line) if folder else []
@@ -111,8 +139,10 @@ def _tune(args):
 
 
 class Progress(Interrupts):
-    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken between evaluations, from the second on: the
-    first is of the values that the case has, and what follows it is compiled first."""
+    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken
+    between evaluations, from the second on: the first is of the values that the case has, and what
+    follows it is compiled first.
+    """
 
     def __init__(self, unit, quiet):
         super().__init__()
@@ -126,5 +156,13 @@ class Progress(Interrupts):
         self.last = event["start"]
         breaks = " (breaks a limit)" if event["best_violation"] else ""
         best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}{breaks}"
-        line = f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation {event['evaluations']}  best {best}"
-        print(f"\r{line:<70}" if self.terminal else line, end="" if self.terminal else "\n", file=sys.stderr, flush=True)
+        line = (
+            f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
+            f" {event['evaluations']}  best {best}"
+        )
+        print(
+            f"\r{line:<70}" if self.terminal else line,
+            end="" if self.terminal else "\n",
+            file=sys.stderr,
+            flush=True,
+        )
