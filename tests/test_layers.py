@@ -13,7 +13,7 @@ RANKS = [
     "jaxtank.core jaxtank.xla",
     "jaxtank.signals jaxtank.instruments jaxtank.plants",
     "jaxtank.analysis",
-    "jaxtank.controllers jaxtank.observers jaxtank.measures",
+    "jaxtank.controllers jaxtank.observers jaxtank.measures jaxtank.safety",
     "jaxtank.loop",
     "jaxtank.case",
     "jaxtank.presets",

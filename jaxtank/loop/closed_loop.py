@@ -23,6 +23,7 @@ from jaxtank.loop.step import Inputs, State
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
+from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.base import Signal
 
 
@@ -38,6 +39,7 @@ class ClosedLoop:
     reference: Signal
     disturbance: Signal | None = None
     faults: Faults | None = None
+    safety_filter: SafetyFilter | None = None
     x0: np.ndarray = leaf("cm", "(n,) levels at t = 0", low=0.0)
 
     @property

@@ -95,8 +95,13 @@ def decide(loop, observer, controller, tick, y):
     """
     estimate, observer = loop.observer.step(observer, tick, y)
     command, controller = commanded(loop, controller, tick, estimate)
-    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
-    applied = loop.actuator.limit(command, metric)
+    guard = loop.safety_filter
+    allocates = loop.actuator.saturation == "boxqp" or guard is not None
+    metric = loop.controller.input_metric(estimate) if allocates else None
+    if guard is None:
+        applied = loop.actuator.limit(command, metric)
+    else:
+        applied = guard.apply(loop.actuator, command, metric, y, tick.dt)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
     return Decision(estimate, command, applied, observer, controller)

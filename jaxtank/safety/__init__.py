@@ -1,0 +1,9 @@
+"""Limits on levels that hold for every plant of a box: the filter, and when it is proved.
+
+May be imported by the loop and everything above it.
+"""
+
+from jaxtank.safety.certificate import TankCertificate, design
+from jaxtank.safety.filter import SafetyFilter
+
+__all__ = ["SafetyFilter", "TankCertificate", "design"]

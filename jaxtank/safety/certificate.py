@@ -1,0 +1,441 @@
+"""For which limits a safety filter is proved, tank by tank, and what it costs.
+
+Works on plain numbers, before a run. May be imported by the rig files, the command line and tests.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxtank.core.errors import InputError
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.network import TankNetwork
+from jaxtank.safety.filter import FLOOR, SafetyFilter
+from jaxtank.safety.worst_case import Rates, rates_of
+
+FASTEST = 2.0
+"""Default of kappa at most [1/s]: faster approaches gain less than they move the pumps."""
+SHARE_OF_HOLD = 0.5
+"""kappa T of the default; proved up to 1."""
+MARGIN = 0.9
+"""Share of D = sum c_j o_j / 2 that the choice of k1 counts on."""
+SIGMAS = 6.0
+"""Standard deviations of the sensor noise in the band."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TankCertificate:
+    """Whether the limit of one tank is proved, and by what.
+
+    tank : counted from 0.  limit : H [cm].  certified : True if no plant of the box passes it.
+    reason : the condition that failed with both of its numbers, or the theorem.  rate, rate_bound :
+    kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
+    rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
+    passes [cm]; inf if unknown.
+    """
+
+    tank: int
+    limit: float
+    certified: bool
+    reason: str
+    rate: float
+    rate_bound: float
+    gap: float
+    reach: float
+
+
+class _Setting(NamedTuple):
+    """What the conditions need: coefficients over the box, times [s], pumps' limits [V], bands."""
+
+    rates: Rates
+    hold: float
+    delay: float
+    lag: float
+    low: np.ndarray
+    high: np.ndarray
+    band: np.ndarray
+    top: np.ndarray
+    pulse: bool
+
+
+def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
+    """Return the largest kappa [1/s] that is proved for a hold, a dead time and a lag [s].
+
+    Without lag, d = delay/hold whole samples: kappa T <= d^d/(d + 1)^(d + 1) (1 for d = 0).
+    With a lag tau and age a = delay + hold: max over sigma of sigma (1 - tau sigma) exp(-sigma a).
+
+    Examples
+    --------
+    >>> rate_bound(0.1), round(rate_bound(0.1, delay=0.1), 3)
+    (10.0, 2.5)
+    """
+    if lag > 0.0:
+        age = delay + hold
+        sigma = 2.0 / (2.0 * lag + age + math.sqrt(4.0 * lag**2 + age**2))
+        return sigma * (1.0 - lag * sigma) * math.exp(-sigma * age)
+    d = math.ceil(delay / hold - 1e-9)
+    return d**d / (d + 1) ** (d + 1) / hold
+
+
+def box_of(plant: TankNetwork, spread: Mapping[str, float]) -> tuple[TankNetwork, TankNetwork]:
+    """Return the plants at the lower and the upper end of a box.
+
+    spread : {parameter of the plant, with or without "plant." : share by which it may be off}
+    Raises InputError for a name that the plant does not have, or a share outside [0, 1).
+    """
+    ends = ({}, {})
+    for name, share in spread.items():
+        field = name.removeprefix("plant.")
+        if field not in {f.name for f in dataclasses.fields(plant)} or field == "rim":
+            raise InputError(f"safety_filter: {name} is no parameter of this plant's flows")
+        if not 0.0 <= share < 1.0:
+            raise InputError(f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1")
+        value = np.asarray(getattr(plant, field), dtype=float)
+        ends[0][field], ends[1][field] = value * (1.0 - share), value * (1.0 + share)
+    if "split" in ends[1]:
+        ends[1]["split"] = np.minimum(ends[1]["split"], 1.0)
+    least, most = (dataclasses.replace(plant, **end) for end in ends)
+    return least, most
+
+
+def band_of(sensor: LevelSensor) -> np.ndarray:
+    """Return the (n,) band of the readings [cm]: 6 standard deviations, half an ADC step, offset."""
+    band = SIGMAS * np.asarray(sensor.noise, dtype=float)
+    if sensor.offset is not None:
+        band = band + np.abs(np.asarray(sensor.offset, dtype=float))
+    if sensor.bits:
+        band = band + 0.5 * np.asarray(sensor.gain) * float(sensor.full_scale) / 2**sensor.bits
+    return band
+
+
+def top_of(sensor: LevelSensor, tanks: int) -> np.ndarray:
+    """Return the (n,) highest level that the sensors can read [cm]; inf without an ADC."""
+    if not sensor.bits:
+        return np.full(tanks, np.inf)
+    return np.asarray(sensor.gain, dtype=float) * float(sensor.full_scale)
+
+
+def design(
+    plant: TankNetwork,
+    actuator: PumpBank,
+    sensor: LevelSensor,
+    hold: float,
+    *,
+    spread: Mapping[str, float],
+    limit: ArrayLike | None = None,
+    inflow: ArrayLike = 0.0,
+    band: ArrayLike | None = None,
+    rate: float | None = None,
+    substeps: int = 1,
+    start: ArrayLike | None = None,
+) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
+    """Return a safety filter for a rig, and the certificate of each tank.
+
+    Parameters
+    ----------
+    plant, actuator, sensor : the rig
+    hold : longest time for which an input is held [s]
+    spread : {parameter: share}, the box: each entry of each may be off by its share, each by itself
+    limit : (n,) wanted limits [cm]; the rims where it is left out. Limits may come out lower
+    inflow : (n,) largest inflow disturbance [cm^3/s]
+    band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
+    rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
+    substeps : integration steps of a hold
+    start : (n,) levels at t = 0 [cm], which must lie below the limits
+
+    Raises
+    ------
+    InputError
+        for a plant that is no TankNetwork, or a value out of its range
+    """
+    if not isinstance(plant, TankNetwork):
+        raise InputError("safety_filter: is for tank networks (plants.network) only")
+    n = plant.tanks
+    least, most = box_of(plant, spread)
+    inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (n,))
+    eps = band_of(sensor) if band is None else np.broadcast_to(np.asarray(band, dtype=float), (n,))
+    coefficients = jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps))
+    lag = 0.0 if actuator.lag is None else float(np.max(actuator.lag))
+    setting = _Setting(
+        rates=coefficients,
+        hold=float(hold),
+        delay=float(actuator.delay),
+        lag=lag,
+        low=np.asarray(actuator.low, dtype=float),
+        high=_driving(actuator),
+        band=eps,
+        top=top_of(sensor, n),
+        pulse=actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse",
+    )
+    bound = rate_bound(setting.hold, setting.delay, lag)
+    kappa = min(FASTEST, SHARE_OF_HOLD / hold, MARGIN * bound) if rate is None else float(rate)
+    wanted = np.asarray(plant.rim if limit is None else limit, dtype=float)
+    wanted = np.minimum(np.broadcast_to(wanted, (n,)), setting.top)
+    heights, slopes, reasons = _limits(setting, wanted, _reachable(setting, wanted, plant.rim), kappa)
+    rows = [
+        _judge(setting, i, heights, slopes, reasons[i], kappa, bound, start) for i in range(n)
+    ]
+    reach = _reach(setting, heights, slopes, [r.certified for r in rows], plant)
+    nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
+    found = SafetyFilter(
+        least=least,
+        most=most,
+        limit=heights,
+        reach=np.minimum(reach, 1e6),
+        rate=np.full(n, kappa),
+        band=np.array(eps),
+        inflow=np.array(inflow),
+        slope=slopes,
+        age=setting.delay + lag,
+        held=tuple(i for i in range(n) if coefficients.pumps[i] or slopes[i] > 0.0),
+    )
+    rows = tuple(
+        dataclasses.replace(row, reach=float(reach[row.tank]), gap=_gap(setting, nominal, row, reach))
+        for row in rows
+    )
+    return found, rows
+
+
+def _plain(value):
+    """A number of Rates as a float; an index as it is."""
+    return value if isinstance(value, int) else float(value)
+
+
+def _driving(actuator):
+    """(m,) largest inputs that move liquid [V]."""
+    high = np.asarray(actuator.high, dtype=float)
+    if actuator.dead_zone is not None and actuator.dead_zone_kind == "offset":
+        return np.maximum(high - np.asarray(actuator.dead_zone, dtype=float), 0.0)
+    return high
+
+
+def phi(rates: Rates, tank: int, level: float, others: Any) -> float:
+    """Phi_max(level) [cm/s] in plain numbers; see `worst_case.rise`."""
+    knee, h = rates.knee, max(level, 0.0)
+    empty = h < rates.empty[tank]
+    rate = rates.inflow[tank] - (0.0 if empty else rates.out[tank] * _root(h, knee))
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            z = others[j] - h
+            s = math.copysign(math.sqrt(abs(z)), z) if not math.isinf(z) else z
+            s = z / (z * z + knee * knee) ** 0.25 if abs(z) < 1e6 else s
+            rate += most * s if s >= 0.0 else (0.0 if empty else least * s)
+    for source, sink, _, most in rates.links:
+        if sink == tank:
+            rate += most * _root(max(others[source], 0.0), knee)
+    return rate
+
+
+def _root(h, knee):
+    """The root of the plant's flows (`numerics.root`) of a level h >= 0 in plain numbers."""
+    return math.sqrt(h) if h >= knee else math.sqrt(knee) * (1.5 * h / knee - 0.5 * (h / knee) ** 2)
+
+
+def _unstoppable(setting, tank):
+    """What pumps with a lower limit above 0 V always bring [cm/s]."""
+    return sum(b * max(setting.low[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def _reachable(setting, wanted, rim):
+    """(n,) starting limits [cm]: the wanted ones, or what full pumps can reach at worst."""
+    heights, rates = np.array(wanted), setting.rates
+    for _ in range(len(heights)):
+        for i in range(len(heights)):
+            if any(tank == i for tank, *_ in rates.pipes) or rates.out[i] == 0.0:
+                continue
+            full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[i].items())
+            brought = full + phi(rates, i, 0.0, heights)
+            heights[i] = min(wanted[i], max((brought / rates.out[i]) ** 2, rates.empty[i], 1e-9))
+    return heights
+
+
+def _limits(setting, wanted, heights, kappa):
+    """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2.
+
+    A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
+    own; otherwise the limits of the tanks above are lowered by one factor until it is not.
+    """
+    n, rates = len(heights), setting.rates
+    heights, slopes, reasons = np.array(heights), np.zeros(n), [""] * n
+    for _ in range(4 * n):
+        changed = False
+        for i in range(n):
+            excess = phi(rates, i, heights[i], heights) + _unstoppable(setting, i)
+            if excess <= 0.0 or slopes[i] > 0.0 or reasons[i]:
+                continue
+            slopes[i], why = _second_order(setting, i, heights, kappa)
+            if slopes[i] > 0.0:
+                continue
+            sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
+            pressed = sum(most * _root(heights[j], rates.knee) for j, most in sources)
+            room = rates.out[i] * _root(heights[i], rates.knee) - (
+                excess + rates.out[i] * _root(heights[i], rates.knee) - pressed
+            )
+            if not sources or room <= 0.0:
+                reasons[i] = _rim_words(setting, i, heights) + (f"; {why}" if why else "")
+                continue
+            for j, _ in sources:
+                heights[j] *= (room / pressed) ** 2 * (1.0 - 1e-12)
+            changed = True
+        if not changed:
+            break
+    return heights, slopes, reasons
+
+
+def _rim_words(setting, tank, heights):
+    """The rim condition with both of its numbers."""
+    rates = setting.rates
+    leaves = rates.out[tank] * _root(heights[tank], rates.knee)
+    enters = phi(rates, tank, heights[tank], heights) + leaves + _unstoppable(setting, tank)
+    return f"rim condition: {enters:.3g} cm/s may enter at the limit, {leaves:.3g} leave for certain"
+
+
+def _second_order(setting, tank, heights, kappa):
+    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the condition that failed)."""
+    rates, hold = setting.rates, setting.hold
+    sources = [(j, least, most) for j, sink, least, most in rates.links if sink == tank]
+    above = {j for j, *_ in sources}
+    if rates.pumps[tank]:
+        return 0.0, ""
+    if setting.delay > 0.0 or setting.lag > 0.0:
+        return 0.0, "second order: not proved with dead time or lag"
+    others = {i for pipe in rates.pipes for i in pipe[:2]}
+    if others & (above | {tank}) or any(rates.inflow[i] > 0.0 for i in (tank, *above)):
+        return 0.0, "second order: not proved with pipes or inflow disturbances"
+    if any(sink in above for _, sink, *_ in rates.links) or not all(rates.pumps[j] for j in above):
+        return 0.0, "second order: not proved where the tanks above are fed by others"
+    if any(setting.low > 0.0):
+        return 0.0, "second order: not proved for pumps that cannot stop"
+    if kappa * hold > 1.0:
+        return 0.0, f"second order: k2 T = {kappa * hold:.3g} above 1"
+    top, knee = heights[tank], rates.knee
+    full = sum(most * _root(heights[j], knee) for j, _, most in sources)
+    drained = MARGIN * sum(0.5 * most * rates.out[j] for j, _, most in sources)
+    a0 = FLOOR * _root(top, knee)
+    if a0**2 < knee:
+        return 0.0, f"second order: laminar threshold {knee:g} above {a0**2:.3g}"
+    for j, _, most in sources:
+        left = rates.out[tank] * _root(top, knee) - (full - most * _root(heights[j], knee))
+        if left <= most * a0:
+            return 0.0, f"second order: (C3) {left:.3g} not above {most * a0:.3g} cm/s"
+    for k1 in np.geomspace(1.0 / hold, 1e-4, 2000):
+        if k1 * top < full:  # (C2)
+            break
+        level = _crossing(rates.out[tank], k1, top, full)
+        lowest = level - hold * full - 2.0 * setting.band[tank]
+        lowest -= hold * rates.out_most[tank] * _root(top, knee)
+        steep = rates.out[tank] * 0.5 / math.sqrt(lowest) if lowest > knee else math.inf
+        if k1**2 * (top - level) <= drained and k1 > steep:  # (C1), (C4)
+            return float(k1), ""
+    return 0.0, f"second order: no k1 with (C1) k1^2 (H - h*) <= {drained:.3g} cm/s^2"
+
+
+def _crossing(out, k1, top, full):
+    """h* [cm] with out sqrt(h*) + k1 (H - h*) = F, on the falling side."""
+    root = (out + math.sqrt(out**2 + 4.0 * k1 * (k1 * top - full))) / (2.0 * k1)
+    return min(root**2, top)
+
+
+def _judge(setting, tank, heights, slopes, why, kappa, bound, start):
+    """The TankCertificate of one tank, without gap and reach."""
+    rates = setting.rates
+    reason, theorem = why, "Theorem 2" if slopes[tank] > 0.0 else "Theorem 1"
+    delayed = setting.delay > 0.0 or setting.lag > 0.0
+    if delayed and slopes[tank] == 0.0:
+        theorem = "Theorem 4" if setting.lag > 0.0 else "Theorem 3"
+    if not reason and setting.pulse:
+        reason = "a pulse dead zone pays out more than was commanded"
+    if not reason and kappa > bound * (1.0 + 1e-12):
+        reason = f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
+    if not reason and delayed:
+        reason = _delayed(setting, tank, heights, kappa, bound)
+    if not reason and start is not None and np.asarray(start)[tank] > heights[tank]:
+        reason = f"start at {np.asarray(start)[tank]:.4g} cm, above the limit"
+    return TankCertificate(
+        tank=tank,
+        limit=float(heights[tank]),
+        certified=not reason,
+        reason=reason or theorem,
+        rate=kappa,
+        rate_bound=bound,
+        gap=math.nan,
+        reach=math.inf,
+    )
+
+
+def _delayed(setting, tank, heights, kappa, bound):
+    """The condition of Theorems 3 and 4 that fails, or ""."""
+    rates = setting.rates
+    if any(i == tank for i, *_ in rates.pipes):
+        return "a pipe with dead time or lag: not proved"
+    steep = rates.out[tank] / math.sqrt(heights[tank])
+    if kappa < steep:
+        return f"(N) kappa {kappa:.3g} below c_min/sqrt(H) = {steep:.3g} 1/s"
+    if setting.lag > 0.0:
+        full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[tank].items())
+        rise = (full + phi(rates, tank, 0.0, heights)) * (2 * setting.lag + setting.delay + setting.hold)
+        if rise > 0.75 * heights[tank]:
+            return f"(F) {rise:.3g} cm may be filled within the lag: above 3/4 of the limit"
+    return ""
+
+
+def _reach(setting, heights, slopes, certified, plant):
+    """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest."""
+    rates, n = setting.rates, len(heights)
+    rim = np.asarray(plant.rim, dtype=float)
+    reach = np.array(heights)
+    for _ in range(50):
+        before = reach.copy()
+        for i in range(n):
+            if not certified[i]:
+                full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[i].items())
+                reach[i] = max(reach[i], _rest(rates, i, full, reach))
+                if plant.overflow:
+                    reach[i] = min(reach[i], max(rim[i], heights[i]))
+        if np.allclose(reach, before, rtol=1e-9):
+            return reach
+    return np.where(certified, heights, rim if plant.overflow else np.inf)
+
+
+def _rest(rates, tank, full, others):
+    """Level [cm] at which a tank rests with the most that may enter; inf if it never does."""
+    level = _highest(lambda h: full + phi(rates, tank, h, others), 1e6)
+    return math.inf if level == 1e6 else level * (1.0 + 1e-9)
+
+
+def _gap(setting, nominal, row, reach):
+    """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
+    full, or its limit where that is lower.
+    """
+    rates, i = setting.rates, row.tank
+    if not rates.pumps[i]:
+        return math.nan
+    most = sum(b for _, b in rates.pumps[i].values())
+    full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[i].items())
+    gain = sum(b for _, b in nominal.pumps[i].values())
+    others = np.minimum(reach, 1e6)
+
+    def filtered(h):
+        low = h - setting.band[i]
+        cap = max(0.0, row.rate * (row.limit - h - setting.band[i]) - phi(rates, i, low, others))
+        return min(full, gain / most * cap) + phi(nominal, i, h, others)
+
+    free = lambda h: full + phi(nominal, i, h, others)
+    return _highest(free, row.limit) - _highest(filtered, row.limit)
+
+
+def _highest(rate, top):
+    """The level [cm] up to which rate(level), which falls with it, is above 0; `top` at most."""
+    low, high = 0.0, top
+    if rate(top) > 0.0:
+        return top
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        low, high = (mid, high) if rate(mid) > 0.0 else (low, mid)
+    return low

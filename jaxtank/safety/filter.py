@@ -1,0 +1,190 @@
+"""An upper limit on the pumps, computed from the readings, that keeps levels below their limits.
+
+A robust sampled-data control barrier function in closed form (a "safety filter"). Theorems and
+conditions: README.md of this folder; what is proved for a rig: `certificate.design`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.numerics import at_least, clip, root
+from jaxtank.core.tree import component, leaf, static
+from jaxtank.instruments.actuators import PumpBank, allocate
+from jaxtank.plants.network import TankNetwork
+from jaxtank.safety.worst_case import rates_of, rise
+
+FLOOR = 0.05
+"""a0 as a share of s(H): below it the root of a feeding tank's level counts as constant."""
+
+
+@component
+class SafetyFilter:
+    """Caps on the inputs under which no level passes its limit, for every plant of a box.
+
+    For tank i with level h, reading y, |y - h| <= band, the inputs must satisfy
+
+        sum_j b_ij,max u_j <= M_i = max(0, -Phi_max(y - band) + rate (limit - y - band))
+
+    where Phi_max is the largest rate of the level with the pumps off (`worst_case.rise`). A tank
+    without a pump whose inflow alone can pass its limit is held by a row on the pumps of the tanks
+    above it (`slope` > 0; second order, see `_row_above`). u = 0 serves every row, and lowering an
+    input never breaks one.
+    """
+
+    least: TankNetwork
+    most: TankNetwork
+    limit: np.ndarray = leaf("cm", "(n,) level that no tank may pass", low=0.0, strict=True)
+    reach: np.ndarray = leaf("cm", "(n,) level that no tank passes for certain", low=0.0)
+    rate: np.ndarray = leaf(
+        "1/s", "(n,) how fast a level may approach its limit (kappa)", low=0.0, strict=True
+    )
+    band: np.ndarray = leaf("cm", "(n,) largest difference of reading and level", low=0.0)
+    inflow: np.ndarray = leaf("cm^3/s", "(n,) largest inflow disturbance", low=0.0)
+    slope: np.ndarray = leaf(
+        "1/s",
+        "(n,) k1 of a tank that is held by the pumps above it; 0: by its own",
+        low=0.0,
+        default=lambda own: np.zeros(np.shape(own["limit"])),
+    )
+    age: np.ndarray = leaf(
+        "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
+    )
+    held: tuple = static(doc="tanks whose limits are kept, counted from 0")
+    allocate: bool = static(
+        doc="give the other of two pumps what serves the outputs best where one meets its cap",
+        choices=(False, True),
+        default=True,
+    )
+
+    def apply(
+        self, actuator: PumpBank, command: Sequence, metric: tuple | None, y: Sequence, hold: Any
+    ) -> tuple:
+        """Return the (m) inputs within the pumps' limits and the caps [V] for a command (m) [V].
+
+        Parameters
+        ----------
+        actuator : the pumps
+        command : (m) inputs before their limits [V]
+        metric : (g11, g12, g22) of the controller's cost (`Controller.input_metric`), or None:
+            that of the plant, by the effect of two pumps on the outputs
+        y : (n) readings [cm]
+        hold : longest time for which the inputs are held [s]
+        """
+        pumps = range(actuator.pumps)
+        low, dead = [actuator.low[j] for j in pumps], [0.0 for _ in pumps]
+        if actuator.dead_zone is not None and actuator.dead_zone_kind == "offset":
+            dead = [actuator.dead_zone[j] for j in pumps]
+        high = [actuator.high[j] - dead[j] for j in pumps]
+        caps, shared = self.limits(y, hold, low, high)
+        caps = tuple(cap + zone for cap, zone in zip(caps, dead))
+        if self.allocate and actuator.pumps == 2:
+            u = allocate(command, metric or self._metric(y), actuator.low, caps)
+        else:
+            u = tuple(clip(command[j], low[j], caps[j]) for j in pumps)
+        if not shared:
+            return u
+        moving = tuple(v - zone for v, zone in zip(u, dead))
+        return tuple(v + zone for v, zone in zip(self.scaled(moving, shared), dead))
+
+    def _metric(self, y):
+        """(g11, g12, g22) of G = J'J, J_oj the effect of pump j on output o: on its rate, or on its
+        second derivative where it has no pump of its own.
+        """
+        r, knee = rates_of(self.least, self.most, self.inflow, 0.0), self.least.knee
+        g11 = g12 = g22 = 0.0
+        for o in self.least.outputs:
+            row = {j: 0.5 * (a + b) for j, (a, b) in r.pumps[o].items()}
+            for source, sink, a, b in () if row else r.links:
+                if sink == o:
+                    steep = 0.25 * (a + b) / root(at_least(y[source], 10.0 * knee), knee)
+                    for j, (c, d) in r.pumps[source].items():
+                        row[j] = row.get(j, 0.0) + steep * 0.5 * (c + d)
+            first, second = row.get(0, 0.0), row.get(1, 0.0)
+            g11, g12, g22 = g11 + first**2, g12 + first * second, g22 + second**2
+        small = 1e-6 * (g11 + g22)  # a pump that moves no output keeps its own command
+        return g11 + small, g12, g22 + small
+
+    def bounds(self, y: Sequence, hold: Any, high: Sequence) -> list[tuple[dict, Any]]:
+        """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y.
+
+        Parameters
+        ----------
+        y : (n) readings [cm]
+        hold : longest time for which an input is held [s]
+        high : (m) upper limits of the pumps [V]
+        """
+        n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold)
+        fastest = [self._fastest(r, i, high) for i in range(n)]
+        above = [
+            jnp.minimum(self.reach[i], y[i] + self.band[i] + (hold + self.age) * fastest[i])
+            for i in range(n)
+        ]
+        rows = []
+        for i in self.held:
+            if r.pumps[i]:
+                m = self.rate[i] * (self.limit[i] - y[i] - self.band[i]) - rise(
+                    r, i, y[i] - self.band[i], above
+                )
+                rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, at_least(m, 0.0)))
+            else:
+                rows.append(self._row_above(r, i, y, hold))
+        return rows
+
+    def _fastest(self, r, tank, high):
+        """Largest rate of a level [cm/s]: all pumps at `high`, all other tanks at `reach`."""
+        pumped = sum(b * at_least(high[j], 0.0) for j, (_, b) in r.pumps[tank].items())
+        return pumped + at_least(rise(r, tank, 0.0, self.reach), 0.0)
+
+    def _row_above(self, r, tank, y, hold):
+        """Return the row of a tank without a pump on the pumps of the tanks that feed it.
+
+            g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
+            sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
+        """
+        s = lambda h: root(at_least(h, 0.0), r.knee)
+        k1, k2, top, eps = self.slope[tank], self.rate[tank], self.limit[tank], self.band[tank]
+        a0 = FLOOR * s(top)
+        sources = [(j, most) for j, sink, _, most in r.links if sink == tank]
+        full = sum(most * s(self.reach[j]) for j, most in sources)
+        drains, row = 0.0, {}
+        g = r.out[tank] * s(y[tank] - eps) + k1 * (top - y[tank] - eps)
+        for j, most in sources:
+            lowest = s(y[j] - self.band[j]) - 0.5 * r.out_most[j] * hold
+            drains = drains + jnp.where(lowest >= a0, 0.5 * most * r.out[j], 0.0)
+            g = g - most * at_least(s(y[j] + self.band[j]), a0)
+            steep = most * 0.5 / at_least(lowest, a0)
+            for pump, (_, b) in r.pumps[j].items():
+                row[pump] = row.get(pump, 0.0) + steep * b
+        lowest = at_least(y[tank] - eps - hold * r.out_most[tank] * s(top), 0.0)
+        m = at_least(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
+        x = y[tank] + eps + hold * full
+        far = r.out[tank] * s(x) + k1 * (top - x) >= full
+        return row, jnp.where(far, jnp.inf, m)
+
+    def limits(self, y: Sequence, hold: Any, low: Sequence, high: Sequence) -> tuple:
+        """Return ((m) upper limits of the inputs [V], the rows that bind two pumps or more).
+
+        Lower limits win: a pump that cannot stop runs at its lower limit.
+        """
+        caps, shared = list(high), []
+        for row, m in self.bounds(y, hold, high):
+            if len(row) == 1:
+                ((j, a),) = row.items()
+                cap = jnp.where(a > 0.0, m / jnp.where(a > 0.0, a, 1.0), jnp.inf)
+                caps[j] = jnp.minimum(caps[j], at_least(cap, low[j]))
+            else:
+                shared.append((row, m))
+        return tuple(caps), shared
+
+    def scaled(self, u: Sequence, shared: list) -> tuple:
+        """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion."""
+        u = list(u)
+        for row, m in shared:
+            total = sum(a * at_least(u[j], 0.0) for j, a in row.items())
+            share = jnp.where(total > m, m / jnp.where(total > m, total, 1.0), 1.0)
+            for j in row:
+                u[j] = jnp.where(u[j] > 0.0, u[j] * share, u[j])
+        return tuple(u)

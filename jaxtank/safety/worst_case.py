@@ -1,0 +1,124 @@
+"""The largest rates a level can have over a box of plants, tank by tank.
+
+Imported by the filter (on traced scalars) and by the certificate (on plain numbers).
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from jaxtank.core.numerics import at_least, root, signed_root
+from jaxtank.plants.network import TankNetwork
+
+
+class Rates(NamedTuple):
+    """Coefficients of h' over a box of plants, each divided by the area of its tank.
+
+    `out`, `out_most` : (n) least and largest of what leaves a tank freely, per sqrt(level)
+    [cm^0.5/s].  `links` : [(source, sink, least, largest)] per orifice between tanks.  `pipes` :
+    [(tank, other, least, largest)], each pipe once from either end.  `pumps` : (n) {pump: (least,
+    largest)} [cm/(s V)].  `inflow` : (n) largest inflow disturbance [cm/s].  `knee` : laminar
+    threshold [cm].  `empty` : (n) level below which outflow counts as nothing [cm].
+    """
+
+    out: tuple
+    out_most: tuple
+    links: tuple
+    pipes: tuple
+    pumps: tuple
+    inflow: tuple
+    knee: float
+    empty: tuple
+
+
+def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> Rates:
+    """Return the Rates of all plants whose parameters lie between those of two networks.
+
+    Parameters
+    ----------
+    least, most : TankNetwork
+        Lower and upper end of every parameter; the topology is that of `least`.
+    inflow : (n,) largest inflow disturbance into each tank [cm^3/s]
+    step : longest integration step [s], for plants with `bottom`
+    """
+    n = least.tanks
+    slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
+    out, out_most = ([plant.drain[i] for i in range(n)] for plant in (least, most))
+    for k, (source, _) in enumerate(least.links):
+        out[source] = out[source] + least.orifice[k]
+        out_most[source] = out_most[source] + most.orifice[k]
+    everything = list(out_most)
+    for k, ends in enumerate(least.pipes):
+        for i in ends:
+            everything[i] = everything[i] + most.pipe[k]
+    links = tuple(
+        (source, sink, least.orifice[k] * slow / most.area[sink], most.orifice[k] * fast / least.area[sink])
+        for k, (source, sink) in enumerate(least.links)
+    )
+    pipes = tuple(
+        (i, j, least.pipe[k] * slow / most.area[i], most.pipe[k] * fast / least.area[i])
+        for k, ends in enumerate(least.pipes)
+        for i, j in (ends, ends[::-1])
+    )
+    pumps: tuple[dict, ...] = tuple({} for _ in range(n))
+    for j, (first, second) in enumerate(least.feeds):
+        share = (least.split[j], most.split[j]) if second is not None else (1.0, 1.0)
+        _feed(pumps[first], j, least, most, first, *share)
+        if second is not None:
+            _feed(pumps[second], j, least, most, second, 1.0 - share[1], 1.0 - share[0])
+    # with `bottom`, outflow is limited below this level (see TankNetwork.limited)
+    empty = tuple(
+        (step * fast * everything[i] / least.area[i]) ** 2 if least.bottom else 0.0 for i in range(n)
+    )
+    return Rates(
+        out=tuple(out[i] * slow / most.area[i] for i in range(n)),
+        out_most=tuple(out_most[i] * fast / least.area[i] for i in range(n)),
+        links=links,
+        pipes=pipes,
+        pumps=pumps,
+        inflow=tuple(inflow[i] / least.area[i] for i in range(n)),
+        knee=least.knee,
+        empty=empty,
+    )
+
+
+def _feed(pumps, pump, least, most, tank, share_least, share_most):
+    """Add the gains of one pump into `tank` to {pump: (least, largest)} [cm/(s V)]."""
+    before = pumps.get(pump, (0.0, 0.0))
+    pumps[pump] = (
+        before[0] + least.pump_gain[pump] * share_least / most.area[tank],
+        before[1] + most.pump_gain[pump] * share_most / least.area[tank],
+    )
+
+
+def rise(rates: Rates, tank: int, level: Any, others: Any) -> Any:
+    """Return Phi_max [cm/s]: the largest rate of a tank's level when its pumps stand still.
+
+        Phi_max(h) = -c_min s(h) + sum_in c_max s(h_k) + sum_pipes P(h_k - h) + d_max,
+        P(z) = p_max s(z) for z >= 0, p_min s(z) for z < 0
+
+    Parameters
+    ----------
+    level : (...) the least the level may be [cm]; Phi_max never rises with it
+    others : (n) the most the other levels may be [cm]
+    """
+    h = at_least(level, 0.0)
+    rate = rates.inflow[tank] - rates.out[tank] * root(h, rates.knee)
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            s = signed_root(others[j] - h, rates.knee)
+            rate = rate + jnp.where(s >= 0.0, most, least) * s
+    rate = jnp.where(h < rates.empty[tank], _inflows_only(rates, tank, h, others), rate)
+    for source, sink, _, most in rates.links:
+        if sink == tank:
+            rate = rate + most * root(at_least(others[source], 0.0), rates.knee)
+    return rate
+
+
+def _inflows_only(rates, tank, h, others):
+    """Phi_max [cm/s] without orifices of other tanks, where nothing may flow out."""
+    rate = rates.inflow[tank]
+    for i, j, _, most in rates.pipes:
+        if i == tank:
+            rate = rate + most * at_least(signed_root(others[j] - h, rates.knee), 0.0)
+    return rate
