@@ -95,7 +95,9 @@ def box_of(plant: TankNetwork, spread: Mapping[str, float]) -> tuple[TankNetwork
         if field not in {f.name for f in dataclasses.fields(plant)} or field == "rim":
             raise InputError(f"safety_filter: {name} is no parameter of this plant's flows")
         if not 0.0 <= share < 1.0:
-            raise InputError(f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1")
+            raise InputError(
+                f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
+            )
         value = np.asarray(getattr(plant, field), dtype=float)
         ends[0][field], ends[1][field] = value * (1.0 - share), value * (1.0 + share)
     if "split" in ends[1]:
@@ -105,7 +107,7 @@ def box_of(plant: TankNetwork, spread: Mapping[str, float]) -> tuple[TankNetwork
 
 
 def band_of(sensor: LevelSensor) -> np.ndarray:
-    """Return the (n,) band of the readings [cm]: 6 standard deviations, half an ADC step, offset."""
+    """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset."""
     band = SIGMAS * np.asarray(sensor.noise, dtype=float)
     if sensor.offset is not None:
         band = band + np.abs(np.asarray(sensor.offset, dtype=float))
@@ -147,7 +149,8 @@ def design(
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
     rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
     substeps : integration steps of a hold
-    start : (n,) levels at t = 0 [cm], which must lie below the limits
+    start : (n,) highest levels at t = 0 [cm]. Without it a certificate holds for starts at or below
+        the limits, and no tank counts as one that full pumps cannot fill
 
     Raises
     ------
@@ -177,12 +180,32 @@ def design(
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, MARGIN * bound) if rate is None else float(rate)
     wanted = np.asarray(plant.rim if limit is None else limit, dtype=float)
     wanted = np.minimum(np.broadcast_to(wanted, (n,)), setting.top)
-    heights, slopes, reasons = _limits(setting, wanted, _reachable(setting, wanted, plant.rim), kappa)
-    rows = [
-        _judge(setting, i, heights, slopes, reasons[i], kappa, bound, start) for i in range(n)
-    ]
-    reach = _reach(setting, heights, slopes, [r.certified for r in rows], plant)
+    x0 = wanted if start is None else np.broadcast_to(np.asarray(start, dtype=float), (n,))
+    heights = np.minimum(wanted, np.maximum(_filled(setting, wanted, x0), x0))
+    before = heights.copy()
+    heights, slopes, reasons = _limits(setting, heights, kappa)
+    idle = (heights == before) & (heights < wanted)  # full pumps cannot reach the limit
+    for i in range(n):
+        reasons[i] = reasons[i] or _failed(
+            setting, i, heights, slopes, idle[i], kappa, bound, start
+        )
+    reach = _settle(setting, heights, slopes, idle, reasons, plant)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
+    proved = _theorem(setting)
+    rows = tuple(
+        TankCertificate(
+            tank=i,
+            limit=float(wanted[i] if idle[i] else heights[i]),
+            certified=not reasons[i],
+            reason=reasons[i]
+            or ("full pumps stay below" if idle[i] else "Theorem 2" if slopes[i] > 0.0 else proved),
+            rate=kappa,
+            rate_bound=bound,
+            gap=0.0 if idle[i] else _gap(setting, nominal, i, kappa, heights[i], reach),
+            reach=float(reach[i]),
+        )
+        for i in range(n)
+    )
     found = SafetyFilter(
         least=least,
         most=most,
@@ -193,11 +216,9 @@ def design(
         inflow=np.array(inflow),
         slope=slopes,
         age=setting.delay + lag,
-        held=tuple(i for i in range(n) if coefficients.pumps[i] or slopes[i] > 0.0),
-    )
-    rows = tuple(
-        dataclasses.replace(row, reach=float(reach[row.tank]), gap=_gap(setting, nominal, row, reach))
-        for row in rows
+        held=tuple(
+            i for i in range(n) if not idle[i] and (coefficients.pumps[i] or slopes[i] > 0.0)
+        ),
     )
     return found, rows
 
@@ -242,20 +263,26 @@ def _unstoppable(setting, tank):
     return sum(b * max(setting.low[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
 
 
-def _reachable(setting, wanted, rim):
-    """(n,) starting limits [cm]: the wanted ones, or what full pumps can reach at worst."""
-    heights, rates = np.array(wanted), setting.rates
-    for _ in range(len(heights)):
-        for i in range(len(heights)):
-            if any(tank == i for tank, *_ in rates.pipes) or rates.out[i] == 0.0:
-                continue
-            full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[i].items())
-            brought = full + phi(rates, i, 0.0, heights)
-            heights[i] = min(wanted[i], max((brought / rates.out[i]) ** 2, rates.empty[i], 1e-9))
-    return heights
+def _filled(setting, wanted, start):
+    """(n,) levels [cm] to which full pumps fill the tanks at most, no tank above its wanted limit
+    or its start; inf for tanks with pipes.
+    """
+    filled, rates = np.full(len(wanted), np.inf), setting.rates
+    for _ in filled:
+        others = np.minimum(wanted, np.maximum(filled, start))
+        for i in range(len(filled)):
+            if not any(tank == i for tank, *_ in rates.pipes):
+                rest = _rest(rates, i, _full(setting, i), others)
+                filled[i] = max(rest, rates.empty[i])
+    return filled
 
 
-def _limits(setting, wanted, heights, kappa):
+def _full(setting, tank):
+    """What full pumps bring at most [cm/s]."""
+    return sum(b * max(setting.high[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def _limits(setting, heights, kappa):
     """(limits (n,) [cm], k1 (n,) [1/s], {tank: why it failed}): Theorem 2.
 
     A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
@@ -267,21 +294,21 @@ def _limits(setting, wanted, heights, kappa):
         changed = False
         for i in range(n):
             excess = phi(rates, i, heights[i], heights) + _unstoppable(setting, i)
-            if excess <= 0.0 or slopes[i] > 0.0 or reasons[i]:
+            if excess <= 1e-12 or slopes[i] > 0.0 or reasons[i]:
                 continue
             slopes[i], why = _second_order(setting, i, heights, kappa)
             if slopes[i] > 0.0:
                 continue
             sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
             pressed = sum(most * _root(heights[j], rates.knee) for j, most in sources)
-            room = rates.out[i] * _root(heights[i], rates.knee) - (
+            margin = rates.out[i] * _root(heights[i], rates.knee) - (
                 excess + rates.out[i] * _root(heights[i], rates.knee) - pressed
             )
-            if not sources or room <= 0.0:
+            if not sources or margin <= 0.0:
                 reasons[i] = _rim_words(setting, i, heights) + (f"; {why}" if why else "")
                 continue
             for j, _ in sources:
-                heights[j] *= (room / pressed) ** 2 * (1.0 - 1e-12)
+                heights[j] *= (margin / pressed) ** 2 * (1.0 - 1e-12)
             changed = True
         if not changed:
             break
@@ -293,11 +320,13 @@ def _rim_words(setting, tank, heights):
     rates = setting.rates
     leaves = rates.out[tank] * _root(heights[tank], rates.knee)
     enters = phi(rates, tank, heights[tank], heights) + leaves + _unstoppable(setting, tank)
-    return f"rim condition: {enters:.3g} cm/s may enter at the limit, {leaves:.3g} leave for certain"
+    return (
+        f"rim condition: {enters:.3g} cm/s may enter at the limit, {leaves:.3g} leave for certain"
+    )
 
 
 def _second_order(setting, tank, heights, kappa):
-    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the condition that failed)."""
+    """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the failed condition)."""
     rates, hold = setting.rates, setting.hold
     sources = [(j, least, most) for j, sink, least, most in rates.links if sink == tank]
     above = {j for j, *_ in sources}
@@ -342,63 +371,86 @@ def _crossing(out, k1, top, full):
     return min(root**2, top)
 
 
-def _judge(setting, tank, heights, slopes, why, kappa, bound, start):
-    """The TankCertificate of one tank, without gap and reach."""
-    rates = setting.rates
-    reason, theorem = why, "Theorem 2" if slopes[tank] > 0.0 else "Theorem 1"
-    delayed = setting.delay > 0.0 or setting.lag > 0.0
-    if delayed and slopes[tank] == 0.0:
-        theorem = "Theorem 4" if setting.lag > 0.0 else "Theorem 3"
-    if not reason and setting.pulse:
-        reason = "a pulse dead zone pays out more than was commanded"
-    if not reason and kappa > bound * (1.0 + 1e-12):
-        reason = f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
-    if not reason and delayed:
-        reason = _delayed(setting, tank, heights, kappa, bound)
-    if not reason and start is not None and np.asarray(start)[tank] > heights[tank]:
-        reason = f"start at {np.asarray(start)[tank]:.4g} cm, above the limit"
-    return TankCertificate(
-        tank=tank,
-        limit=float(heights[tank]),
-        certified=not reason,
-        reason=reason or theorem,
-        rate=kappa,
-        rate_bound=bound,
-        gap=math.nan,
-        reach=math.inf,
-    )
+def _theorem(setting):
+    """The theorem that proves the limit of a tank with a pump."""
+    if setting.lag > 0.0:
+        return "Theorem 4"
+    return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
 
 
-def _delayed(setting, tank, heights, kappa, bound):
-    """The condition of Theorems 3 and 4 that fails, or ""."""
+def _failed(setting, tank, heights, slopes, idle, kappa, bound, start):
+    """The condition that keeps the limit of one tank from being proved, or ""."""
     rates = setting.rates
+    if start is not None and np.asarray(start)[tank] > heights[tank] * (1.0 + 1e-12):
+        return f"start at {np.asarray(start)[tank]:.4g} cm, above the limit {heights[tank]:.4g} cm"
+    if idle:
+        return ""
+    if setting.pulse:
+        return "a pulse dead zone pays out more than was commanded"
+    if kappa > bound * (1.0 + 1e-12):
+        return f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
+    if slopes[tank] > 0.0:
+        return _too_high_above(setting, tank, heights, slopes, start)
+    if not rates.pumps[tank] or (setting.delay == 0.0 and setting.lag == 0.0):
+        return ""
     if any(i == tank for i, *_ in rates.pipes):
         return "a pipe with dead time or lag: not proved"
     steep = rates.out[tank] / math.sqrt(heights[tank])
     if kappa < steep:
         return f"(N) kappa {kappa:.3g} below c_min/sqrt(H) = {steep:.3g} 1/s"
     if setting.lag > 0.0:
-        full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[tank].items())
-        rise = (full + phi(rates, tank, 0.0, heights)) * (2 * setting.lag + setting.delay + setting.hold)
-        if rise > 0.75 * heights[tank]:
-            return f"(F) {rise:.3g} cm may be filled within the lag: above 3/4 of the limit"
+        brought = _full(setting, tank) + phi(rates, tank, 0.0, heights)
+        filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
+        if filled > 0.75 * heights[tank]:
+            return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
     return ""
 
 
-def _reach(setting, heights, slopes, certified, plant):
+def _too_high_above(setting, tank, heights, slopes, start):
+    """Why the levels `start` do not allow a second-order row to begin (g >= 0), or ""."""
+    if start is None:
+        return ""
+    start, rates, knee = np.asarray(start), setting.rates, setting.rates.knee
+    a0 = FLOOR * _root(heights[tank], knee)
+    g = rates.out[tank] * _root(start[tank], knee)
+    g += slopes[tank] * (heights[tank] - start[tank])
+    for j, sink, _, most in rates.links:
+        if sink == tank:
+            g -= most * max(_root(start[j], knee), a0)
+    return "" if g >= 0.0 else "start: the tanks above hold more than can be stopped in time"
+
+
+def _settle(setting, heights, slopes, idle, reasons, plant):
+    """(n,) levels that no tank passes [cm]. A tank that relies on one which is not certified loses
+    its certificate (in `reasons`) unless its condition holds for what that one may reach.
+    """
+    rates, n = setting.rates, len(heights)
+    while True:
+        reach = _reach(setting, heights, [not why for why in reasons], plant)
+        before = list(reasons)
+        for i in (i for i in range(n) if not reasons[i]):
+            extra = _full(setting, i) if idle[i] else _unstoppable(setting, i)
+            above = [j + 1 for j, sink, *_ in rates.links if sink == i and reasons[j]]
+            fails = phi(rates, i, heights[i], reach) + extra > 1e-9 * max(rates.out[i], 1e-9)
+            if above if slopes[i] > 0.0 else fails:
+                others = above or [j + 1 for j in range(n) if reasons[j]]
+                reasons[i] = f"relies on tank {', '.join(map(str, others))}, not certified"
+        if reasons == before:
+            return reach
+
+
+def _reach(setting, heights, certified, plant):
     """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest."""
     rates, n = setting.rates, len(heights)
     rim = np.asarray(plant.rim, dtype=float)
     reach = np.array(heights)
     for _ in range(50):
         before = reach.copy()
-        for i in range(n):
-            if not certified[i]:
-                full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in rates.pumps[i].items())
-                reach[i] = max(reach[i], _rest(rates, i, full, reach))
-                if plant.overflow:
-                    reach[i] = min(reach[i], max(rim[i], heights[i]))
-        if np.allclose(reach, before, rtol=1e-9):
+        for i in (i for i in range(n) if not certified[i]):
+            reach[i] = max(reach[i], _rest(rates, i, _full(setting, i), reach))
+            if plant.overflow:
+                reach[i] = min(reach[i], max(rim[i], heights[i]))
+        if np.allclose(reach, before, rtol=1e-9, atol=0.0):
             return reach
     return np.where(certified, heights, rim if plant.overflow else np.inf)
 
@@ -409,25 +461,24 @@ def _rest(rates, tank, full, others):
     return math.inf if level == 1e6 else level * (1.0 + 1e-9)
 
 
-def _gap(setting, nominal, row, reach):
+def _gap(setting, nominal, tank, kappa, limit, reach):
     """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
-    full, or its limit where that is lower.
+    full, or its limit where that is lower; nan for a tank without a pump.
     """
-    rates, i = setting.rates, row.tank
-    if not rates.pumps[i]:
+    rates, eps = setting.rates, setting.band[tank]
+    if not rates.pumps[tank]:
         return math.nan
-    most = sum(b for _, b in rates.pumps[i].values())
-    full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[i].items())
-    gain = sum(b for _, b in nominal.pumps[i].values())
+    most = sum(b for _, b in rates.pumps[tank].values())
+    full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[tank].items())
+    gain = sum(b for _, b in nominal.pumps[tank].values())
     others = np.minimum(reach, 1e6)
 
     def filtered(h):
-        low = h - setting.band[i]
-        cap = max(0.0, row.rate * (row.limit - h - setting.band[i]) - phi(rates, i, low, others))
-        return min(full, gain / most * cap) + phi(nominal, i, h, others)
+        cap = max(0.0, kappa * (limit - h - eps) - phi(rates, tank, h - eps, others))
+        return min(full, gain / most * cap) + phi(nominal, tank, h, others)
 
-    free = lambda h: full + phi(nominal, i, h, others)
-    return _highest(free, row.limit) - _highest(filtered, row.limit)
+    free = lambda h: full + phi(nominal, tank, h, others)
+    return float(_highest(free, limit) - _highest(filtered, limit))
 
 
 def _highest(rate, top):

@@ -141,8 +141,8 @@ class SafetyFilter:
     def _row_above(self, r, tank, y, hold):
         """Return the row of a tank without a pump on the pumps of the tanks that feed it.
 
-            g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
-            sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
+        g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
+        sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
         """
         s = lambda h: root(at_least(h, 0.0), r.knee)
         k1, k2, top, eps = self.slope[tank], self.rate[tank], self.limit[tank], self.band[tank]

@@ -52,7 +52,12 @@ def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> R
         for i in ends:
             everything[i] = everything[i] + most.pipe[k]
     links = tuple(
-        (source, sink, least.orifice[k] * slow / most.area[sink], most.orifice[k] * fast / least.area[sink])
+        (
+            source,
+            sink,
+            least.orifice[k] * slow / most.area[sink],
+            most.orifice[k] * fast / least.area[sink],
+        )
         for k, (source, sink) in enumerate(least.links)
     )
     pipes = tuple(
@@ -68,7 +73,8 @@ def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> R
             _feed(pumps[second], j, least, most, second, 1.0 - share[1], 1.0 - share[0])
     # with `bottom`, outflow is limited below this level (see TankNetwork.limited)
     empty = tuple(
-        (step * fast * everything[i] / least.area[i]) ** 2 if least.bottom else 0.0 for i in range(n)
+        (step * fast * everything[i] / least.area[i]) ** 2 if least.bottom else 0.0
+        for i in range(n)
     )
     return Rates(
         out=tuple(out[i] * slow / most.area[i] for i in range(n)),
