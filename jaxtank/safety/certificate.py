@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
-from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.network import TankNetwork
 from jaxtank.safety.filter import FLOOR, SafetyFilter
@@ -61,7 +61,12 @@ class _Setting(NamedTuple):
     high: np.ndarray
     band: np.ndarray
     top: np.ndarray
+    spare: np.ndarray
     pulse: bool
+
+    def phi(self, tank, level, others):
+        """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
+        return phi(self.rates, tank, level, np.asarray(others) + self.spare)
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -83,27 +88,55 @@ def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
     return d**d / (d + 1) ** (d + 1) / hold
 
 
-def box_of(plant: TankNetwork, spread: Mapping[str, float]) -> tuple[TankNetwork, TankNetwork]:
+def box_of(plant: TankNetwork, widths: Mapping[str, ArrayLike]) -> tuple[TankNetwork, TankNetwork]:
     """Return the plants at the lower and the upper end of a box.
 
-    spread : {parameter of the plant, with or without "plant." : share by which it may be off}
-    Raises InputError for a name that the plant does not have, or a share outside [0, 1).
+    Parameters
+    ----------
+    widths : {parameter of the plant: half width of its interval, in its unit}; "drain", or
+        "plant.drain", or one entry, "plant.drain[1]"
+
+    Raises
+    ------
+    InputError
+        for a name that the plant's flows do not have, or an interval that reaches 0
     """
-    ends = ({}, {})
-    for name, share in spread.items():
-        field = name.removeprefix("plant.")
-        if field not in {f.name for f in dataclasses.fields(plant)} or field == "rim":
+    ends: tuple[dict, dict] = ({}, {})
+    flows = {f.name for f in dataclasses.fields(plant) if f.metadata.get("kind") == "leaf"}
+    for name, width in widths.items():
+        field, _, entry = name.removeprefix("plant.").partition("[")
+        if field not in flows - {"rim", "caught"}:
             raise InputError(f"safety_filter: {name} is no parameter of this plant's flows")
-        if not 0.0 <= share < 1.0:
-            raise InputError(
-                f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
-            )
-        value = np.asarray(getattr(plant, field), dtype=float)
-        ends[0][field], ends[1][field] = value * (1.0 - share), value * (1.0 + share)
+        value = np.array(getattr(plant, field), dtype=float)
+        half = np.zeros(value.shape)
+        half[int(entry[:-1]) if entry else ...] = width
+        for end, sign in zip(ends, (-1.0, 1.0)):
+            end[field] = end.get(field, value) + sign * half
+        if np.any(ends[0][field] < 0.0) or (
+            field not in ("drain", "orifice", "pipe", "split") and np.any(ends[0][field] <= 0.0)
+        ):
+            raise InputError(f"safety_filter: the interval of {name} reaches below 0")
     if "split" in ends[1]:
         ends[1]["split"] = np.minimum(ends[1]["split"], 1.0)
     least, most = (dataclasses.replace(plant, **end) for end in ends)
     return least, most
+
+
+def widths_of(plant: TankNetwork, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
+    """Return the half widths of `box_of` for parameters that may be off by a share of their value.
+
+    Raises InputError for a share outside [0, 1).
+    """
+    found = {}
+    for name, share in spread.items():
+        if not 0.0 <= share < 1.0:
+            raise InputError(
+                f"safety_filter: spread of {name} = {share:g}: must be from 0 to below 1"
+            )
+        field, _, entry = name.removeprefix("plant.").partition("[")
+        value = np.asarray(getattr(plant, field, 0.0), dtype=float)
+        found[name] = share * (value[int(entry[:-1])] if entry else value)
+    return found
 
 
 def band_of(sensor: LevelSensor) -> np.ndarray:
@@ -125,13 +158,14 @@ def top_of(sensor: LevelSensor, tanks: int) -> np.ndarray:
 
 def design(
     plant: TankNetwork,
-    actuator: PumpBank,
+    actuator: Actuator,
     sensor: LevelSensor,
     hold: float,
     *,
-    spread: Mapping[str, float],
+    widths: Mapping[str, ArrayLike],
     limit: ArrayLike | None = None,
     inflow: ArrayLike = 0.0,
+    volume: ArrayLike = 0.0,
     band: ArrayLike | None = None,
     rate: float | None = None,
     substeps: int = 1,
@@ -143,9 +177,12 @@ def design(
     ----------
     plant, actuator, sensor : the rig
     hold : longest time for which an input is held [s]
-    spread : {parameter: share}, the box: each entry of each may be off by its share, each by itself
+    widths : {parameter: half width of its interval, in its unit}, the box (see `widths_of`): each
+        entry of each lies somewhere in its interval, and may change there in time
     limit : (n,) wanted limits [cm]; the rims where it is left out. Limits may come out lower
     inflow : (n,) largest inflow disturbance [cm^3/s]
+    volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]; limits are
+        lowered by it
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
     rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
     substeps : integration steps of a hold
@@ -160,26 +197,30 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n = plant.tanks
-    least, most = box_of(plant, spread)
+    least, most = box_of(plant, widths)
     inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (n,))
     eps = band_of(sensor) if band is None else np.broadcast_to(np.asarray(band, dtype=float), (n,))
     coefficients = jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps))
-    lag = 0.0 if actuator.lag is None else float(np.max(actuator.lag))
+    lags, zone = getattr(actuator, "lag", None), getattr(actuator, "dead_zone", None)
+    lag = 0.0 if lags is None else float(np.max(lags))
     setting = _Setting(
         rates=coefficients,
         hold=float(hold),
         delay=float(actuator.delay),
         lag=lag,
         low=np.asarray(actuator.low, dtype=float),
-        high=_driving(actuator),
+        high=np.asarray(actuator.high, dtype=float) - actuator.offset,
         band=eps,
         top=top_of(sensor, n),
-        pulse=actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse",
+        spare=np.broadcast_to(np.asarray(volume, dtype=float), (n,)) / np.asarray(least.area),
+        pulse=zone is not None and getattr(actuator, "dead_zone_kind", "") == "pulse",
     )
     bound = rate_bound(setting.hold, setting.delay, lag)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, MARGIN * bound) if rate is None else float(rate)
     wanted = np.asarray(plant.rim if limit is None else limit, dtype=float)
-    wanted = np.minimum(np.broadcast_to(wanted, (n,)), setting.top)
+    wanted = np.minimum(np.broadcast_to(wanted, (n,)), setting.top) - setting.spare
+    if np.any(wanted <= 0.0):
+        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
     x0 = wanted if start is None else np.broadcast_to(np.asarray(start, dtype=float), (n,))
     heights = np.minimum(wanted, np.maximum(_filled(setting, wanted, x0), x0))
     before = heights.copy()
@@ -195,14 +236,14 @@ def design(
     rows = tuple(
         TankCertificate(
             tank=i,
-            limit=float(wanted[i] if idle[i] else heights[i]),
+            limit=float((wanted if idle[i] else heights)[i] + setting.spare[i]),
             certified=not reasons[i],
             reason=reasons[i]
             or ("full pumps stay below" if idle[i] else "Theorem 2" if slopes[i] > 0.0 else proved),
             rate=kappa,
             rate_bound=bound,
             gap=0.0 if idle[i] else _gap(setting, nominal, i, kappa, heights[i], reach),
-            reach=float(reach[i]),
+            reach=float(reach[i] + setting.spare[i]),
         )
         for i in range(n)
     )
@@ -210,7 +251,8 @@ def design(
         least=least,
         most=most,
         limit=heights,
-        reach=np.minimum(reach, 1e6),
+        reach=np.minimum(reach + setting.spare, 1e6),
+        spare=setting.spare,
         rate=np.full(n, kappa),
         band=np.array(eps),
         inflow=np.array(inflow),
@@ -226,14 +268,6 @@ def design(
 def _plain(value):
     """A number of Rates as a float; an index as it is."""
     return value if isinstance(value, int) else float(value)
-
-
-def _driving(actuator):
-    """(m,) largest inputs that move liquid [V]."""
-    high = np.asarray(actuator.high, dtype=float)
-    if actuator.dead_zone is not None and actuator.dead_zone_kind == "offset":
-        return np.maximum(high - np.asarray(actuator.dead_zone, dtype=float), 0.0)
-    return high
 
 
 def phi(rates: Rates, tank: int, level: float, others: Any) -> float:
@@ -272,7 +306,7 @@ def _filled(setting, wanted, start):
         others = np.minimum(wanted, np.maximum(filled, start))
         for i in range(len(filled)):
             if not any(tank == i for tank, *_ in rates.pipes):
-                rest = _rest(rates, i, _full(setting, i), others)
+                rest = _rest(setting, i, others)
                 filled[i] = max(rest, rates.empty[i])
     return filled
 
@@ -293,14 +327,16 @@ def _limits(setting, heights, kappa):
     for _ in range(4 * n):
         changed = False
         for i in range(n):
-            excess = phi(rates, i, heights[i], heights) + _unstoppable(setting, i)
+            excess = setting.phi(i, heights[i], heights) + _unstoppable(setting, i)
             if excess <= 1e-12 or slopes[i] > 0.0 or reasons[i]:
                 continue
             slopes[i], why = _second_order(setting, i, heights, kappa)
             if slopes[i] > 0.0:
                 continue
             sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
-            pressed = sum(most * _root(heights[j], rates.knee) for j, most in sources)
+            pressed = sum(
+                most * _root(heights[j] + setting.spare[j], rates.knee) for j, most in sources
+            )
             margin = rates.out[i] * _root(heights[i], rates.knee) - (
                 excess + rates.out[i] * _root(heights[i], rates.knee) - pressed
             )
@@ -319,7 +355,7 @@ def _rim_words(setting, tank, heights):
     """The rim condition with both of its numbers."""
     rates = setting.rates
     leaves = rates.out[tank] * _root(heights[tank], rates.knee)
-    enters = phi(rates, tank, heights[tank], heights) + leaves + _unstoppable(setting, tank)
+    enters = setting.phi(tank, heights[tank], heights) + leaves + _unstoppable(setting, tank)
     return (
         f"rim condition: {enters:.3g} cm/s may enter at the limit, {leaves:.3g} leave for certain"
     )
@@ -399,7 +435,7 @@ def _failed(setting, tank, heights, slopes, idle, kappa, bound, start):
     if kappa < steep:
         return f"(N) kappa {kappa:.3g} below c_min/sqrt(H) = {steep:.3g} 1/s"
     if setting.lag > 0.0:
-        brought = _full(setting, tank) + phi(rates, tank, 0.0, heights)
+        brought = _full(setting, tank) + setting.phi(tank, 0.0, heights)
         filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
         if filled > 0.75 * heights[tank]:
             return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
@@ -431,7 +467,7 @@ def _settle(setting, heights, slopes, idle, reasons, plant):
         for i in (i for i in range(n) if not reasons[i]):
             extra = _full(setting, i) if idle[i] else _unstoppable(setting, i)
             above = [j + 1 for j, sink, *_ in rates.links if sink == i and reasons[j]]
-            fails = phi(rates, i, heights[i], reach) + extra > 1e-9 * max(rates.out[i], 1e-9)
+            fails = setting.phi(i, heights[i], reach) + extra > 1e-9 * max(rates.out[i], 1e-9)
             if above if slopes[i] > 0.0 else fails:
                 others = above or [j + 1 for j in range(n) if reasons[j]]
                 reasons[i] = f"relies on tank {', '.join(map(str, others))}, not certified"
@@ -441,13 +477,12 @@ def _settle(setting, heights, slopes, idle, reasons, plant):
 
 def _reach(setting, heights, certified, plant):
     """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest."""
-    rates, n = setting.rates, len(heights)
-    rim = np.asarray(plant.rim, dtype=float)
+    n, rim = len(heights), np.asarray(plant.rim, dtype=float)
     reach = np.array(heights)
     for _ in range(50):
         before = reach.copy()
         for i in (i for i in range(n) if not certified[i]):
-            reach[i] = max(reach[i], _rest(rates, i, _full(setting, i), reach))
+            reach[i] = max(reach[i], _rest(setting, i, reach))
             if plant.overflow:
                 reach[i] = min(reach[i], max(rim[i], heights[i]))
         if np.allclose(reach, before, rtol=1e-9, atol=0.0):
@@ -455,9 +490,10 @@ def _reach(setting, heights, certified, plant):
     return np.where(certified, heights, rim if plant.overflow else np.inf)
 
 
-def _rest(rates, tank, full, others):
+def _rest(setting, tank, others):
     """Level [cm] at which a tank rests with the most that may enter; inf if it never does."""
-    level = _highest(lambda h: full + phi(rates, tank, h, others), 1e6)
+    full = _full(setting, tank)
+    level = _highest(lambda h: full + setting.phi(tank, h, others), 1e6)
     return math.inf if level == 1e6 else level * (1.0 + 1e-9)
 
 
@@ -471,7 +507,7 @@ def _gap(setting, nominal, tank, kappa, limit, reach):
     most = sum(b for _, b in rates.pumps[tank].values())
     full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[tank].items())
     gain = sum(b for _, b in nominal.pumps[tank].values())
-    others = np.minimum(reach, 1e6)
+    others = np.minimum(reach + setting.spare, 1e6)
 
     def filtered(h):
         cap = max(0.0, kappa * (limit - h - eps) - phi(rates, tank, h - eps, others))

@@ -10,9 +10,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.numerics import at_least, clip, root
+from jaxtank.core.numerics import clip, lower_clip, smooth_sqrt
 from jaxtank.core.tree import component, leaf, static
-from jaxtank.instruments.actuators import PumpBank, allocate
+from jaxtank.instruments.actuators import allocate
+from jaxtank.instruments.base import Actuator
 from jaxtank.plants.network import TankNetwork
 from jaxtank.safety.worst_case import rates_of, rise
 
@@ -49,6 +50,12 @@ class SafetyFilter:
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
     )
+    spare: np.ndarray = leaf(
+        "cm",
+        "(n,) rise by volumes that may enter besides, in all",
+        low=0.0,
+        default=lambda own: np.zeros(np.shape(own["limit"])),
+    )
     age: np.ndarray = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
@@ -60,7 +67,7 @@ class SafetyFilter:
     )
 
     def apply(
-        self, actuator: PumpBank, command: Sequence, metric: tuple | None, y: Sequence, hold: Any
+        self, actuator: Actuator, command: Sequence, metric: tuple | None, y: Sequence, hold: Any
     ) -> tuple:
         """Return the (m) inputs within the pumps' limits and the caps [V] for a command (m) [V].
 
@@ -75,8 +82,8 @@ class SafetyFilter:
         """
         pumps = range(actuator.pumps)
         low, dead = [actuator.low[j] for j in pumps], [0.0 for _ in pumps]
-        if actuator.dead_zone is not None and actuator.dead_zone_kind == "offset":
-            dead = [actuator.dead_zone[j] for j in pumps]
+        if np.ndim(actuator.offset):
+            dead = [actuator.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
         caps, shared = self.limits(y, hold, low, high)
         caps = tuple(cap + zone for cap, zone in zip(caps, dead))
@@ -99,7 +106,7 @@ class SafetyFilter:
             row = {j: 0.5 * (a + b) for j, (a, b) in r.pumps[o].items()}
             for source, sink, a, b in () if row else r.links:
                 if sink == o:
-                    steep = 0.25 * (a + b) / root(at_least(y[source], 10.0 * knee), knee)
+                    steep = 0.25 * (a + b) / smooth_sqrt(lower_clip(y[source], 10.0 * knee), knee)
                     for j, (c, d) in r.pumps[source].items():
                         row[j] = row.get(j, 0.0) + steep * 0.5 * (c + d)
             first, second = row.get(0, 0.0), row.get(1, 0.0)
@@ -119,7 +126,9 @@ class SafetyFilter:
         n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold)
         fastest = [self._fastest(r, i, high) for i in range(n)]
         above = [
-            jnp.minimum(self.reach[i], y[i] + self.band[i] + (hold + self.age) * fastest[i])
+            jnp.minimum(
+                self.reach[i], y[i] + self.band[i] + (hold + self.age) * fastest[i] + self.spare[i]
+            )
             for i in range(n)
         ]
         rows = []
@@ -128,15 +137,15 @@ class SafetyFilter:
                 m = self.rate[i] * (self.limit[i] - y[i] - self.band[i]) - rise(
                     r, i, y[i] - self.band[i], above
                 )
-                rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, at_least(m, 0.0)))
+                rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, lower_clip(m, 0.0)))
             else:
                 rows.append(self._row_above(r, i, y, hold))
         return rows
 
     def _fastest(self, r, tank, high):
         """Largest rate of a level [cm/s]: all pumps at `high`, all other tanks at `reach`."""
-        pumped = sum(b * at_least(high[j], 0.0) for j, (_, b) in r.pumps[tank].items())
-        return pumped + at_least(rise(r, tank, 0.0, self.reach), 0.0)
+        pumped = sum(b * lower_clip(high[j], 0.0) for j, (_, b) in r.pumps[tank].items())
+        return pumped + lower_clip(rise(r, tank, 0.0, self.reach), 0.0)
 
     def _row_above(self, r, tank, y, hold):
         """Return the row of a tank without a pump on the pumps of the tanks that feed it.
@@ -144,7 +153,7 @@ class SafetyFilter:
         g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
         sum_j c_j,max b_j,max S_j u_j <= M = max(0, D + k2 g_low - k1^2 (H - l))
         """
-        s = lambda h: root(at_least(h, 0.0), r.knee)
+        s = lambda h: smooth_sqrt(lower_clip(h, 0.0), r.knee)
         k1, k2, top, eps = self.slope[tank], self.rate[tank], self.limit[tank], self.band[tank]
         a0 = FLOOR * s(top)
         sources = [(j, most) for j, sink, _, most in r.links if sink == tank]
@@ -154,12 +163,12 @@ class SafetyFilter:
         for j, most in sources:
             lowest = s(y[j] - self.band[j]) - 0.5 * r.out_most[j] * hold
             drains = drains + jnp.where(lowest >= a0, 0.5 * most * r.out[j], 0.0)
-            g = g - most * at_least(s(y[j] + self.band[j]), a0)
-            steep = most * 0.5 / at_least(lowest, a0)
+            g = g - most * lower_clip(s(y[j] + self.band[j]), a0)
+            steep = most * 0.5 / lower_clip(lowest, a0)
             for pump, (_, b) in r.pumps[j].items():
                 row[pump] = row.get(pump, 0.0) + steep * b
-        lowest = at_least(y[tank] - eps - hold * r.out_most[tank] * s(top), 0.0)
-        m = at_least(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
+        lowest = lower_clip(y[tank] - eps - hold * r.out_most[tank] * s(top), 0.0)
+        m = lower_clip(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
         x = y[tank] + eps + hold * full
         far = r.out[tank] * s(x) + k1 * (top - x) >= full
         return row, jnp.where(far, jnp.inf, m)
@@ -174,7 +183,7 @@ class SafetyFilter:
             if len(row) == 1:
                 ((j, a),) = row.items()
                 cap = jnp.where(a > 0.0, m / jnp.where(a > 0.0, a, 1.0), jnp.inf)
-                caps[j] = jnp.minimum(caps[j], at_least(cap, low[j]))
+                caps[j] = jnp.minimum(caps[j], lower_clip(cap, low[j]))
             else:
                 shared.append((row, m))
         return tuple(caps), shared
@@ -183,7 +192,7 @@ class SafetyFilter:
         """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion."""
         u = list(u)
         for row, m in shared:
-            total = sum(a * at_least(u[j], 0.0) for j, a in row.items())
+            total = sum(a * lower_clip(u[j], 0.0) for j, a in row.items())
             share = jnp.where(total > m, m / jnp.where(total > m, total, 1.0), 1.0)
             for j in row:
                 u[j] = jnp.where(u[j] > 0.0, u[j] * share, u[j])

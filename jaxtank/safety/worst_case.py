@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.core.numerics import at_least, root, signed_root
+from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants.network import TankNetwork
 
 
@@ -108,16 +108,16 @@ def rise(rates: Rates, tank: int, level: Any, others: Any) -> Any:
     level : (...) the least the level may be [cm]; Phi_max never rises with it
     others : (n) the most the other levels may be [cm]
     """
-    h = at_least(level, 0.0)
-    rate = rates.inflow[tank] - rates.out[tank] * root(h, rates.knee)
+    h = lower_clip(level, 0.0)
+    rate = rates.inflow[tank] - rates.out[tank] * smooth_sqrt(h, rates.knee)
     for i, j, least, most in rates.pipes:
         if i == tank:
-            s = signed_root(others[j] - h, rates.knee)
+            s = smooth_signed_sqrt(others[j] - h, rates.knee)
             rate = rate + jnp.where(s >= 0.0, most, least) * s
     rate = jnp.where(h < rates.empty[tank], _inflows_only(rates, tank, h, others), rate)
     for source, sink, _, most in rates.links:
         if sink == tank:
-            rate = rate + most * root(at_least(others[source], 0.0), rates.knee)
+            rate = rate + most * smooth_sqrt(lower_clip(others[source], 0.0), rates.knee)
     return rate
 
 
@@ -126,5 +126,5 @@ def _inflows_only(rates, tank, h, others):
     rate = rates.inflow[tank]
     for i, j, _, most in rates.pipes:
         if i == tank:
-            rate = rate + most * at_least(signed_root(others[j] - h, rates.knee), 0.0)
+            rate = rate + most * lower_clip(smooth_signed_sqrt(others[j] - h, rates.knee), 0.0)
     return rate

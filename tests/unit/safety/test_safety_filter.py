@@ -15,9 +15,14 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import design
-from jaxtank.safety.certificate import rate_bound
+from jaxtank.safety.certificate import rate_bound, widths_of
 
 NAMES = ("drain", "orifice", "pipe", "pump_gain", "split")
+
+
+def of(plant, share):
+    """Half widths of the box of plants whose flows are off by up to `share`."""
+    return widths_of(plant, dict.fromkeys(NAMES, share))
 
 
 def root(h, knee):
@@ -157,7 +162,7 @@ def trial(seed):
     if lag:
         actuator = dataclasses.replace(actuator, lag=np.full(plant.pumps, lag))
     kappa = 0.999 * min(2.0, rate_bound(hold, delay * hold, lag))
-    given = {"spread": dict.fromkeys(NAMES, spread), "band": eps, "rate": kappa, "start": start}
+    given = {"widths": of(plant, spread), "band": eps, "rate": kappa, "start": start}
     sensor = LevelSensor(noise=np.zeros(plant.tanks))
     found, rows = design(plant, actuator, sensor, hold, **given)
     how = {"seconds": 400 * hold, "count": 30, "seed": seed, "start": start}
@@ -187,7 +192,7 @@ def test_every_tank_of_a_preset_is_certified_and_holds(name):
     hold, eps, seconds = PRESETS[name]
     loop = presets.find(name).loop
     start = 0.5 * np.asarray(loop.plant.rim)
-    given = {"spread": dict.fromkeys(NAMES, 0.05), "band": eps, "start": start}
+    given = {"widths": of(loop.plant, 0.05), "band": eps, "start": start}
     found, rows = design(loop.plant, loop.actuator, loop.sensor, hold, **given)
     assert all(r.certified for r in rows)
     low, high = np.maximum(loop.actuator.low, 0.0), np.minimum(loop.actuator.high, 50.0)
@@ -200,10 +205,8 @@ def test_every_tank_of_a_preset_is_certified_and_holds(name):
 
 def test_second_order_rows_and_gaps_are_those_worked_out_by_hand():
     """Of gouta2015: k1 = 0.19 1/s, gap 2 delta c s(H)/kappa = 0.108 cm; of cascaded: k1 = 0.110."""
-    of = lambda name: presets.find(name).loop
-    spread = dict.fromkeys(NAMES, 0.05)
-    loop = of("gouta2015/backstepping")
-    found, rows = design(loop.plant, loop.actuator, loop.sensor, 0.01, spread=spread)
+    loop = presets.find("gouta2015/backstepping").loop
+    found, rows = design(loop.plant, loop.actuator, loop.sensor, 0.01, widths=of(loop.plant, 0.05))
     assert found.slope[:2] == pytest.approx(0.19, abs=0.005)
     c = (
         math.sqrt(2 * 981.0)
@@ -215,8 +218,8 @@ def test_second_order_rows_and_gaps_are_those_worked_out_by_hand():
     )
     # b_max/b c - c_min = (1.05 - 0.95) c
     assert rows[2].gap == pytest.approx(0.1 * c * math.sqrt(30.0) / 2.0, rel=0.01)
-    loop = of("cascaded/pi")
-    found, _ = design(loop.plant, loop.actuator, loop.sensor, 4.0, spread=spread)
+    loop = presets.find("cascaded/pi").loop
+    found, _ = design(loop.plant, loop.actuator, loop.sensor, 4.0, widths=of(loop.plant, 0.05))
     assert found.slope[1] == pytest.approx(0.110, abs=0.002)
 
 
@@ -248,7 +251,7 @@ def sensor_of(plant):
 
 def test_a_rate_above_its_bound_is_not_certified_and_passes_the_limit():
     plant, actuator = one_tank()
-    given = {"spread": {}, "limit": 30.0}
+    given = {"widths": {}, "limit": 30.0}
     found, (row,) = design(plant, actuator, sensor_of(plant), 0.5, rate=2.0, **given)
     assert row.certified and not passes(plant, actuator, found, 0.0).any()
     found, (row,) = design(plant, actuator, sensor_of(plant), 0.5, rate=2.2, **given)
@@ -258,8 +261,7 @@ def test_a_rate_above_its_bound_is_not_certified_and_passes_the_limit():
 
 def test_an_inflow_above_the_certain_outflow_lowers_the_tank_above_or_passes():
     plant, actuator = one_tank(drain=0.3, inflow=0.33)
-    spread = dict.fromkeys(NAMES, 0.05)
-    found, rows = design(plant, actuator, sensor_of(plant), 0.5, spread=spread)
+    found, rows = design(plant, actuator, sensor_of(plant), 0.5, widths=of(plant, 0.05))
     assert [r.certified for r in rows] == [True, True]
     expected = 30.0 * (0.95 * 0.3 / (1.05 * 0.33)) ** 2
     assert found.limit[1] == pytest.approx(expected, rel=1e-6)
@@ -270,7 +272,7 @@ def test_an_inflow_above_the_certain_outflow_lowers_the_tank_above_or_passes():
 
 def test_swapped_ends_of_the_box_pass_the_limit():
     plant, actuator = one_tank(drain=0.3)
-    found, _ = design(plant, actuator, sensor_of(plant), 0.5, spread=dict.fromkeys(NAMES, 0.1))
+    found, _ = design(plant, actuator, sensor_of(plant), 0.5, widths=of(plant, 0.1))
     wrong = dataclasses.replace(
         found, least=dataclasses.replace(found.least, drain=found.most.drain)
     )
@@ -282,7 +284,7 @@ def test_swapped_ends_of_the_box_pass_the_limit():
 def test_a_dead_time_needs_a_smaller_rate(delay):
     plant, actuator = one_tank()
     delayed = dataclasses.replace(actuator, delay=0.5 * delay)
-    given = {"spread": {}, "limit": 30.0}
+    given = {"widths": {}, "limit": 30.0}
     _, (row,) = design(plant, delayed, sensor_of(plant), 0.5, **given)
     assert row.rate_bound == pytest.approx(delay**delay / (delay + 1) ** (delay + 1) / 0.5)
     at_bound, _ = design(plant, delayed, sensor_of(plant), 0.5, rate=row.rate_bound, **given)
@@ -303,7 +305,7 @@ def test_one_tank_with_scipy_and_the_cap_written_apart():
     README of jaxtank/safety, integrated by scipy, is the run of `attack` and stays below.
     """
     plant, actuator = one_tank(drain=0.3)
-    found, _ = design(plant, actuator, sensor_of(plant), 0.5, spread=dict.fromkeys(NAMES, 0.1))
+    found, _ = design(plant, actuator, sensor_of(plant), 0.5, widths=of(plant, 0.1))
     w, kappa = math.sqrt(2 * 981.0), float(found.rate[0])
     c_min, b_max, h = 0.27 * w / 20.0, 8.8 / 20.0, 1.0
     for _ in range(300):
@@ -329,7 +331,8 @@ ROWS = {
 @pytest.mark.parametrize("name", ["gouta2015/ngpc", "cascaded/pi"])
 def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
     case = presets.find(name)
-    loop, given = case.loop, {"spread": dict.fromkeys(NAMES, 0.05), "start": case.loop.x0}
+    loop = case.loop
+    given = {"widths": of(loop.plant, 0.05), "start": loop.x0}
     found, _ = design(loop.plant, loop.actuator, loop.sensor, case.clock.dt, **given)
 
     @jax.jit
@@ -349,9 +352,7 @@ def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
 def test_gradients_through_the_filter_are_central_differences():
     case = presets.find("gouta2015/ngpc")
     loop, clock = case.loop, dataclasses.replace(case.clock, duration=600.0)
-    found, _ = design(
-        loop.plant, loop.actuator, loop.sensor, clock.dt, spread=dict.fromkeys(NAMES, 0.05)
-    )
+    found, _ = design(loop.plant, loop.actuator, loop.sensor, clock.dt, widths=of(loop.plant, 0.05))
     loop = dataclasses.replace(loop, safety_filter=found)
 
     @jax.jit
