@@ -359,7 +359,7 @@ def test_a_checkpoint_and_its_former_name_are_one_folder(own, run):
 
 
 def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
-    options = {"measures": ("max_level",), "limits": {}, "fan": False, "lanes": 2}
+    options = {"measures": ("max_level",), "limits": {}, "fan": False, "batch": 2}
     spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
     tuning.ensemble(own, spread, 4, checkpoint=tmp_path, shard=(1, 2), **options)
     with pytest.raises(InputError, match="1 of 2 batches are missing"):
