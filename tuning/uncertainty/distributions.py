@@ -8,7 +8,8 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import is_real, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import is_real
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,8 +8,9 @@ import math
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import check_value, describe, get_value, split_index
+from jaxtank.core.tree import describe, get_value, split_index
 from tuning.uncertainty.distributions import Correlated, Discrete
 
 
