@@ -23,7 +23,8 @@ from jaxtank.presets import Scenario
 from tuning.search import diagnostics, robust
 from tuning.storage import batch_store
 from tuning.uncertainty import manifest
-from tuning.uncertainty.distributions import Draws, parse, stated
+from tuning.uncertainty.distributions import parse, stated
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
 from tuning.uncertainty.sensitivity_study import what_varies
 
@@ -129,7 +130,7 @@ if process >= 0:
     jax.distributed.initialize(sys.argv[4], 2, process)
 case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02})
 two = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-found = tuning.ensemble(case, two, samples=50, key=3, lanes=16, fan=False, devices=devices)
+found = tuning.ensemble(case, two, samples=50, key=3, batch=16, fan=False, devices=devices)
 np.savez(folder, **found.measures)
 """
 
@@ -173,9 +174,9 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
     path = tmp_path / "manifest.json"
     said = json.loads(path.read_text())
     for change, words in (
-        ({"told": None}, "does not say"),
-        ({"told": {"rig": None, "limits": {}}}, "no rig file describes"),
-        ({"told": {"rig": "x = ", "limits": {}}}, "is not TOML"),
+        ({"origin": None}, "does not say"),
+        ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
+        ({"origin": {"rig": "x = ", "limits": {}}}, "is not TOML"),
         ({"samples": "50"}, "does not say"),
         ({"lanes": 0}, "not one of this program"),
         ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
@@ -353,7 +354,7 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
 @pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
 def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
     tuning.ensemble(
-        case, folder=tmp_path, shard=(1, 2), samples=8, lanes=4, measures=("max_level",), fan=False
+        case, folder=tmp_path, shard=(1, 2), samples=8, batch=4, measures=("max_level",), fan=False
     )
     altered = batch_store.read_manifest(tmp_path) | {"measures": measures}
     (tmp_path / "manifest.json").write_text(json.dumps(altered))
