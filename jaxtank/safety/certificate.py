@@ -166,6 +166,7 @@ def design(
     limit: ArrayLike | None = None,
     inflow: ArrayLike = 0.0,
     volume: ArrayLike = 0.0,
+    offset: ArrayLike | None = None,
     band: ArrayLike | None = None,
     rate: float | None = None,
     substeps: int = 1,
@@ -183,6 +184,7 @@ def design(
     inflow : (n,) largest inflow disturbance [cm^3/s]
     volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]; limits are
         lowered by it
+    offset : (m,) least input that moves liquid [V]; the pumps' offset dead zone where it is left out
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
     rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
     substeps : integration steps of a hold
@@ -203,13 +205,15 @@ def design(
     coefficients = jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps))
     lags, zone = getattr(actuator, "lag", None), getattr(actuator, "dead_zone", None)
     lag = 0.0 if lags is None else float(np.max(lags))
+    dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
+    dead = np.broadcast_to(dead, (actuator.pumps,))
     setting = _Setting(
         rates=coefficients,
         hold=float(hold),
         delay=float(actuator.delay),
         lag=lag,
         low=np.asarray(actuator.low, dtype=float),
-        high=np.asarray(actuator.high, dtype=float) - actuator.offset,
+        high=np.asarray(actuator.high, dtype=float) - dead,
         band=eps,
         top=top_of(sensor, n),
         spare=np.broadcast_to(np.asarray(volume, dtype=float), (n,)) / np.asarray(least.area),
@@ -253,6 +257,7 @@ def design(
         limit=heights,
         reach=np.minimum(reach + setting.spare, 1e6),
         spare=setting.spare,
+        offset=dead,
         rate=np.full(n, kappa),
         band=np.array(eps),
         inflow=np.array(inflow),

@@ -59,6 +59,11 @@ class SafetyFilter:
     age: np.ndarray = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
+    offset: np.ndarray = leaf(
+        "V",
+        "(m,) least input that moves liquid, of pumps with an offset dead zone",
+        default=lambda own: np.zeros(own["least"].pumps),
+    )
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
     allocate: bool = static(
         doc="give the other of two pumps what serves the outputs best where one meets its cap",
@@ -81,9 +86,7 @@ class SafetyFilter:
         hold : longest time for which the inputs are held [s]
         """
         pumps = range(actuator.pumps)
-        low, dead = [actuator.low[j] for j in pumps], [0.0 for _ in pumps]
-        if np.ndim(actuator.offset):
-            dead = [actuator.offset[j] for j in pumps]
+        low, dead = [actuator.low[j] for j in pumps], [self.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
         caps, shared = self.limits(y, hold, low, high)
         caps = tuple(cap + zone for cap, zone in zip(caps, dead))
