@@ -3,7 +3,6 @@
 import dataclasses
 import inspect
 import re
-from typing import Any
 
 import numpy as np
 
@@ -11,11 +10,12 @@ from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import number, shortened
-from jaxtank.core.units import local
+from jaxtank.core.units import DEFAULT
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.schema import is_numeric, static_value
-from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
+from jaxtank.rig.entry import read_entry, sizes_of
+from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
+from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
 LAWS = {
@@ -42,7 +42,7 @@ REGISTERED = set()
 """Kinds that were added by `register`."""
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-_TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
+_FIELDS = (bool, int, float, str, tuple)
 
 
 def register(kind, cls):
@@ -126,132 +126,111 @@ def _unwritable(field):
     kind = field.metadata.get("kind")
     if field.name == "kind":
         return "a rig file has this key for the name of the class: give the field another name"
-    if kind == "static" and _type_of(field) not in _TYPES.values():
-        return f"a static field must be one of {', '.join(_TYPES)} to be set by a rig file"
+    if kind == "static" and type_of(field) not in _FIELDS:
+        types = ", ".join(kind.__name__ for kind in _FIELDS)
+        return f"a static field must be one of {types} to be set by a rig file"
     if kind is None and field.name != "model":
         return "a rig file sets fields made by leaf(...) and static(...), and `model`"
     return ""
 
 
-def _type_of(field):
-    """The type of a field, also where `from __future__ import annotations` makes it a text."""
-    return _TYPES.get(field.type, field.type)
-
-
-# what a law or an observer needs and a file may leave out: by field
 USUAL = {"Tt": 30.0, "spread": 0.0}
-FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}  # [cm]
-SIZES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
+"""Defaults of fields that a rig file may leave out."""
+
+FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}
+"""Defaults in centimetres [cm], converted to the rig's unit of length."""
+
+
+def section_of(name, kind, known, units=DEFAULT):
+    """Return the Section of a [law] or [observer] of a kind: its class's leaves and static fields.
+
+    Parameters
+    ----------
+    name : "law" or "observer"
+    kind : name of a class in `known`
+    known : LAWS or OBSERVERS
+    units : (length, pump input), in which defaults are
+    """
+    first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
+    if known[kind] is controllers.OpenLoop:
+        return dataclasses.replace(OPEN_LOOP, keys=(first, *OPEN_LOOP.keys[1:]))
+    keys = [_key(known[kind], f, kind in REGISTERED, units) for f in _settable(known[kind])]
+    return Section(name, (first, *keys))
+
+
+def _settable(cls):
+    return [f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static")]
+
+
+def _key(cls, field, own, units):
+    """The Key of a field; own: a class of the user's, without defaults of ours."""
+    default = NEEDED if field.default is dataclasses.MISSING else None
+    if field.name in USUAL and not own:
+        default = USUAL[field.name]
+    if field.name in FLOORS and not own:
+        default = in_unit(FLOORS[field.name], units[0])
+    changes = {}
+    if field.metadata["kind"] == "leaf":
+        changes["kind"] = "scalar" if type_of(field) is float else "array"
+    doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
+    return Key.of(cls, field.name, doc, default=default, **changes)
 
 
 def law_of(table, plant, levels, initial):
-    """The law of a [law] table on `plant`; levels: outputs at t = 0, initial: (m,) inputs before
-    it, what `bias` is where it is left out.
+    """Return the controller of a [law] table.
+
+    Parameters
+    ----------
+    table : {key: value} as in the file
+    plant : the rig, which is the controller's model
+    levels : (outputs,) levels of the controlled tanks at t = 0 [cm]
+    initial : (m,) inputs before t = 0 [V], what `bias` is where the rig has no steady state
     """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
-        return _open_loop(table, plant, initial)
-    return component("law", table, LAWS, plant, {"bias": _resting(plant, levels, initial)})
+        start = ramps(np.asarray(initial).tolist(), [], ramp=0.0)
+        section = section_of("law", "open-loop", LAWS)
+        return controllers.OpenLoop(
+            signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(plant))
+        )
+    return component("law", table, LAWS, plant, {"bias": _steady_input(plant, levels, initial)})
 
 
 def observer_of(table, plant, levels, initial):
-    """The observer of an [observer] table on `plant`."""
+    """Return the observer of an [observer] table; arguments as in `law_of`, levels of all tanks."""
     offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
     return component("observer", table, OBSERVERS, plant, offered)
 
 
-def component(kind, table, known, plant, offered):
-    """The law or observer of a table: kind, then the fields of the component by their names."""
+def component(name, table, known, plant, offered):
+    """Return the controller or observer of a table: kind, then the fields of its class.
+
+    Parameters
+    ----------
+    name : "law" or "observer"
+    table : {key: value} as in the file
+    known : LAWS or OBSERVERS
+    plant : the rig, its field `model`
+    offered : {key: value} that a table may leave out, for classes of ours
+    """
     if not isinstance(table, dict):
-        raise InputError(f"[{kind}]: must be a table")
+        raise InputError(f"[{name}]: must be a table")
     if "kind" not in table:
-        raise InputError(f"[{kind}] needs kind = one of {', '.join(known)}")
-    if not isinstance(table["kind"], str) or table["kind"] not in known:
-        raise unknown(f"{kind} kind", str(table["kind"]), known)
-    cls, values, own = known[table["kind"]], {}, table["kind"] in REGISTERED
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    settable = {n: f for n, f in fields.items() if n != "model"}
-    for key in table:
-        if key != "kind" and key not in settable:
-            raise unknown(f"key of [{kind}]", key, ["kind", *settable])
-    if "model" in fields:
+        raise InputError(f"[{name}] needs kind = one of {', '.join(known)}")
+    kind = table["kind"]
+    if not isinstance(kind, str) or kind not in known:
+        raise unknown(f"{name} kind", str(kind), known)
+    section = section_of(name, kind, known, plant.units)
+    usual = {k: v for k, v in offered.items() if k in section.names and kind not in REGISTERED}
+    title = f"{section.title} {kind}"
+    values = read_entry(section, {**usual, **table}, sizes_of(plant), title=title)
+    del values["kind"]
+    if "model" in known[kind].__dataclass_fields__:
         values["model"] = plant
-    for name, field in settable.items():
-        meta = field.metadata
-        if name in table:
-            value = table[name]
-        elif name in offered and not own:
-            value = offered[name]
-        elif name in USUAL and not own:
-            value = USUAL[name]
-        elif name in FLOORS and not own:
-            value = in_unit(FLOORS[name], plant.units[0])
-        elif field.default is not dataclasses.MISSING:
-            continue
-        else:
-            unit = "" if meta.get("unit", "-") == "-" else f" [{local(meta['unit'], plant.units)}]"
-            raise InputError(f"[{kind}] {table['kind']} needs {name}{unit}: {meta.get('doc', '')}")
-        values[name] = _value(f"{kind}.{name}", value, field, plant)
-    return cls(**values)
+    return known[kind](**values)
 
 
-def _value(name, value, field, plant):
-    if field.metadata.get("kind") == "leaf":
-        array = _shaped(name, value, field.metadata, plant)
-        if _type_of(field) is float and array.ndim:
-            raise InputError(f"{name} = {shortened(value)}: must be one number")
-        return array
-    if _type_of(field) is tuple:  # tanks, counted from 1 in a file
-        if not (
-            isinstance(value, list)
-            and all(isinstance(i, int) and not isinstance(i, bool) for i in value)
-        ):
-            raise InputError(
-                f"{name} = {shortened(value)}: must be a list of tanks, counted from 1"
-            )
-        if not all(1 <= i <= plant.tanks for i in value):
-            raise InputError(
-                f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}"
-            )
-        return tuple(i - 1 for i in value)
-    return static_value(name, value, field.metadata, _type_of(field))
-
-
-def _shaped(name, value, meta, plant):
-    """A leaf's value as an array; one number for an array of one entry per pump, tank or output
-    fills it.
-    """
-    if not is_numeric(value):
-        raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers")
-    array = number(value)
-    size = size_of(meta, plant)
-    return np.full(size, array) if size is not None and array.ndim == 0 else array
-
-
-def size_of(meta, plant):
-    """Number of entries of a leaf that has one per pump, tank or output, by the shape its metadata
-    begins with; None of another.
-    """
-    n, m, outputs = plant.tanks, plant.pumps, len(plant.outputs)
-    sizes = dict(zip(SIZES, (m, n, outputs, m, 2, n + outputs)))
-    return next(
-        (size for start, size in sizes.items() if meta["doc"].split(")")[0].startswith(start)), None
-    )
-
-
-def _open_loop(table, plant, initial):
-    keys = RAMP_KEYS[:-1]
-    for key in table:
-        if key != "kind" and key not in keys:
-            raise unknown("key of [law]", key, ["kind", *keys])
-    return controllers.OpenLoop(
-        signal=ramps_of(
-            "law", table, ramps(np.asarray(initial).tolist(), [], ramp=0.0), ("pump", "input")
-        )
-    )
-
-
-def _resting(plant, levels, initial):
-    """(pumps,) inputs at which the outputs rest where they start; `initial` where they cannot."""
+def _steady_input(plant, levels, initial):
+    """(m,) inputs that hold the outputs where they start; `initial` where none do."""
     if len(levels) != plant.pumps:
         return initial
     try:
@@ -261,44 +240,25 @@ def _resting(plant, levels, initial):
 
 
 def kind_of(part, known):
-    """The name of a law or observer in a rig file, None where it has none."""
+    """The name of a controller or an observer in a rig file, None where it has none."""
     return next((name for name, cls in known.items() if cls is type(part)), None)
 
 
-def keys_of(part, known):
-    """[(key, metadata, value)] of a [law] or [observer]; value None of an optional one that is not
-    in use. InputError where it has no name.
+def values_of(name, part, known):
+    """Return (section, {key: value}) of a controller or an observer, None of an optional leaf that
+    is not in use; name: "law" or "observer". InputError where no rig file describes it.
     """
-    kind = kind_of(part, known)
+    kind, cls = kind_of(part, known), type(part).__name__
     if kind is None:
-        raise InputError(f"its {type(part).__name__} has no name in a rig file")
-    found: list[tuple[str, Any, Any]] = [
-        ("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)
-    ]
+        raise InputError(f"its {cls} has no name in a rig file")
+    section = section_of(name, kind, known)
     if isinstance(part, controllers.OpenLoop):
         if not isinstance(part.signal, Ramps):
             raise InputError("its OpenLoop plays a signal that no rig file describes")
-        values = {
-            k: np.asarray(getattr(part.signal, k)).tolist() for k in ("initial", "ramp", "shape")
-        }
-        values["changes"] = changes_of(part.signal)
-        docs = {
-            "initial": PUMPS,
-            "changes": {"unit": "-", "doc": "[time [s], pump (from 1), input] of each change"},
-        }
-        return found + [(k, docs.get(k) or meta_of(Ramps, k), values[k]) for k in RAMP_KEYS[:-1]]
-    for field in dataclasses.fields(part):
-        value, meta = getattr(part, field.name), field.metadata
-        if meta.get("kind") == "leaf":
-            found.append((field.name, meta, None if value is None else np.asarray(value).tolist()))
-        elif meta.get("kind") == "static":
-            if isinstance(value, tuple) and not all(type(i) is int for i in value):
-                named = f"its {type(part).__name__}.{field.name}"
-                raise InputError(f"{named} = {shortened(value)} is no list of tanks")
-            found.append(
-                (field.name, meta, [i + 1 for i in value] if isinstance(value, tuple) else value)
-            )
-    return found
-
-
-PUMPS = {"unit": "V", "doc": "(m,) input of each pump before the first change"}
+        return section, {"kind": kind, **ramp_values(part.signal)}
+    values = {key.name: getattr(part, key.name) for key in section.keys[1:]}
+    for key in section.keys:
+        value = values.get(key.name)
+        if key.kind == "tanks" and not all(type(i) is int for i in value):
+            raise InputError(f"its {cls}.{key.name} = {shortened(value)} is no list of tanks")
+    return section, {"kind": kind, **values}

@@ -22,7 +22,7 @@ from jaxtank.core.tree import (
 )
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import schedule
-from jaxtank.rig.schema import is_numeric, plain, static_value, unit
+from jaxtank.rig.entry import is_numeric, plain, static_value, unit
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""

@@ -22,7 +22,7 @@ def open_case(args):
     case, notes = rig.open_case(args.case), []
     # as the file is: what --set changes is meant
     if args.case.endswith(".toml") and not args.quiet:
-        notes = rig.doubts(case)
+        notes = rig.case_warnings(case)
         for sentence in notes:
             print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values = settings(args)
@@ -32,11 +32,11 @@ def open_case(args):
         for name, scenarios in replaced.items():
             words = f"--set {name} takes the place of the value of {_counted(scenarios)}"
             print(f"jaxtank: note: {words}", file=sys.stderr)
-    for sentence in () if args.quiet else rig.model_doubts(case):
+    for sentence in () if args.quiet else rig.model_warnings(case):
         if sentence not in notes:
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
     if case.clock != clock and not args.quiet:
-        for sentence in rig.clock_doubts(case.clock):
+        for sentence in rig.clock_warnings(case.clock):
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
     for sentence in () if args.quiet else step_size.doubts(case.loop, case.clock):
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
