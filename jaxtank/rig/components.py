@@ -153,7 +153,7 @@ def section_of(name, kind, known, units=DEFAULT):
     """
     first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
     if known[kind] is controllers.OpenLoop:
-        return dataclasses.replace(OPEN_LOOP, keys=(first, *OPEN_LOOP.keys[1:]))
+        return Section(name, (first, *OPEN_LOOP[1:]))
     keys = [_key(known[kind], f, kind in REGISTERED, units) for f in _settable(known[kind])]
     return Section(name, (first, *keys))
 
@@ -259,6 +259,6 @@ def values_of(name, part, known):
     values = {key.name: getattr(part, key.name) for key in section.keys[1:]}
     for key in section.keys:
         value = values.get(key.name)
-        if key.kind == "tanks" and not all(type(i) is int for i in value):
+        if key.kind == "tanks" and not all(type(i) is int for i in value or ()):
             raise InputError(f"its {cls}.{key.name} = {shortened(value)} is no list of tanks")
     return section, {"kind": kind, **values}

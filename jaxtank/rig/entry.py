@@ -30,7 +30,7 @@ class Sizes(NamedTuple):
 
 
 def sizes_of(plant, names: Mapping[str, int] = {}) -> Sizes:
-    """Return the Sizes of a plant; names: {name: index} of its tanks."""
+    """Return the Sizes of a plant; names: those of its tanks."""
     return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names)
 
 
@@ -44,7 +44,7 @@ def read_entry(
     section : schema.Section
     table : {key: value} as in the file
     sizes : of the rig
-    index : number of the table in its list, from 0; None of a table that is no list
+    index : number of the table in its list, from 0, or None
     title : what messages on missing keys call it; "": its title
 
     Returns
@@ -141,14 +141,6 @@ def _flag(key, label, value, sizes):
     return value
 
 
-def _choice(key, label, value, sizes):
-    return static_value(label, value, key.meta(sizes.units), str)
-
-
-def _text(key, label, value, sizes):
-    return name_of(label, value)
-
-
 def _texts(key, label, value, sizes):
     if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
         raise InputError(f"{label} = {shortened(value)}: must be a list of texts: {key.doc}")
@@ -236,8 +228,8 @@ READ = {
     "number": _number,
     "integer": _integer,
     "flag": _flag,
-    "choice": _choice,
-    "text": _text,
+    "choice": lambda key, label, value, sizes: static_value(label, value, key.meta(), str),
+    "text": lambda key, label, value, sizes: name_of(label, value),
     "texts": _texts,
     "list": _list,
     "array": _array,
@@ -275,9 +267,7 @@ def size_of(doc, sizes):
 
 
 def name_of(where, value):
-    """`value` if it can be a name: a text of one line without control characters, which a terminal
-    would obey.
-    """
+    """`value` if it can be a name: a text of one line without control characters."""
     if not isinstance(value, str) or not value.isprintable():
         raise InputError(
             f"{where} = {shortened(value)}: must be a text"
@@ -287,9 +277,7 @@ def name_of(where, value):
 
 
 def is_numeric(value):
-    """True for a number that a float can hold, and for lists of such numbers and arrays of a
-    regular shape.
-    """
+    """Whether a value is a number that a float can hold, or a regular array or list of such."""
     if isinstance(value, (np.ndarray, np.generic)):
         return np.issubdtype(value.dtype, np.number)
     if isinstance(value, (list, tuple)):

@@ -10,44 +10,63 @@ from jaxtank.core.tree import is_component, walk
 from jaxtank.rig import components, schedule, signals
 
 
-def origin_of(case):
-    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as
-    its own), or (None, ()): of a rig whose tanks have names too, which only a file that describes
-    it tank by tank can say.
+PARTS = (("law", "controller", components.LAWS), ("observer", "observer", components.OBSERVERS))
+"""(section, part of the loop, its classes) of what a file may have another one of."""
 
-    Of several, the one with the same law and observer, then of the same name, then with the most
-    static fields in common: its title is the one that the file will show. What a file can say in a
-    table of its own (reference, disturbances, faults) may differ.
+
+def origin_of(case):
+    """Return the preset that a case came from.
+
+    Of several, the one with the same controller and observer, then of the same name, then with the
+    most static fields in common: its title is the one that the file will show. What a file has
+    tables of its own for (reference, disturbances, faults) may differ.
+
+    Returns
+    -------
+    (Case of a preset with the same rig, which of "law" and "observer" are of the same kind as its
+    own), or (None, ()): also of a rig whose tanks have names, which only a file that describes it
+    tank by tank can have.
     """
     if case.names:
         return None, ()
     loop = schedule.unscheduled(case.loop)
-    mine, statics, best, found = structures(loop), _statics(loop), None, (None, ())
+    best, found = None, (None, ())
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
-            theirs = structures(other.loop)
-            if mine["rest"] != theirs["rest"] or not _optional(
-                other.loop, ("plant", "sensor", "actuator")
-            ) <= _optional(loop):
+            same = _same_parts(loop, other.loop)
+            if same is None:
                 continue
-            same = tuple(
-                word
-                for word, field in (("law", "controller"), ("observer", "observer"))
-                if mine[field] == theirs[field]
-                and _optional(other.loop, (field,)) <= _optional(loop)
-            )
-            if (
-                "law" not in same and components.kind_of(loop.controller, components.LAWS) is None
-            ) or (
-                "observer" not in same
-                and components.kind_of(loop.observer, components.OBSERVERS) is None
-            ):
-                continue
-            common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
+            common = sum(a == b for a, b in zip(_statics(loop), _statics(other.loop)))
             score = ("law" in same, "observer" in same, other.name == case.name, common)
             if best is None or score > best:
                 best, found = score, (other, same)
     return found
+
+
+def _same_parts(loop, other):
+    """Which of "law" and "observer" two loops have of the same kind; None where a file cannot make
+    one loop of the other.
+    """
+    mine, theirs = structures(loop), structures(other)
+    if mine["rest"] != theirs["rest"] or not _has_optional(
+        other, ("plant", "sensor", "actuator"), loop
+    ):
+        return None
+    same = tuple(
+        section
+        for section, field, _ in PARTS
+        if mine[field] == theirs[field] and _has_optional(other, (field,), loop)
+    )
+    for section, field, known in PARTS:
+        if section not in same and components.kind_of(getattr(loop, field), known) is None:
+            return None
+    return same
+
+
+def _has_optional(other, fields, loop):
+    """Whether the optional leaves that parts of `other` use are in use in `loop`."""
+    used = {name for name in _optional(other) if name.split(".")[0] in fields}
+    return used <= _optional(loop)
 
 
 def _statics(loop):
@@ -56,15 +75,14 @@ def _statics(loop):
     ]
 
 
-def _optional(loop, fields=None):
-    """Names of the optional leaves that are in use; fields: of which parts of the loop."""
-    named = {name for name, value, meta in walk(loop) if meta.get("like") and value is not None}
-    return named if fields is None else {name for name in named if name.split(".")[0] in fields}
+def _optional(loop):
+    """Names of the optional leaves that are in use."""
+    return {name for name, value, meta in walk(loop) if meta.get("like") and value is not None}
 
 
 def structures(loop):
-    """Pytree structures of law, observer and the rest, with what a rig file can set made alike:
-    they compare by their components.
+    """Pytree structures of controller, observer and the rest, with what a rig file can set made
+    alike: they compare by their components.
     """
 
     def settle(tree):
@@ -79,12 +97,12 @@ def structures(loop):
                 changed[field.name] = None
         return dataclasses.replace(tree, **changed)
 
-    told = {"faults": None}
+    described = {"faults": None}
     if signals.steps(loop.reference) is not None:
-        told["reference"] = None
+        described["reference"] = None
     if signals.disturbance_tables(loop.disturbance) is not None:
-        told["disturbance"] = None
-    plain = settle(dataclasses.replace(loop, **told))
+        described["disturbance"] = None
+    plain = settle(dataclasses.replace(loop, **described))
     rest = dataclasses.replace(plain, controller=None, observer=None)
     return {
         "rest": jax.tree.structure(rest),

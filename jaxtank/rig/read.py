@@ -225,18 +225,15 @@ def _top(table):
     """The values at the top of a rig file; InputError for a section or key that is unknown or of
     another kind, and unless there is either a case or a tank.
     """
+    _check_sections(table)
     first = SECTIONS[""]
-    known = [*first.names, *(name for name in SECTIONS if name and "." not in name)]
-    for key, value in table.items():
-        if key not in known:
-            raise unknown("key", key, known)
-        many = key in SECTIONS and SECTIONS[key].many
-        if key in SECTIONS and not isinstance(value, list if many else dict):
-            words = f"a list of tables, [[{key}]]" if many else "a table"
-            raise InputError(f"{key} = {shortened(value)}: must be {words}")
-    top = {key: value for key, value in table.items() if key in first.names}
-    top = {key: read_value(first[key], key, value, Sizes(0)) for key, value in top.items()}
-    if "case" in table and (given := [k for k in TANKWISE if k in table]):
+    top = {
+        k.name: read_value(k, k.name, table[k.name], Sizes(0))
+        for k in first.keys
+        if k.name in table
+    }
+    given = [name for name in TANKWISE if name in table]
+    if "case" in table and given:
         raise InputError(
             f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out"
             f" case, or [{given[0]}]"
@@ -247,6 +244,20 @@ def _top(table):
             " [[tank]] to describe a rig"
         )
     return top
+
+
+def _check_sections(table):
+    """Raise InputError for a key at the top that is unknown, and for one that is no table."""
+    sections = {name: section for name, section in SECTIONS.items() if name and "." not in name}
+    for key, value in table.items():
+        if key in SECTIONS[""].names:
+            continue
+        if key not in sections:
+            raise unknown("key", key, [*SECTIONS[""].names, *sections])
+        many = sections[key].many
+        if not isinstance(value, list if many else dict):
+            words = f"a list of tables, [[{key}]]" if many else "a table"
+            raise InputError(f"{key} = {shortened(value)}: must be {words}")
 
 
 def _with_parts(case, table):

@@ -4,6 +4,7 @@ Reading, writing, `jaxtank init` and validation all follow `SECTIONS`; imported 
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 from jaxtank.core.units import DEFAULT, local
@@ -27,20 +28,14 @@ class Key:
     ----------
     name : the key in the file
     doc : what it is, printed by `init` and where it is missing
-    kind : how a value is read and written, a name in `entry.READ`: "number", "integer", "flag",
-        "choice", "text", "texts", "list", "array", "scalar", "tank", "tanks", "pair", "feed",
-        "table" or "any"
+    kind : how a value is read and written, a name in `entry.READ`
     unit : of its number, written for ("cm", "V")
     low, high, strict : allowed range, or None; strict: `low` itself is excluded
     choices : allowed values, or None
     default : value, as in a file, where the key is left out; None: it is then absent
-    target : dotted name of the field of ClosedLoop that holds the value, one entry for each table
-        of a list ("actuator.low"); a number after it is a part of that entry ("plant.links.0").
-        Where the section is a component or a NamedTuple of its own, the name of the field; "": the
-        key's own name.
+    target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
+        ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
 
-    Examples
-    --------
     >>> Key.of(PumpBank, "stop", target="actuator.stop").unit
     'V'
     """
@@ -77,16 +72,13 @@ class Key:
         meta = found.metadata
         own = {k: meta[k] for k in ("unit", "doc", "low", "high", "strict") if k in meta}
         if meta["kind"] == "static":
-            kinds = {bool: "flag", int: "integer", str: "choice", tuple: "tanks"}
-            own |= {"kind": kinds.get(type_of(found), "number"), "choices": meta["choices"]}
+            own |= {"kind": _KINDS.get(type_of(found), "number"), "choices": meta["choices"]}
         return cls(**{"name": field, **own, **({"doc": doc} if doc else {}), **changes})
 
     def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
         """Return the metadata of a value, as of a leaf, in the units of a rig.
 
-        Examples
-        --------
-        >>> Key("level", "level at t = 0", unit="cm").meta(("m", "V"))["unit"]
+        >>> Key("level", unit="cm").meta(("m", "V"))["unit"]
         'm'
         """
         found = {k: getattr(self, k) for k in ("kind", "doc", "low", "high", "strict", "choices")}
@@ -105,10 +97,7 @@ class Section:
     prose : sentence that `init` prints above it where a case has none
     per : field of TankNetwork with an entry for each table of the list
     elsewhere : (part of the loop, class) whose other fields are in [values], for all tables at once
-    entry : the key that all names of a table have in common, or None
 
-    Examples
-    --------
     >>> SECTIONS["tank"].title, SECTIONS["tank"]["area"].unit
     ('[[tank]]', 'cm^2')
     """
@@ -119,7 +108,6 @@ class Section:
     prose: str = ""
     per: str = ""
     elsewhere: tuple = ()
-    entry: Key | None = None
 
     @property
     def title(self) -> str:
@@ -135,6 +123,7 @@ class Section:
         return next(key for key in self.keys if key.name == name)
 
 
+_KINDS = {bool: "flag", int: "integer", str: "choice", tuple: "tanks"}
 _TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
 
 
@@ -143,278 +132,188 @@ def type_of(field):
     return _TYPES.get(field.type, field.type)
 
 
-FIRST = "first tank, or [first, second]"
-RAMPS = tuple(Key.of(Ramps, name, default=None) for name in ("ramp", "shape"))
-RELATIVE = (
-    'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" '
-    '(less), "0.02 if zero", and "steady" for x0, actuator.initial and reference.initial'
+def _of(owner, part, field, doc, name="", **changes):
+    """The key of a component's field that is a part of the loop."""
+    target = f"{part}.{field}" if part else field
+    return Key.of(owner, field, doc, name=name or field, target=target, **changes)
+
+
+_plant = functools.partial(_of, TankNetwork, "plant")
+_pump = functools.partial(_of, PumpBank, "actuator")
+_sensor = functools.partial(_of, LevelSensor, "sensor")
+_optional = functools.partial(Key, default=None)
+BY_NAME = "by name or number from 1"
+
+TOP = (
+    _optional("case", "the preset that this file starts from", "choice"),
+    _optional("name", "what reports call it", "text"),
+    _optional(
+        "reachable",
+        "whether every plateau of the reference must have a steady state",
+        "flag",
+        choices=(True, False),
+    ),
+    Key("units", "[length, pump input]", "any", default=list(DEFAULT)),
+)
+TANK = (
+    Key("name", "what other tables may call it, instead of its number from 1", "text", default=""),
+    _plant("area", "cross-section A"),
+    _plant("rim", "height"),
+    _plant("drain", "effective orifice area to the basin; 0: closed", default=0.0),
+    _of(ClosedLoop, "", "x0", "level at t = 0", name="level", default=0.0),
+    Key(
+        "inflow",
+        "steady inflow that no pump brings; negative: a leak",
+        unit="cm^3/s",
+        default=0.0,
+        target="disturbance.level",
+    ),
+    _sensor("noise", "standard deviation of the noise of its sensor", default=0.0),
+)
+ORIFICE = (
+    Key("from", f"the tank that it leaves, {BY_NAME}", "tank", target="plant.links.0"),
+    Key("to", f"the tank that it flows into, {BY_NAME}", "tank", target="plant.links.1"),
+    _plant("orifice", "effective area", name="area"),
+)
+PIPE = (
+    Key("between", "the two tanks that it joins, below the surface", "pair", target="plant.pipes"),
+    _plant("pipe", "effective area", name="area"),
+)
+SPILL = (
+    Key("from", f"the tank whose rim is passed, {BY_NAME}", "tank", target="plant.spills.0"),
+    Key("to", f"the tank that it falls into, {BY_NAME}", "tank", target="plant.spills.1"),
+    _plant("caught", "share that falls into it", default=1.0),
+)
+PUMP = (
+    Key("name", "a note; nothing refers to it", "text", default=""),
+    _plant("pump_gain", "flow per unit of the pump's input (Kp)", name="gain"),
+    Key("to", "the tank that it fills, or [first, second]", "feed", target="plant.feeds"),
+    _plant("split", "share that goes to the first of two tanks", default=1.0),
+    _pump("low", "lower limit", default=0.0),
+    _pump("high", "upper limit"),
+    _pump("initial", "input at which it ran before t = 0", default=0.0),
+)
+PLANT = (
+    _optional(
+        "outputs",
+        "the tanks whose levels are controlled; left out: those that the pumps fill first",
+        "tanks",
+        target="plant.outputs",
+    ),
+    *(_plant(name, "", default=None) for name in ("gravity", "overflow", "bottom", "knee")),
 )
 KIND = Key("kind", kind="any")
 """The key that names the class of a controller or an observer; its doc lists the classes."""
-
-OPEN_LOOP = Section(
-    "law",
-    (
-        KIND,
-        Key(
-            "initial",
-            "(m,) input of each pump before the first change",
-            "list",
-            unit="V",
-            default=None,
-        ),
-        Key("changes", "[time in s, pump from 1, input] of each change", "any", "V", default=None),
-        *RAMPS,
+COURSE = tuple(Key.of(Ramps, name, default=None) for name in ("ramp", "shape"))
+OPEN_LOOP = (
+    KIND,
+    _optional("initial", "(m,) input of each pump before the first change", "list", "V"),
+    _optional("changes", "[time in s, pump from 1, input] of each change", "any", "V"),
+    *COURSE,
+)
+"""[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
+REFERENCE = (
+    _optional(
+        "initial", "(outputs,) setpoint of each output before the first change", "list", "cm"
+    ),
+    _optional("changes", "[time in s, output from 1, setpoint] of each change", "any", "cm"),
+    *COURSE,
+    Key.of(Ramps, "band", default=None),
+    _optional("sine", "a sine on top: [reference.sine]; {}: none", "table"),
+)
+SINE = (
+    Key.of(Sine, "amplitude"),
+    Key.of(Sine, "offset", default=0.0),
+    Key.of(Sine, "period"),
+    Key.of(Sine, "zero", default=0.0),
+    Key.of(Sine, "start", default=0.0),
+    Key.of(Sine, "end", default=1e9),
+    Key("output", "the output it moves, from 1", "integer", low=1, target="channel"),
+)
+DISTURBANCE = (
+    _optional(
+        "inflow",
+        "(n,) steady inflow of each tank that no pump brings; negative: a leak",
+        "list",
+        "cm^3/s",
+    ),
+    Key.of(Pours, "window", default=None),
+)
+POUR = (
+    Key("time", "when it begins", unit="s", low=0.0),
+    Key("duration", "how long it lasts", unit="s", low=0.0, strict=True),
+    Key("tank", f"the tank, {BY_NAME}", "tank"),
+    Key("volume", "volume of the pulse; negative: taken out", unit="cm^3"),
+)
+FAULT = (
+    Key("of", "the entry of the plant that changes, counted from 0", "text"),
+    Key("start", "when it begins", unit="s", low=0.0),
+    Key("end", "when it is over", unit="s"),
+    Key.of(Faults, "factor", "what the entry is multiplied by", default=1.0),
+    Key.of(Faults, "extra", "what is added to it, in its own unit", default=0.0),
+)
+SCHEDULE = (
+    Key("gains", "names of the gains that follow the variable", "texts"),
+    Key("variable", "a setpoint, r1 .., or a level, h1 ..", "any"),
+    Key("knots", "values of the variable at which the gains are given", "array", "cm"),
+)
+COVARIANCE = (
+    Key("names", "parameters, an array's entry by name[i]", "texts"),
+    Key("matrix", "their covariance, in their units", "any"),
+)
+SCENARIO = (
+    _optional("name", "what reports call it", "text"),
+    Key("seed", "of its sensor noise", "integer", low=0, high=2**31 - 1, default=0),
+    Key("weight", "in the mean over scenarios", low=0.0, strict=True, default=1.0),
+    Key(
+        "values",
+        'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by'
+        ' -0.5" (less), "0.02 if zero", and "steady" for x0, actuator.initial and'
+        " reference.initial",
+        "table",
+        default={},
     ),
 )
-"""[law] of kind "open-loop"."""
+WEIGHT = Key("weight", "weight in the sum that is minimised", low=0.0, default=1.0)
+SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
 
 _ALL = (
-    Section(
-        "",
-        (
-            Key("case", "the preset that this file starts from", "choice", default=None),
-            Key("name", "what reports call it", "text", default=None),
-            Key(
-                "reachable",
-                "whether every plateau of the reference must have a steady state",
-                "flag",
-                choices=(True, False),
-                default=None,
-            ),
-            Key("units", "[length, pump input]", "any", default=list(DEFAULT)),
-        ),
-    ),
-    Section(
-        "tank",
-        (
-            Key(
-                "name",
-                "what other tables may call it, instead of its number from 1",
-                "text",
-                default="",
-            ),
-            Key.of(TankNetwork, "area", "cross-section A", target="plant.area"),
-            Key.of(TankNetwork, "rim", "height", target="plant.rim"),
-            Key.of(
-                TankNetwork,
-                "drain",
-                "effective orifice area to the basin; 0: closed",
-                default=0.0,
-                target="plant.drain",
-            ),
-            Key.of(ClosedLoop, "x0", "level at t = 0", name="level", default=0.0, target="x0"),
-            Key(
-                "inflow",
-                "steady inflow that no pump brings; negative: a leak",
-                unit="cm^3/s",
-                default=0.0,
-                target="disturbance.level",
-            ),
-            Key.of(
-                LevelSensor,
-                "noise",
-                "standard deviation of the noise of its sensor",
-                default=0.0,
-                target="sensor.noise",
-            ),
-        ),
-        many=True,
-        per="area",
-        elsewhere=("sensor", LevelSensor),
-    ),
-    Section(
-        "orifice",
-        (
-            Key(
-                "from",
-                "the tank that it leaves, by name or number from 1",
-                "tank",
-                target="plant.links.0",
-            ),
-            Key(
-                "to",
-                "the tank that it flows into, by name or number from 1",
-                "tank",
-                target="plant.links.1",
-            ),
-            Key.of(TankNetwork, "orifice", "effective area", name="area", target="plant.orifice"),
-        ),
-        many=True,
-        per="links",
-    ),
-    Section(
-        "pipe",
-        (
-            Key(
-                "between",
-                "the two tanks that it joins, below the surface",
-                "pair",
-                target="plant.pipes",
-            ),
-            Key.of(TankNetwork, "pipe", "effective area", name="area", target="plant.pipe"),
-        ),
-        many=True,
-        per="pipes",
-    ),
-    Section(
-        "spill",
-        (
-            Key(
-                "from",
-                "the tank whose rim is passed, by name or number from 1",
-                "tank",
-                target="plant.spills.0",
-            ),
-            Key(
-                "to",
-                "the tank that it falls into, by name or number from 1",
-                "tank",
-                target="plant.spills.1",
-            ),
-            Key.of(
-                TankNetwork,
-                "caught",
-                "share that falls into it",
-                default=1.0,
-                target="plant.caught",
-            ),
-        ),
-        many=True,
-        per="spills",
-    ),
-    Section(
-        "pump",
-        (
-            Key("name", "a note; nothing refers to it", "text", default=""),
-            Key.of(
-                TankNetwork,
-                "pump_gain",
-                "flow per unit of the pump's input (Kp)",
-                name="gain",
-                target="plant.pump_gain",
-            ),
-            Key("to", f"the tank that it fills: {FIRST}", "feed", target="plant.feeds"),
-            Key.of(
-                TankNetwork,
-                "split",
-                "share that goes to the first of two tanks",
-                default=1.0,
-                target="plant.split",
-            ),
-            Key.of(PumpBank, "low", "lower limit", default=0.0, target="actuator.low"),
-            Key.of(PumpBank, "high", "upper limit", target="actuator.high"),
-            Key.of(
-                PumpBank,
-                "initial",
-                "input at which it ran before t = 0",
-                default=0.0,
-                target="actuator.initial",
-            ),
-        ),
-        many=True,
-        per="feeds",
-        elsewhere=("actuator", PumpBank),
-    ),
-    Section(
-        "plant",
-        (
-            Key(
-                "outputs",
-                "the tanks whose levels are controlled; left out: those that the pumps fill first",
-                "tanks",
-                default=None,
-                target="plant.outputs",
-            ),
-            *(
-                Key.of(TankNetwork, name, default=None, target=f"plant.{name}")
-                for name in ("gravity", "overflow", "bottom", "knee")
-            ),
-        ),
-    ),
+    Section("", TOP),
+    Section("tank", TANK, many=True, per="area", elsewhere=("sensor", LevelSensor)),
+    Section("orifice", ORIFICE, many=True, per="links"),
+    Section("pipe", PIPE, many=True, per="pipes"),
+    Section("spill", SPILL, many=True, per="spills"),
+    Section("pump", PUMP, many=True, per="feeds", elsewhere=("actuator", PumpBank)),
+    Section("plant", PLANT),
     Section("law"),
     Section("observer"),
-    Section(
-        "reference",
-        (
-            Key(
-                "initial",
-                "(outputs,) setpoint of each output before the first change",
-                "list",
-                unit="cm",
-                default=None,
-            ),
-            Key(
-                "changes",
-                "[time in s, output from 1, setpoint] of each change",
-                "any",
-                "cm",
-                default=None,
-            ),
-            *RAMPS,
-            Key.of(Ramps, "band", default=None),
-            Key("sine", "a sine on top: [reference.sine]; {}: none", "table", default=None),
-        ),
-    ),
+    Section("reference", REFERENCE),
     Section(
         "reference.sine",
-        (
-            Key.of(Sine, "amplitude"),
-            Key.of(Sine, "offset", default=0.0),
-            Key.of(Sine, "period"),
-            Key.of(Sine, "zero", default=0.0),
-            Key.of(Sine, "start", default=0.0),
-            Key.of(Sine, "end", default=1e9),
-            Key("output", "the output it moves, from 1", "integer", low=1, target="channel"),
-        ),
+        SINE,
         prose="A sine on top of the ramps of one output, for a while; names are then"
         " reference.first.ramp and so on.",
     ),
     Section(
         "disturbance",
-        (
-            Key(
-                "inflow",
-                "(n,) steady inflow of each tank that no pump brings; negative: a leak",
-                "list",
-                unit="cm^3/s",
-                default=None,
-                target="level",
-            ),
-            Key.of(Pours, "window", default=None),
-        ),
+        DISTURBANCE,
         prose="A steady inflow of each tank, or pulses of inflow, [[pour]]: one of the two.",
     ),
     Section(
         "pour",
-        (
-            Key("time", "when it begins", unit="s", low=0.0),
-            Key("duration", "how long it lasts", unit="s", low=0.0, strict=True),
-            Key("tank", "the tank, by name or number from 1", "tank"),
-            Key("volume", "volume of the pulse; negative: taken out", unit="cm^3"),
-        ),
+        POUR,
         many=True,
         prose="A pulse of inflow into a tank, for recovery_time; as many as you like.",
     ),
     Section(
         "fault",
-        (
-            Key("of", "the entry of the plant that changes, counted from 0", "text"),
-            Key("start", "when it begins", unit="s", low=0.0),
-            Key("end", "when it is over", unit="s"),
-            Key.of(Faults, "factor", "what the entry is multiplied by", default=1.0),
-            Key.of(Faults, "extra", "what is added to it, in its own unit", default=0.0),
-        ),
+        FAULT,
         many=True,
         prose="A fault of the plant that is unknown to the controller; as many as you like.",
     ),
     Section(
         "schedule",
-        (
-            Key("gains", "names of the gains that follow the variable", "texts"),
-            Key("variable", "a setpoint, r1 .., or a level, h1 ..", "any"),
-            Key("knots", "values of the variable at which the gains are given", "array", unit="cm"),
-        ),
+        SCHEDULE,
         prose="Gains that follow a setpoint or a level, linear between knots; they start from the"
         ' value above. Theirs are then "controller.values", a row per gain; [free] may name the'
         " gain for all its knots.",
@@ -422,30 +321,17 @@ _ALL = (
     Section("values"),
     Section("limits"),
     Section("free"),
-    Section(
-        "objective",
-        entry=Key("objective", "weight in the sum that is minimised", low=0.0, default=1.0),
-    ),
-    Section(
-        "uncertain", entry=Key("uncertain", "share", low=0.0, high=1.0, strict=True, default=0.05)
-    ),
+    Section("objective"),
+    Section("uncertain"),
     Section(
         "covariance",
-        (
-            Key("names", "parameters, an array's entry by name[i]", "texts"),
-            Key("matrix", "their covariance, in their units", "any"),
-        ),
+        COVARIANCE,
         prose="Parameters that vary together, as `jaxtank identify` writes them; used in the place"
         " of [uncertain].",
     ),
     Section(
         "scenario",
-        (
-            Key("name", "what reports call it", "text", default=None),
-            Key("seed", "of its sensor noise", "integer", low=0, high=2**31 - 1, default=0),
-            Key("weight", "in the mean over scenarios", low=0.0, strict=True, default=1.0),
-            Key("values", RELATIVE, "table", default={}),
-        ),
+        SCENARIO,
         many=True,
         prose="A run that `tune` judges by, in the place of the case's own; as many as you like.",
     ),
@@ -458,7 +344,7 @@ _ALL = (
 SECTIONS = {section.name: section for section in _ALL}
 """{name: Section} of a rig file, in the order in which it is written."""
 
-TANKWISE = tuple(s.name for s in _ALL if s.per) + ("plant", "units")
+TANKWISE = (*(s.name for s in _ALL if s.per), "plant", "units")
 """What describes a rig tank by tank, and is not given beside `case`."""
 
 

@@ -12,7 +12,7 @@ from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.rig import components
 from jaxtank.rig import schedule as scheduling
 from jaxtank.rig.lines import Block, Line, suggestion, toml
-from jaxtank.rig.schema import SECTIONS, Section
+from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
@@ -54,7 +54,7 @@ def of_free(case, name):
 
 def of_uncertain(case, name):
     """What a share of a parameter is, as metadata."""
-    entry = SECTIONS["uncertain"].entry.meta()
+    entry = SHARE.meta()
     return {**entry, "doc": f"{entry['doc']}, of: {describe(case.loop, name)['doc']}"}
 
 
@@ -63,7 +63,7 @@ def _measures(case, but):
     disturbed = hasattr(case.loop.disturbance, "since")
     stepped = hasattr(case.loop.reference, "windows")
     return [
-        Line(name, SECTIONS["objective"].entry.default, of_measure(case, name), False)
+        Line(name, WEIGHT.default, of_measure(case, name), False)
         for name, spec in MEASURES.items()
         if name not in but
         and name not in TIMES.values()
@@ -120,7 +120,7 @@ def _rounded(value):
 
 def uncertain(case):
     """Lines of the plant's parameters whose spread is not given."""
-    taken, share = {n.split("[")[0] for n in case.uncertain}, SECTIONS["uncertain"].entry.default
+    taken, share = {n.split("[")[0] for n in case.uncertain}, SHARE.default
     return [
         Line(toml(name), share, of_uncertain(case, name), False)
         for name, value in parameters(case.loop).items()

@@ -133,10 +133,12 @@ def _kept(mine, theirs, suggested):
         if in_values:
             found = (_differing(line, known, suggested) for line in block.lines)
             lines = sorted(filter(None, found), key=lambda line: not line.on)
-            if lines or block.title:
-                kept.append(block._replace(lines=lines))
-        elif block.on and (not block.title or block.title in SHORT or block.title not in same):
-            kept.append(block._replace(lines=[line for line in block.lines if line.on]))
+        elif block.on and (block.title in ("", *SHORT) or block.title not in same):
+            lines = [line for line in block.lines if line.on]
+        else:
+            continue
+        if lines or block.title:
+            kept.append(block._replace(lines=lines))
     return kept
 
 
