@@ -1,16 +1,21 @@
-"""[law] and [observer] of a rig file: a component by its kind, and its fields by their names."""
+"""[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
+by their names.  Imported by the readers and writers of `rig`.
+"""
 
 import dataclasses
 import inspect
 import re
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
+from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
@@ -18,7 +23,7 @@ from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
-LAWS = {
+LAWS: dict[str, type] = {
     "pid": controllers.PID,
     "state-feedback": controllers.StateFeedback,
     "lqi": controllers.LQI,
@@ -32,31 +37,54 @@ LAWS = {
     "laguerre": controllers.Laguerre,
     "open-loop": controllers.OpenLoop,
 }
-OBSERVERS = {
+OBSERVERS: dict[str, type] = {
     "direct": Direct,
     "disturbance": DisturbanceObserver,
     "kalman": Kalman,
     "extended-kalman": ExtendedKalman,
 }
-REGISTERED = set()
+SENSORS: dict[str, type] = {"level": LevelSensor}
+ACTUATORS: dict[str, type] = {"pumps": PumpBank}
+REGISTERED: set[str] = set()
 """Kinds that were added by `register`."""
+
+
+class Role(NamedTuple):
+    """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
+    fields that are the case's own where a file leaves them out, and the class that needs no
+    section, for [values] set its fields.
+    """
+
+    field: str
+    base: type
+    classes: dict
+    kept: tuple = ()
+    default: type | None = None
+
+
+ROLES = {
+    "law": Role("controller", controllers.Controller, LAWS),
+    "observer": Role("observer", Observer, OBSERVERS),
+    "sensor": Role("sensor", Sensor, SENSORS, ("noise",), LevelSensor),
+    "actuator": Role("actuator", Actuator, ACTUATORS, ("low", "high", "initial"), PumpBank),
+}
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _FIELDS = (bool, int, float, str, tuple)
 
 
-def register(kind, cls):
-    """Give a controller or an observer of one's own a name in rig files.
+def register(kind: str, cls: type) -> type:
+    """Give a controller, observer, sensor or actuator of one's own a name in rig files.
 
-    `kind = "..."` of [law] (a controller) or [observer] (an observer) then makes a component of
-    the class. Its leaves and static fields are keys of the table; a field `model` is the plant of
-    the rig. A static field of type tuple holds tanks, which a file counts from 1. `rig.dump`,
-    `rig.complete` and `result.save` write such a case.
+    `kind = "..."` of [law] (a controller), [observer], [sensor] or [actuator] then makes a
+    component of the class. Its leaves and static fields are keys of the table; a field `model` is
+    the plant of the rig. A static field of type tuple holds tanks, which a file counts from 1.
+    `rig.dump`, `rig.complete` and `result.save` write such a case.
 
     Parameters
     ----------
     kind : text of letters, digits, "-", "_" and "."; a name that no other class has
-    cls : class made by `jaxtank.component`, of Controller or Observer
+    cls : class made by `jaxtank.component`, of Controller, Observer, Sensor or Actuator
 
     Returns
     -------
@@ -94,13 +122,16 @@ def register(kind, cls):
     name = getattr(cls, "__name__", shortened(cls))
     known = _table_of(cls)
     if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
-        wanted = "a class of Controller or Observer with its own step, made by jaxtank.component"
+        wanted = (
+            "a class of Controller, Observer, Sensor or Actuator with its own step, made by"
+            " jaxtank.component"
+        )
         raise InputError(f"{name} is no component: it must be {wanted}")
     for field in dataclasses.fields(cls):
         why = _unwritable(field)
         if why:
             raise InputError(f"{name}.{field.name}: {why}")
-    taken = LAWS.get(kind) or OBSERVERS.get(kind)
+    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
     if taken not in (None, cls):
         raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
     other = next((k for k, c in known.items() if c is cls and k != kind), None)
@@ -113,12 +144,10 @@ def register(kind, cls):
 
 
 def _table_of(cls):
-    """LAWS or OBSERVERS, where `cls` belongs; None of what belongs to neither."""
+    """The {kind: class} of the role of `cls`; None of what has no role."""
     if not isinstance(cls, type):
         return None
-    if issubclass(cls, controllers.Controller):
-        return LAWS
-    return OBSERVERS if issubclass(cls, Observer) else None
+    return next((r.classes for r in ROLES.values() if issubclass(cls, r.base)), None)
 
 
 def _unwritable(field):
@@ -141,16 +170,16 @@ FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}
 """Defaults in centimetres [cm], converted to the rig's unit of length."""
 
 
-def section_of(name, kind, known, units=DEFAULT):
-    """Return the Section of a [law] or [observer] of a kind: its class's leaves and static fields.
+def section_of(name, kind, units=DEFAULT):
+    """Return the Section of a kind of component: the leaves and static fields of its class.
 
     Parameters
     ----------
-    name : "law" or "observer"
-    kind : name of a class in `known`
-    known : LAWS or OBSERVERS
+    name : "law", "observer", "sensor" or "actuator"
+    kind : name of one of its classes
     units : (length, pump input), in which defaults are
     """
+    known = ROLES[name].classes
     first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
     if known[kind] is controllers.OpenLoop:
         return Section(name, (first, *OPEN_LOOP[1:]))
@@ -188,45 +217,56 @@ def law_of(table, plant, levels, initial):
     """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
         start = ramps(np.asarray(initial).tolist(), [], ramp=0.0)
-        section = section_of("law", "open-loop", LAWS)
+        section = section_of("law", "open-loop")
         return controllers.OpenLoop(
             signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(plant))
         )
-    return component("law", table, LAWS, plant, {"bias": _steady_input(plant, levels, initial)})
+    return component("law", table, plant, {"bias": _steady_input(plant, levels, initial)})
 
 
 def observer_of(table, plant, levels, initial):
     """Return the observer of an [observer] table; arguments as in `law_of`, levels of all tanks."""
     offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
-    return component("observer", table, OBSERVERS, plant, offered)
+    return component("observer", table, plant, offered)
 
 
-def component(name, table, known, plant, offered):
-    """Return the controller or observer of a table: kind, then the fields of its class.
+def instrument_of(name, table, loop):
+    """Return the sensor or actuator of a table; noise and limits that it leaves out are those of
+    the loop's own. name: "sensor" or "actuator".
+    """
+    role = ROLES[name]
+    own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
+    return component(name, table, loop.plant, own)
+
+
+def component(name, table, plant, offered):
+    """Return the component of a table: kind, then the fields of its class.
 
     Parameters
     ----------
-    name : "law" or "observer"
+    name : "law", "observer", "sensor" or "actuator"
     table : {key: value} as in the file
-    known : LAWS or OBSERVERS
     plant : the rig, its field `model`
-    offered : {key: value} that a table may leave out, for classes of ours
+    offered : {key: value} that a table may leave out; of a controller or observer for classes of
+        ours only
     """
+    role = ROLES[name]
     if not isinstance(table, dict):
         raise InputError(f"[{name}]: must be a table")
     if "kind" not in table:
-        raise InputError(f"[{name}] needs kind = one of {', '.join(known)}")
+        raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
     kind = table["kind"]
-    if not isinstance(kind, str) or kind not in known:
-        raise unknown(f"{name} kind", str(kind), known)
-    section = section_of(name, kind, known, plant.units)
-    usual = {k: v for k, v in offered.items() if k in section.names and kind not in REGISTERED}
+    if not isinstance(kind, str) or kind not in role.classes:
+        raise unknown(f"{name} kind", str(kind), role.classes)
+    section = section_of(name, kind, plant.units)
+    offered = {} if kind in REGISTERED and not role.kept else offered
+    usual = {key: value for key, value in offered.items() if key in section.names}
     title = f"{section.title} {kind}"
     values = read_entry(section, {**usual, **table}, sizes_of(plant), title=title)
     del values["kind"]
-    if "model" in known[kind].__dataclass_fields__:
+    if "model" in {field.name for field in dataclasses.fields(role.classes[kind])}:
         values["model"] = plant
-    return known[kind](**values)
+    return role.classes[kind](**values)
 
 
 def _steady_input(plant, levels, initial):
@@ -239,19 +279,31 @@ def _steady_input(plant, levels, initial):
         return initial
 
 
-def kind_of(part, known):
-    """The name of a controller or an observer in a rig file, None where it has none."""
-    return next((name for name, cls in known.items() if cls is type(part)), None)
+def kind_of(name, part):
+    """The kind of a component in a section of a rig file, None where it has none."""
+    return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
 
 
-def values_of(name, part, known):
-    """Return (section, {key: value}) of a controller or an observer, None of an optional leaf that
-    is not in use; name: "law" or "observer". InputError where no rig file describes it.
+def has_section(name, part):
+    """Whether a file has the section for a part that is not the preset's: [values] set the fields
+    of LevelSensor and PumpBank.
     """
-    kind, cls = kind_of(part, known), type(part).__name__
+    return ROLES[name].default is None or type(part) is not ROLES[name].default
+
+
+def is_written(name, part):
+    """Whether a section of a rig file can describe a part of the loop."""
+    return has_section(name, part) and kind_of(name, part) is not None
+
+
+def values_of(name, part):
+    """Return (section, {key: value}) of a component, None of an optional leaf that is not in use.
+    InputError where no rig file describes it.
+    """
+    kind, cls = kind_of(name, part), type(part).__name__
     if kind is None:
         raise InputError(f"its {cls} has no name in a rig file")
-    section = section_of(name, kind, known)
+    section = section_of(name, kind)
     if isinstance(part, controllers.OpenLoop):
         if not isinstance(part.signal, Ramps):
             raise InputError("its OpenLoop plays a signal that no rig file describes")

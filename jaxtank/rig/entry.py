@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import check_value, number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.rig.schema import NEEDED
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT, check_unit
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -231,4 +232,6 @@ def _entry_of(loop, target, i):
     *path, part = target.split(".")
     for step in [*path, part] if not part.isdigit() else path:
         value = getattr(value, step)
+    if not isinstance(value, tuple) and np.ndim(value) == 0:  # one number for all tanks
+        return value
     return value[i][int(part)] if part.isdigit() else value[i]

@@ -10,10 +10,6 @@ from jaxtank.core.tree import is_component, walk
 from jaxtank.rig import components, schedule, signals
 
 
-PARTS = (("law", "controller", components.LAWS), ("observer", "observer", components.OBSERVERS))
-"""(section, part of the loop, its classes) of what a file may have another one of."""
-
-
 def origin_of(case):
     """Return the preset that a case came from.
 
@@ -23,50 +19,48 @@ def origin_of(case):
 
     Returns
     -------
-    (Case of a preset with the same rig, which of "law" and "observer" are of the same kind as its
-    own), or (None, ()): also of a rig whose tanks have names, which only a file that describes it
-    tank by tank can have.
+    (Case of a preset with the same rig, which of "law", "observer", "sensor" and "actuator" are of
+    the same kind as its own), or (None, ()): also of a rig whose tanks have names, which only a
+    file that describes it tank by tank can have.
     """
     if case.names:
         return None, ()
     loop = schedule.unscheduled(case.loop)
+    mine, statics = structures(loop), _statics(loop)
     best, found = None, (None, ())
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
-            same = _same_parts(loop, other.loop)
+            same = _same_parts(loop, mine, other.loop)
             if same is None:
                 continue
-            common = sum(a == b for a, b in zip(_statics(loop), _statics(other.loop)))
+            common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
             score = ("law" in same, "observer" in same, other.name == case.name, common)
             if best is None or score > best:
                 best, found = score, (other, same)
     return found
 
 
-def _same_parts(loop, other):
-    """Which of "law" and "observer" two loops have of the same kind; None where a file cannot make
-    one loop of the other.
+def _same_parts(loop, mine, other):
+    """Which sections `other` has of the same kind as `loop`, whose structures are `mine`; None
+    where a file cannot make one loop of the other.
     """
-    mine, theirs = structures(loop), structures(other)
-    if mine["rest"] != theirs["rest"] or not _has_optional(
-        other, ("plant", "sensor", "actuator"), loop
-    ):
+    theirs = structures(other)
+    if mine["rest"] != theirs["rest"] or not _has_optional(other, "plant", loop):
         return None
     same = tuple(
-        section
-        for section, field, _ in PARTS
-        if mine[field] == theirs[field] and _has_optional(other, (field,), loop)
+        name
+        for name, role in components.ROLES.items()
+        if mine[role.field] == theirs[role.field] and _has_optional(other, role.field, loop)
     )
-    for section, field, known in PARTS:
-        if section not in same and components.kind_of(getattr(loop, field), known) is None:
+    for name, role in components.ROLES.items():
+        if name not in same and not components.is_written(name, getattr(loop, role.field)):
             return None
     return same
 
 
-def _has_optional(other, fields, loop):
-    """Whether the optional leaves that parts of `other` use are in use in `loop`."""
-    used = {name for name in _optional(other) if name.split(".")[0] in fields}
-    return used <= _optional(loop)
+def _has_optional(other, field, loop):
+    """Whether the optional leaves that a part of `other` uses are in use in `loop`."""
+    return {name for name in _optional(other) if name.startswith(f"{field}.")} <= _optional(loop)
 
 
 def _statics(loop):
@@ -103,9 +97,7 @@ def structures(loop):
     if signals.disturbance_tables(loop.disturbance) is not None:
         described["disturbance"] = None
     plain = settle(dataclasses.replace(loop, **described))
-    rest = dataclasses.replace(plain, controller=None, observer=None)
-    return {
-        "rest": jax.tree.structure(rest),
-        "controller": jax.tree.structure(plain.controller),
-        "observer": jax.tree.structure(plain.observer),
-    }
+    fields = [role.field for role in components.ROLES.values()]
+    rest = dataclasses.replace(plain, **dict.fromkeys(fields))
+    parts = {field: jax.tree.structure(getattr(plain, field)) for field in fields}
+    return {"rest": jax.tree.structure(rest), **parts}

@@ -13,7 +13,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
-from jaxtank.core.tree import shortened
+from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validate
 from jaxtank.rig.entry import Sizes, read_value
 from jaxtank.rig.schema import SECTIONS, TANKWISE
@@ -208,6 +208,9 @@ def start_of(table):
         _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     )
     loop, changed = case.loop, {}
+    for name in ("sensor", "actuator"):
+        if name in table:
+            changed[name] = components.instrument_of(name, table[name], loop)
     if "reference" in table:
         changed["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
     if "disturbance" in table or "pour" in table:

@@ -287,6 +287,8 @@ _ALL = (
     Section("plant", PLANT),
     Section("law"),
     Section("observer"),
+    Section("sensor"),
+    Section("actuator"),
     Section("reference", REFERENCE),
     Section(
         "reference.sine",

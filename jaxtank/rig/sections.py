@@ -98,12 +98,10 @@ def _building(case, origin, same):
         found = [_of_rig(section, own, i, units) for section, i, own in entries]
     else:
         top, found = {"case": origin.name, "name": case.name}, []
-    for kind, known, part in (
-        ("law", components.LAWS, loop.controller),
-        ("observer", components.OBSERVERS, loop.observer),
-    ):
-        if kind not in same:
-            found.append(block(*components.values_of(kind, part, known), units))
+    for name, role in components.ROLES.items():
+        part = getattr(loop, role.field)
+        if name not in same and components.has_section(name, part):
+            found.append(block(*components.values_of(name, part), units))
     found += _reference(loop, start)
     disturbing = signals.disturbance_tables(loop.disturbance)
     if disturbing is None:
@@ -152,7 +150,7 @@ def _values(case, base, tankwise, same):
     groups = {}
     for name, value, meta in _settable(case):
         part = name.partition(".")[0]
-        line = _line(case, name, value, meta, _is_built(name, tankwise, same), base)
+        line = _line(case, name, value, meta, _is_built(case, name, tankwise, same), base)
         if line is not None:
             groups.setdefault(part, []).append(line)
     groups["clock"] = [
@@ -175,11 +173,14 @@ def _settable(case):
             yield name, None if value is None else np.asarray(value).tolist(), meta
 
 
-def _is_built(name, tankwise, same):
+def _is_built(case, name, tankwise, same):
     """Whether the tables that build a case set the field `name` of its loop."""
-    built = {"controller": "law" not in same, "observer": "observer" not in same, "plant": tankwise}
-    return built.get(name.partition(".")[0], False) or (
-        tankwise and name in targets(*network.LISTS)
+    part = name.partition(".")[0]
+    built = tankwise and (part == "plant" or name in targets(*network.LISTS))
+    return built or any(
+        part == role.field and section not in same and components.has_section(section, own)
+        for section, role in components.ROLES.items()
+        for own in (getattr(case.loop, role.field),)
     )
 
 

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.plants.faults import faults
 from jaxtank.rig.entry import is_finite, read_entries, read_entry, sizes_of, written
 from jaxtank.rig.schema import SECTIONS

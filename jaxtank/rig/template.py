@@ -60,8 +60,9 @@ def of_uncertain(case, name):
 
 def _measures(case, but):
     """Suggested lines of the measures that a run of the case has, without those in `but`."""
-    disturbed = hasattr(case.loop.disturbance, "since")
-    stepped = hasattr(case.loop.reference, "windows")
+    disturbance = case.loop.disturbance
+    disturbed = disturbance is not None and disturbance.onset is not None
+    stepped = case.loop.reference.changes is not None
     return [
         Line(name, WEIGHT.default, of_measure(case, name), False)
         for name, spec in MEASURES.items()
@@ -158,17 +159,17 @@ def _seconds(case, share):
 def _law(case):
     """The case's own controller, as a start for another."""
     part = case.loop.controller
-    known = components.kind_of(part, components.LAWS) is not None
+    known = components.kind_of("law", part) is not None
     if not known or not is_component(getattr(part, "model", None)):
         return None  # also of a controller with a schedule, whose class has no name
-    return _component("law", part, components.LAWS)
+    return _component("law", part)
 
 
-def _component(name, part, known):
+def _component(name, part):
     """{key: value} of a controller or observer, and its section."""
-    section, values = components.values_of(name, part, known)
+    section, values = components.values_of(name, part)
     word = {"law": "controller"}.get(name, name)
-    prose = f"Another {word} than the preset's: {', '.join(known)}."
+    prose = f"Another {word} than the preset's: {', '.join(components.ROLES[name].classes)}."
     if name == "law":
         prose += " [values] above then has the names of that controller."
     return {"section": Section(name, section.keys, prose=prose), **values}
@@ -197,12 +198,12 @@ def schedule(case):
 def _observer(case):
     """The loop's own observer, or an extended Kalman filter where it has none."""
     part = case.loop.observer
-    if components.kind_of(part, components.OBSERVERS) not in (None, "direct"):
-        return _component("observer", part, components.OBSERVERS)
+    if components.kind_of("observer", part) not in (None, "direct"):
+        return _component("observer", part)
     rim = float(np.asarray(case.loop.plant.rim)[0])
     small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
     kind = "extended-kalman"
-    keys = components.section_of("observer", kind, components.OBSERVERS).keys
+    keys = components.section_of("observer", kind).keys
     prose = f"Another observer than the preset's: {', '.join(components.OBSERVERS)}."
     return {
         "section": Section("observer", keys, prose=prose),

@@ -11,9 +11,11 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
+from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import check_value, describe, get_value, shortened, split_index
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures.catalogue import check_names, entries
