@@ -268,7 +268,7 @@ def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
 def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
     """The Free of a parameter, if it is a leaf in use and its range lies within what it allows."""
     if name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS:
-        meta = {"kind": "static"}
+        meta: dict[str, Any] = {"kind": "static"}
     else:
         meta = describe(loop, name)
     if meta["kind"] == "static":
