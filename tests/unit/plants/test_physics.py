@@ -416,7 +416,7 @@ def test_the_clock_does_not_drift():
 
 
 def test_a_knee_too_small_for_its_powers_is_refused():
-    """At the least that is taken, value and slope of a smooth_sqrt at an empty tank are numbers, in the
+    """At the least that is taken, value and slope of a root at an empty tank are numbers, in the
     shorter floats too.
     """
     with pytest.raises(InputError, match=r"plant\.knee = 1e-300 m: must be at least 1e-15 m"):
