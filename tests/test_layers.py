@@ -28,7 +28,7 @@ RANKS = [
 RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
 # A result opens its report when .plot() or .save() is called; `python -m jaxtank` is the command.
 LAZY = {
-    ("tuning.identification.fit", "tuning.report.identification"),
+    ("tuning.identification.result", "tuning.report.identification"),
     ("tuning.search.result", "tuning.report.tuning"),
     ("tuning.search.result", "tuning.report.tuning_figures"),
     ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),
