@@ -26,15 +26,9 @@ RANKS = [
     "tuning.cli",
 ]
 RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
-# A result opens its report when .plot() or .save() is called; `python -m jaxtank` is the command.
-LAZY = {
-    ("tuning.identification.result", "tuning.report.identification"),
-    ("tuning.search.result", "tuning.report.tuning"),
-    ("tuning.search.result", "tuning.report.tuning_figures"),
-    ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),
-    ("tuning.uncertainty.study", "tuning.report.uncertainty"),
-    ("jaxtank.__main__", "tuning.cli.main"),
-}
+# A result displays itself as HTML (and opens the module of its report by name); `python -m jaxtank`
+# is the command.
+LAZY = {("tuning.problem.result", "tuning.report.html"), ("jaxtank.__main__", "tuning.cli.main")}
 DRAWING = {"jaxtank.plots", "tuning.report", "tuning.cli"}  # folders that may import matplotlib
 
 

@@ -5,18 +5,18 @@ Imported by `fit`; reports are opened when they are asked for.
 
 import dataclasses
 import functools
-from pathlib import Path
 from typing import Any
 
 from jaxtank.case import Case
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
+from tuning.problem.result import Result
 from tuning.problem.status import Status
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Identification:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Identification(Result):
     """Result of `tuning.identify`; `print(result)` for a table.
 
     Attributes
@@ -64,6 +64,8 @@ class Identification:
     >>> result.save("identified")  # doctest: +SKIP
     """
 
+    REPORT = "tuning.report.identification"
+
     case: Any
     estimation: Estimation
     fit: Fit
@@ -102,34 +104,4 @@ class Identification:
     @property
     def message(self) -> str:
         """How it ended, in one line."""
-        from tuning.report import identification
-
-        return identification.message(self)
-
-    def __str__(self):
-        from tuning.report import identification
-
-        return identification.text(self)
-
-    __repr__ = __str__
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of `jaxtank identify --json`."""
-        from tuning.report import identification
-
-        return identification.json_of(self)
-
-    def plot(self) -> dict[str, Any]:
-        """Return {name: matplotlib Figure}: fit, residuals, correlation, profile."""
-        from tuning.report import identification
-
-        return identification.figures(self)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml.
-
-        command: the command line, for the report. Returns the paths.
-        """
-        from tuning.report import identification
-
-        return identification.save(self, folder, command)
+        return self._report().message(self)

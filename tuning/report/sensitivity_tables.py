@@ -197,13 +197,13 @@ def _column_json(result, c):
     }
 
 
-def text(result):
-    """The result as a page of text."""
-    return "\n".join([*parts_of(result), *(f"- {note}" for note in notes_of(result))])
+def lines(result):
+    """What is printed of a SensitivityResult: lines and tables."""
+    return [*parts_of(result), *(f"- {note}" for note in notes_of(result))]
 
 
 def parts_of(result):
-    """What `text` says but for the notes: a list of lines and tables."""
+    """What `lines` has but for the notes."""
     asked = (
         ""
         if result.samples is None

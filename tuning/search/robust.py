@@ -14,6 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.problem.problem import Problem
+from tuning.problem.result import Shown
 from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
 from tuning.search.result import TuningResult
@@ -44,6 +45,21 @@ class Certificate(NamedTuple):
     fresh: int  # plants run afterwards
     broken: int  # of those, how many broke a limit
     interval95: list  # Clopper and Pearson
+
+    _repr_html_ = Shown._repr_html_
+    _lines = Shown._lines
+
+    def __str__(self):
+        low, high = self.interval95
+        rows = {
+            "plants of the search": self.scenarios,
+            "support scenarios": self.support,
+            "scenario bound": f"{self.bound:.2g} (confidence 1 - {CONFIDENCE:g})",
+            "validation plants": self.fresh,
+            "validation plants that break a limit": self.broken,
+            "probability of breaking a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
+        }
+        return "\n".join(f"{name}: {value}" for name, value in rows.items())
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):

@@ -17,6 +17,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from tuning.problem import scenarios as sc
+from tuning.problem.result import Result
 from tuning.uncertainty import indices
 from tuning.uncertainty.distributions import Correlated, Draws, stated
 from tuning.uncertainty.local import Column, entries_of, local_columns
@@ -39,8 +40,8 @@ loop is held for each.
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SensitivityResult:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class SensitivityResult(Result):
     """What `sensitivity` found. `.text()` for tables, `.to_json()`, `.figures()` for pictures,
     `.save(dir)` for files.
 
@@ -49,6 +50,8 @@ class SensitivityResult:
     columns: one Column for each entry of each measure; runs: simulations; failed: how many of them
     stopped being finite; samples: trajectories or base points, None for the local method.
     """
+
+    REPORT = "tuning.report.sensitivity_tables"
 
     case: Any
     method: str
@@ -69,37 +72,6 @@ class SensitivityResult:
         """
         size = np.abs(column.felt[RANKED_BY[self.method]])
         return np.argsort(np.where(np.isfinite(size), -size, np.inf), kind="stable")
-
-    def to_json(self):
-        """The JSON object of `jaxtank sensitivity --json`."""
-        from tuning.report.sensitivity_tables import json_of
-
-        return json_of(self)
-
-    def text(self):
-        """The result as a page of text."""
-        from tuning.report.sensitivity_tables import text
-
-        return text(self)
-
-    def figures(self):
-        """Matplotlib figures {"tornado" or "sobol": figure}."""
-        from tuning.report.sensitivity_tables import figures
-
-        return figures(self)
-
-    plot = figures
-
-    def save(self, folder, command=None):
-        """Write result.json, sensitivity.csv, the picture and report.html, which says the line
-        `command`, to a folder; returns their paths.
-        """
-        from tuning.report.sensitivity_tables import save
-
-        return save(self, folder, command)
-
-    def __repr__(self):
-        return self.text()
 
 
 def sensitivity(

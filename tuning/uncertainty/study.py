@@ -23,6 +23,7 @@ from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
 from tuning.problem.limits import resolve_limits
+from tuning.problem.result import Result
 from tuning.problem.scenarios import noisy
 from tuning.storage import batch_store
 from tuning.storage.evaluation_log import folder_of
@@ -46,8 +47,8 @@ FAN_DRAWS, FAN_ROWS = 512, 240
 """Draws and time stamps of a fan chart."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ensemble:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Ensemble(Result):
     """What `ensemble` gives: N draws and what each came to.
 
     values: {name: (N, ...)} drawn parameters; measures: {name: (N, ...)}; failed: (N,) True where
@@ -55,6 +56,8 @@ class Ensemble:
     steady state below the rims and within the pumps' limits, None where that is not known in closed
     form; fan: {"t", "r", "x", "u": quantiles (5, rows, ...)} of the first draws, or None.
     """
+
+    REPORT = "tuning.report.uncertainty"
 
     case: Any
     distributions: dict
@@ -133,31 +136,6 @@ class Ensemble:
                 }
             )
         return rows
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON object of `jaxtank uncertainty --json`."""
-        from tuning.report.uncertainty import json_of
-
-        return json_of(self)
-
-    def plot(self):
-        """Matplotlib figures {name: figure}: fan of the levels, violations, rig."""
-        from tuning.report.uncertainty import figures
-
-        return figures(self)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, draws.csv, the pictures and report.html, which says the line
-        `command`, to a folder.
-        """
-        from tuning.report.uncertainty import save
-
-        return save(self, folder, command)
-
-    def __repr__(self):
-        from tuning.report.uncertainty import text
-
-        return text(self)
 
 
 def _within(name, values, end):

@@ -95,7 +95,7 @@ def _told(found, args):
     try:
         written = found.save(args.out, args.line) if args.out else []
     finally:  # a disk that is full costs the files, not the answer
-        print(tables.dumps(found.to_json()) if args.json else repr(found))
+        print(tables.dumps(found.to_json()) if args.json else str(found))
     tell_written(written, args)
     return 0
 
@@ -119,7 +119,7 @@ def sensitivity(args):
     devices = devices_of(args)
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
-    from tuning.report import sensitivity_tables, tables
+    from tuning.report import tables
     from tuning.uncertainty.sensitivity_study import MOST, sensitivity
 
     terminal, told = sys.stderr.isatty(), [0]
@@ -146,6 +146,6 @@ def sensitivity(args):
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:
-        print(tables.dumps(sensitivity_tables.json_of(result)) if args.json else result.text())
+        print(tables.dumps(result.to_json()) if args.json else str(result))
     tell_written(written, args)
     return 0

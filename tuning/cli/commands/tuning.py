@@ -33,7 +33,7 @@ def tune(args):
 def _tune(args):
     seed, case = seed_of(args), open_case(args)
     from jaxtank.rig import check_objective
-    from tuning.report import tables, tuning
+    from tuning.report import tables
     from tuning.search import tuner
 
     free = once("--free", [pair("--free", text, span) for text in args.free])
@@ -126,7 +126,7 @@ def _tune(args):
     try:
         written = result.save(folder, args.line) if folder else []
     finally:  # a disk that is full costs the files, not the answer; and the log is kept
-        print(tables.dumps(result.to_json()) if args.json else tuning.text(result))
+        print(tables.dumps(result.to_json()) if args.json else str(result))
     if folder and result.status != "interrupted":
         from tuning.storage.evaluation_log import discard
 
