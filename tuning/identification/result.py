@@ -7,6 +7,8 @@ import dataclasses
 import functools
 from typing import Any
 
+import numpy as np
+
 from jaxtank.case import Case
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
@@ -100,6 +102,22 @@ class Identification(Result):
     def identifiable(self) -> bool:
         """Whether every parameter is identifiable, so that a rig file may be written."""
         return all(p["identifiable"] for p in self.parameters.values())
+
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """(name, unit) of every channel of readings."""
+        length = self.case.loop.units[0]
+        return [
+            (f"h{tank + 1}", "V" if volts else length)
+            for tank, volts in self.estimation.data.channels
+        ]
+
+    @property
+    def correlation(self) -> tuple[tuple, np.ndarray]:
+        """(names, (n, n)) correlation of the estimates that have an interval."""
+        names, matrix = self.covariance
+        sd = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        return names, np.asarray(matrix) / np.outer(sd, sd)
 
     @property
     def message(self) -> str:
