@@ -100,7 +100,7 @@ def test_a_written_rig_that_says_unreachable_is_told(name, quiet, told, capsys):
         presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]}
     )
     args = types.SimpleNamespace(out="found/", quiet=quiet)
-    options.tell_unreachable(case, [pathlib.Path("found") / name], args)
+    options.report_unreachable(case, [pathlib.Path("found") / name], args)
     said = capsys.readouterr().err
     assert (
         said
@@ -108,7 +108,7 @@ def test_a_written_rig_that_says_unreachable_is_told(name, quiet, told, capsys):
         * f"jaxtank: found/rig.toml: note: {rig.unreachable(case)}; the file says reachable = false"
         " for it\n"
     )
-    options.tell_unreachable(
+    options.report_unreachable(
         presets.find("gouta2015/backstepping"), [pathlib.Path("found") / name], args
     )
     assert capsys.readouterr().err == ""

@@ -144,7 +144,7 @@ def devices_of(args):
     return devices
 
 
-def tell_written(paths, args):
+def report_written(paths, args):
     if paths and not args.quiet:
         print(
             f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths),
@@ -152,7 +152,7 @@ def tell_written(paths, args):
         )
 
 
-def tell_unreachable(case, paths, args):
+def report_unreachable(case, paths, args):
     """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false`
     and the case itself did not.
     """
