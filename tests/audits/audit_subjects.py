@@ -83,27 +83,27 @@ def near(rng, tree, by=0.05):
 # numerics: levels from far below zero to a full tank, most of them about the knee
 
 
-@subject("numerics.root", quick=True, points=60)
+@subject("numerics.smooth_sqrt", quick=True, points=60)
 def _(rng):
-    return rng.choice([-1, 1], p=[0.2, 0.8]) * 10 ** rng.uniform(-4, 1.5), numerics.root
+    return rng.choice([-1, 1], p=[0.2, 0.8]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_sqrt
 
 
-@subject("numerics.signed_root", quick=True, points=60)
+@subject("numerics.smooth_signed_sqrt", quick=True, points=60)
 def _(rng):
-    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.signed_root
+    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_signed_sqrt
 
 
-@subject("numerics.signed_root_slope", quick=True, points=60)
+@subject("numerics.smooth_signed_sqrt_slope", quick=True, points=60)
 def _(rng):
-    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.signed_root_slope
+    return rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1.5), numerics.smooth_signed_sqrt_slope
 
 
-@subject("numerics.floored_root", quick=True, points=40)
+@subject("numerics.clipped_sqrt", quick=True, points=40)
 def _(rng):
-    return 10 ** rng.uniform(-4, 1, 2), lambda p: numerics.floored_root(p[0], p[1])
+    return 10 ** rng.uniform(-4, 1, 2), lambda p: numerics.clipped_sqrt(p[0], p[1])
 
 
-@subject("numerics.limited_root limited_flow", quick=True, points=60)
+@subject("numerics.limited_sqrt limited_flow", quick=True, points=60)
 def _(rng):
     """Levels from empty up, the limit and the flow holding in about half of the points each."""
     h, supply, s = (
@@ -112,8 +112,8 @@ def _(rng):
         rng.choice([-1, 0, 1]) * 10 ** rng.uniform(-4, 1),
     )
     return (*h, supply, s), lambda p: (
-        numerics.limited_root(p[0], 0.01, p[2]),
-        numerics.limited_root(-p[0], 0.01, p[2]),
+        numerics.limited_sqrt(p[0], 0.01, p[2]),
+        numerics.limited_sqrt(-p[0], 0.01, p[2]),
         numerics.limited_flow(p[3], p[0], p[1]),
     )
 
@@ -127,7 +127,7 @@ def _(rng):
 def _(rng):
     low, high = np.sort(rng.normal(size=2))
     return (rng.normal(), low, high), lambda p: (
-        numerics.at_least(p[0], p[1]),
+        numerics.lower_clip(p[0], p[1]),
         numerics.clip(*p),
         numerics.portion(*p),
         numerics.magnitude(p[0]),
@@ -346,7 +346,7 @@ def delivered(p):
     state = pumps.init(clock)
     g = (metric[0] + metric[1] ** 2, metric[1], 1.0 + metric[2])
     for command in commands:
-        u, state = pumps.step(state, tuple(command), g, clock.dt)
+        u, state = pumps.step(state, pumps.limit(tuple(command), g), clock.dt)
         out += [*u, *pumps.driving(u)]
     return jnp.stack(out)
 

@@ -143,8 +143,8 @@ def rimmed(h, **more):
 
 def limited(one, other):
     """Flow of a pipe between two levels whose tanks give at most 2 and 3 times their level."""
-    one, other = numerics.at_least(one, 0.0), numerics.at_least(other, 0.0)
-    return numerics.limited_flow(numerics.signed_root(one - other), 2.0 * one, 3.0 * other)
+    one, other = numerics.lower_clip(one, 0.0), numerics.lower_clip(other, 0.0)
+    return numerics.limited_flow(numerics.smooth_signed_sqrt(one - other), 2.0 * one, 3.0 * other)
 
 
 BOX = ((2.0, 0.5, 1.0), np.array([0.0, 0.0]), np.array([10.0, 10.0]))
@@ -153,8 +153,8 @@ PUMP = actuators.PumpBank(
     initial=np.zeros(1), dead_zone_kind="offset",
 )  # fmt: skip
 KINKS = [  # what, f, where, the slope by convention (None: any between)
-    ("at_least at its floor", lambda x: numerics.at_least(x, 2.0), 2.0, 1.0),
-    ("at_least by its floor", lambda f: numerics.at_least(2.0, f), 2.0, 0.0),
+    ("at_least at its floor", lambda x: numerics.lower_clip(x, 2.0), 2.0, 1.0),
+    ("at_least by its floor", lambda f: numerics.lower_clip(2.0, f), 2.0, 0.0),
     ("clip at its low end", lambda x: numerics.clip(x, 2.0, 3.0), 2.0, 1.0),
     ("clip at its high end", lambda x: numerics.clip(x, 2.0, 3.0), 3.0, 1.0),
     ("clip by its high end", lambda b: numerics.clip(3.0, 2.0, b), 3.0, 0.0),
@@ -173,18 +173,18 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
         2.0,
         0.0,
     ),
-    ("floored root at its floor", lambda h: numerics.floored_root(h, 0.04), 0.04, 2.5),
-    ("floored root by its floor", lambda f: numerics.floored_root(0.04, f), 0.04, 0.0),
+    ("floored root at its floor", lambda h: numerics.clipped_sqrt(h, 0.04), 0.04, 2.5),
+    ("floored root by its floor", lambda f: numerics.clipped_sqrt(0.04, f), 0.04, 0.0),
     ("root of a mean of nothing", lambda e: numerics.root_of_mean(e * e), 0.0, 0.0),
-    ("root at an empty tank", numerics.root, 0.0, 15.0),
-    ("root at its knee", numerics.root, 0.01, 5.0),
-    ("limited root at an empty tank", lambda h: numerics.limited_root(h, 0.01, 2.0), 0.0, 2.0),
-    ("limited root where the limit ends", lambda h: numerics.limited_root(h, 0.01, 2.0), 0.25, 2.0),
+    ("root at an empty tank", numerics.smooth_sqrt, 0.0, 15.0),
+    ("root at its knee", numerics.smooth_sqrt, 0.01, 5.0),
+    ("limited root at an empty tank", lambda h: numerics.limited_sqrt(h, 0.01, 2.0), 0.0, 2.0),
+    ("limited root where the limit ends", lambda h: numerics.limited_sqrt(h, 0.01, 2.0), 0.25, 2.0),
     ("a pipe's flow from an empty tank", lambda h: limited(h, 0.0), 0.0, 2.0),
     ("a pipe's flow into an empty tank", lambda h: limited(0.0, h), 0.0, -3.0),
     ("a pipe's flow between equal levels", lambda h: limited(1.0 + h, 1.0), 0.0, 10.0),
     ("a pipe's flow from a full tank into an empty one", lambda h: limited(4.0, h), 0.0, None),
-    ("signed root between equal levels", numerics.signed_root, 0.0, 10.0),
+    ("signed root between equal levels", numerics.smooth_signed_sqrt, 0.0, 10.0),
     ("membership where it begins", lambda e: membership(e, 1.0, 0.4), 0.6, 0.0),
     ("membership where it is as wide as it may be", lambda w: membership(0.7, 1.0, w), 1.0, None),
     ("a level at its rim", lambda h: rimmed(h)[0][0], 10.0, 1.0),
@@ -279,7 +279,7 @@ def test_pulses_have_the_slope_of_the_mean_flow():
         )
 
         def sample(state, _):
-            (u,), state = pumps.deliver(state, (v,), 0.1)
+            (u,), state = pumps.step(state, (v,), 0.1)
             return state, u
 
         return jax.lax.scan(sample, start, length=4000)[1].mean()

@@ -82,7 +82,7 @@ class Counted(Plant):
 
     def _film(self, x):
         """Levels whose square root is the rig's, film included: written anew from the docstring of
-        numerics.root.
+        numerics.smooth_sqrt.
         """
         k = self.plant.knee
         return [

@@ -36,7 +36,7 @@ from jaxtank.controllers.fuzzy import membership
 from jaxtank.controllers.sliding_mode import acceleration, lower_tanks
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.numerics import signed_root, signed_root_slope
+from jaxtank.core.numerics import smooth_signed_sqrt, smooth_signed_sqrt_slope
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, number, with_values
 from jaxtank.plants import state_coupled_four_tank
@@ -283,8 +283,10 @@ def test_the_drift_at_the_set_point():
 
 def test_signed_root_slope_is_the_slope():
     x = np.array([-2.0, -1e-3, 0.0, 3e-3, 0.01, 5.0])
-    np.testing.assert_allclose(signed_root_slope(x), jax.vmap(jax.grad(signed_root))(x), rtol=1e-12)
-    np.testing.assert_allclose(signed_root_slope(0.0), 10.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        smooth_signed_sqrt_slope(x), jax.vmap(jax.grad(smooth_signed_sqrt))(x), rtol=1e-12
+    )
+    np.testing.assert_allclose(smooth_signed_sqrt_slope(0.0), 10.0, rtol=1e-12)
 
 
 # S4.1: state feedback
@@ -502,7 +504,7 @@ class SmoothRoots(TankNetwork):
 
     def derivative(self, t, x, u, d):
         w, k, g = jnp.sqrt(2.0 * self.gravity), self.pump_gain, self.split
-        q = [w * signed_root(h, self.knee) for h in x]
+        q = [w * smooth_signed_sqrt(h, self.knee) for h in x]
         pumped = (
             g[0] * k[0] * u[0],
             g[1] * k[1] * u[1],

@@ -34,7 +34,7 @@ class Cone(Plant):
 
     def derivative(self, t, x, u, d):
         width = self.slope * (x[0] + 0.5)
-        flow = self.pump_gain * u[0] - self.drain * jnp.sqrt(2.0 * 981.0) * numerics.root(
+        flow = self.pump_gain * u[0] - self.drain * jnp.sqrt(2.0 * 981.0) * numerics.smooth_sqrt(
             x[0], 0.01
         )
         return (flow / (jnp.pi * width * width),)

@@ -10,10 +10,11 @@ import pytest
 
 import jaxtank
 from jaxtank import rig
+from jaxtank.core.checks import check_leaves
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
-from jaxtank.core.tree import check_leaves, describe, get_value, parameters, with_values
+from jaxtank.core.tree import describe, get_value, parameters, with_values
 
 OPTIONAL = ("actuator.dead_zone", "actuator.lag")
 

@@ -15,7 +15,7 @@ import jaxtank
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.numerics import ROOT_KNEE, floored_root, root
+from jaxtank.core.numerics import LAMINAR_THRESHOLD, clipped_sqrt, smooth_sqrt
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.network import network
 from jaxtank.plants.runge_kutta import integrate
@@ -40,23 +40,30 @@ def held(plant, x, u, dt, steps, integrator="rk4"):
 
 
 def test_root_meets_its_docstring():
-    h = np.linspace(ROOT_KNEE, 40, 2001)
-    np.testing.assert_array_equal(root(h), np.sqrt(h))
-    below = np.linspace(0, ROOT_KNEE, 4001)
-    gap = np.sqrt(below) - np.asarray(root(below))
+    h = np.linspace(LAMINAR_THRESHOLD, 40, 2001)
+    np.testing.assert_array_equal(smooth_sqrt(h), np.sqrt(h))
+    below = np.linspace(0, LAMINAR_THRESHOLD, 4001)
+    gap = np.sqrt(below) - np.asarray(smooth_sqrt(below))
     assert gap.min() > -1e-12
-    assert 0.17 < gap.max() / ROOT_KNEE**0.5 < 0.175
-    assert abs(below[gap.argmax()] / ROOT_KNEE - 0.13) < 0.01
-    assert root(jnp.float64(0.0)) == 0.0
-    assert root(jnp.float64(-0.5)) < 0.0  # draws a level back to zero
+    assert 0.17 < gap.max() / LAMINAR_THRESHOLD**0.5 < 0.175
+    assert abs(below[gap.argmax()] / LAMINAR_THRESHOLD - 0.13) < 0.01
+    assert smooth_sqrt(jnp.float64(0.0)) == 0.0
+    assert smooth_sqrt(jnp.float64(-0.5)) < 0.0  # draws a level back to zero
 
 
 @pytest.mark.parametrize(
-    "h, slope", [(-1.0, 15.0), (0.0, 15.0), (ROOT_KNEE / 2, 10.0), (ROOT_KNEE, 5.0), (4.0, 0.25)]
+    "h, slope",
+    [
+        (-1.0, 15.0),
+        (0.0, 15.0),
+        (LAMINAR_THRESHOLD / 2, 10.0),
+        (LAMINAR_THRESHOLD, 5.0),
+        (4.0, 0.25),
+    ],
 )
 def test_root_has_the_right_slope_everywhere(h, slope):
     for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(derivative(root)(h), slope, rtol=1e-12)
+        np.testing.assert_allclose(derivative(smooth_sqrt)(h), slope, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -64,11 +71,11 @@ def test_root_has_the_right_slope_everywhere(h, slope):
 )
 def test_floored_root_has_the_right_slope_everywhere(h, slope):
     for derivative in (jax.grad, jax.jacfwd):
-        np.testing.assert_allclose(derivative(floored_root)(h, 0.01), slope, rtol=1e-12)
+        np.testing.assert_allclose(derivative(clipped_sqrt)(h, 0.01), slope, rtol=1e-12)
 
 
 def test_second_derivatives_of_the_roots_are_finite_below_zero():
-    for f in (root, lambda h: floored_root(h, 0.01)):
+    for f in (smooth_sqrt, lambda h: clipped_sqrt(h, 0.01)):
         for h in (-1.0, -1e-9, 0.0, 0.005, 0.01, 1.0):
             assert np.isfinite(jax.jacfwd(jax.grad(f))(h)) and np.isfinite(
                 jax.grad(jax.jacfwd(f))(h)
@@ -409,7 +416,7 @@ def test_the_clock_does_not_drift():
 
 
 def test_a_knee_too_small_for_its_powers_is_refused():
-    """At the least that is taken, value and slope of a root at an empty tank are numbers, in the
+    """At the least that is taken, value and slope of a smooth_sqrt at an empty tank are numbers, in the
     shorter floats too.
     """
     with pytest.raises(InputError, match=r"plant\.knee = 1e-300 m: must be at least 1e-15 m"):
@@ -425,6 +432,6 @@ def test_a_knee_too_small_for_its_powers_is_refused():
     least = network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, knee=1e-15).knee
     for level in (0.0, 1e-16, 1e-15, 1.0):
         for kind in (np.float32, np.float64):
-            value, slope = jax.value_and_grad(root)(kind(level), least)
+            value, slope = jax.value_and_grad(smooth_sqrt)(kind(level), least)
             assert np.isfinite(value) and np.isfinite(slope)
         assert level in (0.0, 1e-16) or float(value) == np.sqrt(level)
