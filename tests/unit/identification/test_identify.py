@@ -56,7 +56,7 @@ def case():
 
 @pytest.fixture(scope="module")
 def away(case):
-    """The same rig, with splits of a half and gains of 20: where a fit begins that knows nothing."""
+    """The same rig with splits of a half and gains of 20: the start of an uninformed fit."""
     return rig.set_values(case, {"plant.pump_gain": [20.0, 20.0], "plant.split": [0.5, 0.5]})
 
 
