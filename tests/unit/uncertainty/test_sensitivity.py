@@ -1,8 +1,7 @@
 """Which parameter moves which measure: closed forms, SALib, differences, and the command."""
 
-import contextlib
 import csv
-import io
+import functools
 import json
 import re
 import subprocess
@@ -13,13 +12,13 @@ import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers import command
 
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning.cli import main
 from tuning.problem.scenarios import Lane, groups_of, values_of
 from tuning.report import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
@@ -30,6 +29,8 @@ VARIED = {"plant.drain": Uniform(relative=0.05), "plant.pump_gain": LogUniform(f
 D = 4
 CUBE = {"num_vars": D, "names": list("abcd"), "bounds": [[0.0, 1.0]] * D}
 ISHIGAMI = {"num_vars": 3, "names": list("abc"), "bounds": [[0.0, 1.0]] * 3}
+
+say = functools.partial(command, "sensitivity")
 
 
 def ishigami(p):
@@ -417,13 +418,6 @@ def test_defaults_are_the_cases_own(case):
     assert {d.relative for d in what_varies(case, spread=0.02).values()} == {0.02}
     with pytest.raises(InputError, match="names nothing uncertain"):
         sensitivity(case.replace(uncertain={}))
-
-
-def say(*args):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(["sensitivity", *args])
-    return code, out.getvalue(), err.getvalue()
 
 
 SHORT = ("cascaded/pi", "--set", "clock.duration=400")
