@@ -1,16 +1,14 @@
 """Logs as files: what is read of them, and one line with the place for each that cannot be used."""
 
-import contextlib
-import io
 import re
 
 import numpy as np
 import pytest
+from helpers import command
 
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
-from tuning.cli import main
 from tuning.identification import data_checks
 from tuning.identification.csv_log import read_log, split_header
 
@@ -404,14 +402,6 @@ BAD = {
     "negative level": (bad(changed(3, 3, "-12")), r"line 5, column 'h1 \[cm\]': h1 = -12 cm"),
     "negative input": (bad(changed(3, 2, "-2.8")), r"line 5, column 'pump2 \[V\]': pump2 = -2.8 V"),
 }
-
-
-def command(*words):
-    """(exit code, stdout, stderr) of the command line."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(words))
-    return code, out.getvalue(), err.getvalue()
 
 
 @pytest.mark.parametrize("name", BAD)
