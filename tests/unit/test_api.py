@@ -389,11 +389,11 @@ NASTY = "a<script>alert(1)</script>\"'&b"
 def results(own, tuned):
     """{name: result of each kind}, of a case whose name is hostile, under a class of one's own."""
     with pytest.MonkeyPatch.context() as patch:  # a class that has no name in a file
-        patch.setattr(components, "REGISTERED", {})
+        patch.setattr(components, "REGISTERED", set())
         for name in ("LAWS", "OBSERVERS"):
             table = getattr(components, name)
-            left = {k: v for k, v in table.items() if v not in (Proportional, Offset)}
-            patch.setattr(components, name, type(table)(left))
+            for kind in [k for k, v in table.items() if v in (Proportional, Offset)]:
+                patch.delitem(table, kind)
         case = own.replace(name=NASTY)
         spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
         t = np.arange(0.0, 60.0, 2.0)
