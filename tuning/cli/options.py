@@ -123,7 +123,8 @@ def distributions_of(args, case):
 
 def _pair_of(text, case):
     """(name, distribution) of one --vary, if every draw of it is a value that the case may have."""
-    from tuning.uncertainty.distributions import Draws, parse
+    from tuning.uncertainty.distributions import parse
+    from tuning.uncertainty.draws import Draws
 
     name, value = pair("--vary", text, str)
     try:

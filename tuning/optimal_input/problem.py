@@ -197,9 +197,8 @@ def _box(actuator, pumps, needs):
     if not np.all(np.isfinite([low, high])):
         raise InputError("bound: every pump needs finite limits, actuator.low and actuator.high")
     # within an offset dead zone nothing depends on the input: a search would not leave it
-    dead_zone = actuator.dead_zone if actuator.dead_zone_kind == "offset" else None
-    if dead_zone is not None and not needs & SENSITIVE:
-        low = np.minimum(np.maximum(low, dead_zone), high)
+    if np.any(np.asarray(actuator.offset) > 0) and not needs & SENSITIVE:
+        low = np.minimum(np.maximum(low, actuator.offset), high)
     return low, high
 
 

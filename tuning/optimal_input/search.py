@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError, NonFiniteError
-from jaxtank.core.tree import number
 from jaxtank.loop import run as lp
 from tuning.optimal_input.cost import POINTWISE
 from tuning.optimal_input.lbfgsb import minimise
@@ -89,8 +88,7 @@ class InputSearch:
         """
         problem = self.problem
         loop, clock = problem.case.loop, problem.case.clock
-        noise = number(np.zeros(np.shape(loop.sensor.noise)))
-        quiet = dataclasses.replace(loop, sensor=dataclasses.replace(loop.sensor, noise=noise))
+        quiet = dataclasses.replace(loop, sensor=loop.sensor.without_noise())
         try:
             applied = np.asarray(lp.simulate(quiet, clock).applied).T
         except NonFiniteError:
@@ -113,14 +111,9 @@ class InputSearch:
         The middle of the range for a setpoint without a steady state.
         """
         problem, loop = self.problem, self.problem.case.loop
-        actuator = loop.actuator
         clock = dataclasses.replace(problem.coarse, dt=problem.interval)
         r = np.array(loop.reference.sample(clock)[0])[:, : problem.count]
-        offset = (
-            0.0
-            if actuator.dead_zone is None or actuator.dead_zone_kind != "offset"
-            else np.asarray(actuator.dead_zone)
-        )
+        offset = np.asarray(loop.actuator.offset)
         known = np.unique(r, axis=1)
         known, steady = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
         for setpoint in known:

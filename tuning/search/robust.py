@@ -19,9 +19,11 @@ from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
 from tuning.search.result import TuningResult
 from tuning.search.tuner import tune
-from tuning.uncertainty.distributions import Draws, stated
+from tuning.uncertainty.distributions import stated
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
-from tuning.uncertainty.study import Ensemble, ensemble
+from tuning.uncertainty.study import ensemble
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
