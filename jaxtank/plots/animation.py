@@ -1,5 +1,6 @@
-"""A run as a moving picture: the tanks of the rig filling and emptying, setpoints, what the pumps
-get, and the time.
+"""A run as an animation: levels of all tanks, setpoints, inputs of the pumps, and the time.
+
+Imported by reports and notebooks.
 """
 
 import hashlib
@@ -15,8 +16,8 @@ from matplotlib.patches import Rectangle
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
 from jaxtank.plots.layout import place
-from jaxtank.plots.responses import PUMPS, WATER, styled
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
+from jaxtank.plots.style import PUMPS, WATER, styled
 
 RATE = 12
 """Pictures a second: enough for liquid, which moves slowly."""

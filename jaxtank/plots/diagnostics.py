@@ -4,7 +4,7 @@ axes and returning them.
 
 import numpy as np
 
-from jaxtank.plots.responses import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240
 """Slices of time in the strips of `saturation`; each is as dark as the share of it that was spent

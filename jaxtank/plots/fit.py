@@ -4,7 +4,7 @@ them.
 
 import numpy as np
 
-from jaxtank.plots.responses import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE
 
 
 def measured(ax, t, y, told, name, unit, held_from=None):

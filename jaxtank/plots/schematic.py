@@ -7,7 +7,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.plots.layout import place
-from jaxtank.plots.responses import AFTER, GLASS, PUMPS, REFERENCE, WATER
+from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
 """Water in free fall."""

@@ -44,6 +44,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
+from jaxtank.presets import mirakhorli as paper
 from jaxtank.presets.loops.mirakhorli import (
     GAIN,
     RELAY,
@@ -52,7 +53,7 @@ from jaxtank.presets.loops.mirakhorli import (
     plant,
     sliding,
 )
-from jaxtank.presets.mirakhorli import measured, response
+from jaxtank.presets.mirakhorli import response
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -1327,7 +1328,7 @@ def test_names_of_the_contract():
 
 
 def test_every_published_number_that_can_be_measured_is():
-    measured = measured(
+    measured = paper.measured(
         lambda name, values=None, save_every=1: run(
             name, **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}
         )
@@ -1363,7 +1364,7 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
             }
             return run(instead.get(name, name), **values)
 
-        return measured(other)["zero steady-state error of the SFC"].verdict
+        return paper.measured(other)["zero steady-state error of the SFC"].verdict
 
     assert told(swapped, {}) == "reproduced"
     assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
