@@ -44,8 +44,16 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
-from jaxtank.presets.loops.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, sliding
-from jaxtank.presets.mirakhorli import measured, response
+from jaxtank.presets import mirakhorli as paper
+from jaxtank.presets.loops.mirakhorli import (
+    GAIN,
+    RELAY,
+    SETPOINT,
+    UNROUNDED_SPLIT,
+    plant,
+    sliding,
+)
+from jaxtank.presets.mirakhorli import response
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -1320,14 +1328,16 @@ def test_names_of_the_contract():
 
 
 def test_every_published_number_that_can_be_measured_is():
-    found = measured(
+    measured = paper.measured(
         lambda name, values=None, save_every=1: run(
             name, **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}
         )
     )
     published = load("mirakhorli").published
-    assert set(found) <= set(published)
-    verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
+    assert set(measured) <= set(published)
+    verdicts = {
+        name: claim.verdict for name, claim in measured.items() if hasattr(claim, "verdict")
+    }
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
     assert [verdicts[f"rise time, {law}"] for law in ("SMC", "SFC", "hybrid")] == [
@@ -1354,7 +1364,7 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
             }
             return run(instead.get(name, name), **values)
 
-        return measured(other)["zero steady-state error of the SFC"].verdict
+        return paper.measured(other)["zero steady-state error of the SFC"].verdict
 
     assert told(swapped, {}) == "reproduced"
     assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"

@@ -562,10 +562,10 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
     )
     drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
     assert drawn == {
-        "broke a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
+        "violated a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
         "holds every limit, before and after (1 of 4)": [[1.0, 0.5]],
         # it broke one before, too: the counts are of runs, each in one place
-        "breaks a limit after (1 of 4)": [[3.0, 3.5]],
+        "violates a limit after (1 of 4)": [[3.0, 3.5]],
     }
     labels = [line.get_label() for line in ax.lines]
     assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
