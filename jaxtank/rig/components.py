@@ -23,31 +23,6 @@ from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
-LAWS: dict[str, type] = {
-    "pid": controllers.PID,
-    "state-feedback": controllers.StateFeedback,
-    "lqi": controllers.LQI,
-    "ngpc": controllers.NGPC,
-    "backstepping": controllers.Backstepping,
-    "enmpc": controllers.ENMPC,
-    "two-tank-backstepping": controllers.TwoTankBackstepping,
-    "sliding-mode": controllers.SlidingMode,
-    "fuzzy": controllers.FuzzyBlend,
-    "gpc": controllers.GPC,
-    "laguerre": controllers.Laguerre,
-    "open-loop": controllers.OpenLoop,
-}
-OBSERVERS: dict[str, type] = {
-    "direct": Direct,
-    "disturbance": DisturbanceObserver,
-    "kalman": Kalman,
-    "extended-kalman": ExtendedKalman,
-}
-SENSORS: dict[str, type] = {"level": LevelSensor}
-ACTUATORS: dict[str, type] = {"pumps": PumpBank}
-REGISTERED: set[str] = set()
-"""Kinds that were added by `register`."""
-
 
 class Role(NamedTuple):
     """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
@@ -63,11 +38,43 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "law": Role("controller", controllers.Controller, LAWS),
-    "observer": Role("observer", Observer, OBSERVERS),
-    "sensor": Role("sensor", Sensor, SENSORS, ("noise",), LevelSensor),
-    "actuator": Role("actuator", Actuator, ACTUATORS, ("low", "high", "initial"), PumpBank),
+    "law": Role(
+        "controller",
+        controllers.Controller,
+        {
+            "pid": controllers.PID,
+            "state-feedback": controllers.StateFeedback,
+            "lqi": controllers.LQI,
+            "ngpc": controllers.NGPC,
+            "backstepping": controllers.Backstepping,
+            "enmpc": controllers.ENMPC,
+            "two-tank-backstepping": controllers.TwoTankBackstepping,
+            "sliding-mode": controllers.SlidingMode,
+            "fuzzy": controllers.FuzzyBlend,
+            "gpc": controllers.GPC,
+            "laguerre": controllers.Laguerre,
+            "open-loop": controllers.OpenLoop,
+        },
+    ),
+    "observer": Role(
+        "observer",
+        Observer,
+        {
+            "direct": Direct,
+            "disturbance": DisturbanceObserver,
+            "kalman": Kalman,
+            "extended-kalman": ExtendedKalman,
+        },
+    ),
+    "sensor": Role("sensor", Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
+    "actuator": Role(
+        "actuator", Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank
+    ),
 }
+"""{section: Role}; `register` adds classes."""
+
+REGISTERED: set[str] = set()
+"""Kinds that were added by `register`."""
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _FIELDS = (bool, int, float, str, tuple)
@@ -205,7 +212,7 @@ def _key(cls, field, own, units):
     return Key.of(cls, field.name, doc, default=default, **changes)
 
 
-def law_of(table, plant, levels, initial):
+def controller_of(table, plant, levels, initial):
     """Return the controller of a [law] table.
 
     Parameters
@@ -225,7 +232,7 @@ def law_of(table, plant, levels, initial):
 
 
 def observer_of(table, plant, levels, initial):
-    """Return the observer of an [observer] table; arguments as in `law_of`, levels of all tanks."""
+    """Return the observer of an [observer] table; as `controller_of`, levels of all tanks."""
     offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
     return component("observer", table, plant, offered)
 

@@ -338,7 +338,7 @@ def unit(meta):
 
 
 def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another.
+    """The range in `meta` in words, "above 0" for one; value: whether numbers are whole.
     Empty where all numbers are allowed.
     """
     if meta.get("choices") is not None:
