@@ -50,8 +50,10 @@ class TankEnv(gymnasium.Env):
     --------
     >>> from jaxtank import presets
     >>> env = TankEnv(presets.find("cascaded/pi"))
-    >>> observation, info = env.reset(seed=0)
-    >>> observation, reward, terminated, truncated, info = env.step([0.5])
+    >>> env.action_space.shape, env.observation_space.shape
+    ((1,), (4,))
+    >>> observation, info = env.reset(seed=0)  # doctest: +SKIP
+    >>> observation, reward, terminated, truncated, info = env.step([0.5])  # doctest: +SKIP
     """
 
     metadata = {"render_modes": []}

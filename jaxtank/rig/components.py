@@ -126,6 +126,21 @@ def register(kind: str, cls: type) -> type:
     if not (isinstance(kind, str) and _KIND.fullmatch(kind)):
         allowed = 'a text of letters, digits, "-", "_" and "."'
         raise InputError(f"kind = {shortened(kind)}: must be {allowed}")
+    known = _checked(cls)
+    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
+    if taken not in (None, cls):
+        raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
+    other = next((k for k, c in known.items() if c is cls and k != kind), None)
+    if other is not None:
+        raise InputError(f"{cls.__name__} has a name in rig files already: {other!r}")
+    if taken is None:
+        known[kind] = cls
+        REGISTERED.add(kind)
+    return cls
+
+
+def _checked(cls):
+    """The {kind: class} of the role of `cls`; InputError for what a rig file cannot describe."""
     name = getattr(cls, "__name__", shortened(cls))
     known = _table_of(cls)
     if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
@@ -138,16 +153,7 @@ def register(kind: str, cls: type) -> type:
         why = _unwritable(field)
         if why:
             raise InputError(f"{name}.{field.name}: {why}")
-    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
-    if taken not in (None, cls):
-        raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
-    other = next((k for k, c in known.items() if c is cls and k != kind), None)
-    if other is not None:
-        raise InputError(f"{name} has a name in rig files already: {other!r}")
-    if taken is None:
-        known[kind] = cls
-        REGISTERED.add(kind)
-    return cls
+    return known
 
 
 def _table_of(cls):
