@@ -71,7 +71,8 @@ def tank(reference, x0=REST, rim=30.0, volts=2.0, overflow=False):
 def moving():
     """A setpoint that swings about the level at rest."""
     return Sine(
-        amplitude=np.array(1.0), offset=np.array(REST), period=977.0, zero=0.0, start=0.0, end=1e9, channel=0, width=1
+        amplitude=np.array(1.0), offset=np.array(REST), period=977.0, zero=0.0, start=0.0, end=1e9,
+        channel=0, width=1
     )  # fmt: skip
 
 
@@ -144,7 +145,8 @@ import test_long_runs as here
 run, peaks = {"run": here.one_long_run, "draws": here.drained}[sys.argv[2]], []
 for size in sys.argv[3:]:
     run(int(size))
-    peaks.append(next(1024 * int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")))
+    (line,) = (line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+    peaks.append(1024 * int(line.split()[1]))
 print(json.dumps(peaks))
 """
 

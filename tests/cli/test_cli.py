@@ -9,12 +9,12 @@ import math
 import os
 import subprocess
 import sys
-from typing import NamedTuple
 
 import jax
 import matplotlib.image
 import numpy as np
 import pytest
+from helpers import command as say
 
 import jaxtank
 import tuning
@@ -63,25 +63,6 @@ MEASURES = {
     "recovery_time",
     "estimation_rms",
 }
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self):
-        """The one object on stdout; refuses NaN and infinity, which are not JSON."""
-        return json.loads(self.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-
-
-def say(*args):
-    """Run the command here, in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(args))
-    return Said(code, out.getvalue(), err.getvalue())
 
 
 def done(*args):

@@ -2,16 +2,14 @@
 the chain to a tuned rig.
 """
 
-import contextlib
 import csv
 import functools
-import io
 import json
 
 import jax
 import numpy as np
 import pytest
-from helpers import CASCADED_TANKS
+from helpers import CASCADED_TANKS, command
 from scipy.optimize import least_squares
 
 import jaxtank
@@ -19,7 +17,6 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
-from tuning.cli import main
 from tuning.identification import confidence, simulation
 from tuning.identification.design import candidates, compare_experiments, settled
 from tuning.identification.parametrisation import coordinates
@@ -56,7 +53,7 @@ def case():
 
 @pytest.fixture(scope="module")
 def away(case):
-    """The same rig, with splits of a half and gains of 20: where a fit begins that knows nothing."""
+    """The same rig with splits of a half and gains of 20: the start of an uninformed fit."""
     return rig.set_values(case, {"plant.pump_gain": [20.0, 20.0], "plant.split": [0.5, 0.5]})
 
 
@@ -912,14 +909,6 @@ def test_several_logs_measure_what_they_measure(case, clean):
 
 
 # The command, and the chain to a tuned rig
-
-
-def command(*words):
-    """(exit code, stdout, stderr) of the command line."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(words))
-    return code, out.getvalue(), err.getvalue()
 
 
 @functools.cache

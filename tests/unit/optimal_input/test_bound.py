@@ -1,4 +1,4 @@
-"""What no law could beat: against bounds found by others, another solver, and the laws themselves."""
+"""Perfect-information optimum: against bounds found by others, another solver and controllers."""
 
 import dataclasses
 import json

@@ -167,7 +167,7 @@ def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     [(1, 1.901), (5, 1.833), (7.33, 1.796), (11, 1.956), (18, 2.340), (46, 2.257), (100, 2.648)],
 )
 def test_the_penalised_cost_is_that_of_the_tuning_study(gouta, Tp, cost):
-    """At 0.05 s, the step of that study; at 0.01 s the flat far end, Tp = 100 s, is 0.5 % higher."""
+    """At 0.05 s, the step of that study; at 0.01 s the far end, Tp = 100 s, is 0.5 % higher."""
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": float(Tp), "clock.dt": 0.05})
     values = jaxtank.evaluate(case.loop, case.clock, list(PENALISED))
     np.testing.assert_allclose(

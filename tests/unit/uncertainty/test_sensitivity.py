@@ -1,8 +1,7 @@
-"""Which parameter moves which measure: closed forms, SALib, differences, and what the command says."""
+"""Which parameter moves which measure: closed forms, SALib, differences, and the command."""
 
-import contextlib
 import csv
-import io
+import functools
 import json
 import re
 import subprocess
@@ -13,13 +12,13 @@ import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers import command
 
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning.cli import main
 from tuning.problem.scenarios import Lane, groups_of, values_of
 from tuning.report import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
@@ -31,9 +30,11 @@ D = 4
 CUBE = {"num_vars": D, "names": list("abcd"), "bounds": [[0.0, 1.0]] * D}
 ISHIGAMI = {"num_vars": 3, "names": list("abc"), "bounds": [[0.0, 1.0]] * 3}
 
+say = functools.partial(command, "sensitivity")
+
 
 def ishigami(p):
-    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 with x uniform in (-pi, pi); Ishigami and Homma 1990."""
+    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1, x uniform in (-pi, pi); Ishigami and Homma 1990."""
     x = np.pi * (2.0 * np.asarray(p) - 1.0)
     return (
         np.sin(x[..., 0]) + 7.0 * np.sin(x[..., 1]) ** 2 + 0.1 * x[..., 2] ** 4 * np.sin(x[..., 0])
@@ -344,7 +345,7 @@ def test_runs_that_fail_are_counted_and_told(case):
     said = study.to_json()
     assert said[
         "failed"
-    ] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
+    ] == count and f"{count} of {study.runs} runs diverged" in " ".join(said["notes"])
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
@@ -419,13 +420,6 @@ def test_defaults_are_the_cases_own(case):
         sensitivity(case.replace(uncertain={}))
 
 
-def say(*args):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(["sensitivity", *args])
-    return code, out.getvalue(), err.getvalue()
-
-
 SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 
 
@@ -435,9 +429,23 @@ SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 )
 def test_command(tmp_path, method, samples, picture):
     code, out, err = say(
-        *SHORT, "--method", method, "--samples", samples, "--vary", "plant.drain=uniform:5%", "--vary", "plant.pump_gain=normal:2%:tied",
-        "--measure", "max_level", "--measure", "ise", "--json", "--out", str(tmp_path / "found"),
-    )  # fmt: skip
+        *SHORT,
+        "--method",
+        method,
+        "--samples",
+        samples,
+        "--vary",
+        "plant.drain=uniform:5%",
+        "--vary",
+        "plant.pump_gain=normal:2%:tied",
+        "--measure",
+        "max_level",
+        "--measure",
+        "ise",
+        "--json",
+        "--out",
+        str(tmp_path / "found"),
+    )
     assert code == 0
     said = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
     assert said["case"] == "cascaded/pi" and said["method"] == method and said["failed"] == 0
@@ -512,10 +520,13 @@ import jaxtank, tuning
 from jaxtank import presets, rig
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 3)
-case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0})
+values = {"clock.dt": 0.1, "clock.duration": 60.0}
+case = rig.set_values(presets.find("gouta2015/backstepping"), values)
 for devices in (1, 3):
-    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, devices=devices, progress=lambda *done: print(*done))
-    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")])
+    options = dict(devices=devices, progress=lambda *done: print(*done))
+    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, **options)
+    effects = [(c, v) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")]
+    print([(c.label, c.nominal, v.tolist()) for c, v in effects])
 """
 
 
