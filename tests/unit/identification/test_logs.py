@@ -224,9 +224,7 @@ def test_a_level_is_left_out_by_none(read, case):
         "h4": "none",
     }
     for slot in ("t", "pump2"):
-        with pytest.raises(
-            InputError, match=f"column {slot} = none: only a level may be left out"
-        ):
+        with pytest.raises(InputError, match=f"column {slot} = none: only a level may be left out"):
             read(text(), columns={slot: "none"})
     with pytest.raises(DataError, match="no column for a level"):
         read(text(), columns=dict.fromkeys(("h1", "h2", "h3", "h4"), "none"))

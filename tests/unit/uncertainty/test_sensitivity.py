@@ -202,7 +202,9 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
         case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
     ).columns
     for name in ("mu", "mu_star", "sigma"):
-        np.testing.assert_allclose(column.effects[name], np.array(other[name], dtype=float), atol=1e-9)
+        np.testing.assert_allclose(
+            column.effects[name], np.array(other[name], dtype=float), atol=1e-9
+        )
     own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
     assert column.nominal == pytest.approx(own, rel=1e-12)
 
@@ -258,7 +260,9 @@ def test_local_against_central_differences(case, monkeypatch):
         seen += int((np.abs(got) > 1e-3).sum())
     assert seen > 15
     column = study.columns[0]
-    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.effects["effect"][0])
+    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(
+        column.effects["effect"][0]
+    )
     assert column.effects["elasticity"][0] == pytest.approx(
         column.effects["effect"][0] / 0.05 / column.nominal
     )
@@ -322,7 +326,9 @@ def test_noise_may_vary_from_none(case):
     for column in sensitivity(
         case, varied, method="morris", samples=4, measures="input_travel"
     ).columns:
-        assert column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
+        assert (
+            column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
+        )
 
 
 def test_runs_that_fail_are_counted_and_told(case):
@@ -343,9 +349,9 @@ def test_runs_that_fail_are_counted_and_told(case):
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count
     said = study.to_json()
-    assert said[
-        "failed"
-    ] == count and f"{count} of {study.runs} runs diverged" in " ".join(said["notes"])
+    assert said["failed"] == count and f"{count} of {study.runs} runs diverged" in " ".join(
+        said["notes"]
+    )
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
