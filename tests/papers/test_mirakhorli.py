@@ -44,16 +44,8 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
-from jaxtank.presets import mirakhorli as paper
-from jaxtank.presets.loops.mirakhorli import (
-    GAIN,
-    RELAY,
-    SETPOINT,
-    UNROUNDED_SPLIT,
-    plant,
-    sliding,
-)
-from jaxtank.presets.mirakhorli import response
+from jaxtank.presets.loops.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, sliding
+from jaxtank.presets.mirakhorli import measured, response
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -1328,15 +1320,15 @@ def test_names_of_the_contract():
 
 
 def test_every_published_number_that_can_be_measured_is():
-    measured = paper.measured(
+    found = measured(
         lambda name, values=None, save_every=1: run(
             name, **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}
         )
     )
     published = load("mirakhorli").published
-    assert set(measured) <= set(published)
+    assert set(found) <= set(published)
     verdicts = {
-        name: claim.verdict for name, claim in measured.items() if hasattr(claim, "verdict")
+        name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")
     }
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
@@ -1364,7 +1356,7 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
             }
             return run(instead.get(name, name), **values)
 
-        return paper.measured(other)["zero steady-state error of the SFC"].verdict
+        return measured(other)["zero steady-state error of the SFC"].verdict
 
     assert told(swapped, {}) == "reproduced"
     assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
