@@ -1,4 +1,7 @@
-"""The records that cross rooms, and the clock."""
+"""Records that sensors, observers, controllers and measures exchange; check of a random key.
+
+Imports core only; may be imported by every folder.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,9 +13,20 @@ import numpy as np
 from jaxtank.core.errors import InputError
 
 
-def check_key(key):
-    """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the
-    older one, a row of unsigned integers; traced ones and placeholders too.
+def check_key(key: Any) -> None:
+    """Check a random key: None, or one key of jax, typed or a row of unsigned integers.
+
+    Raises
+    ------
+    InputError for anything else; traced keys and placeholders pass.
+
+    Examples
+    --------
+    >>> check_key(jax.random.key(0))
+    >>> check_key(0)
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: key is a int: must be one random key, as jax.random.key(0), or \
+None where there is no noise
     """
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
     typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
@@ -21,58 +35,56 @@ def check_key(key):
     ):
         return
     if key is not None:
-        told = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
+        given = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
         raise InputError(
-            f"key {told}: must be one random key, as jax.random.key(0), or None where there is no"
+            f"key {given}: must be one random key, as jax.random.key(0), or None where there is no"
             " noise"
         )
 
 
 class Tick(NamedTuple):
-    """What a law and an observer are told at sample k besides measurements: tuples of scalars, one
-    per output.
+    """What a controller and an observer know at sample k besides measurements: tuples of scalars,
+    one per output.
     """
 
     t: Any  # time [s]
-    r: tuple  # setpoint r [cm]
-    dr: tuple  # its rate r' [cm/s]
-    ddr: tuple  # its second derivative r'' [cm/s^2]
+    r: tuple[Any, ...]  # setpoint r [cm]
+    dr: tuple[Any, ...]  # its rate r' [cm/s]
+    ddr: tuple[Any, ...]  # its second derivative r'' [cm/s^2]
     dt: Any = 0.0  # sampling period Ts [s]
-    plan: Any = ()  # what the law prepared for this sample before the loop started
-    own: Any = ()  # this sample of the signals that are the law's own (`Controller.inputs`)
+    plan: Any = ()  # what the controller prepared for this sample before the loop started
+    own: Any = ()  # this sample of the controller's own signals (`Controller.inputs`)
 
 
 class Estimate(NamedTuple):
-    """What an observer hands to a law: tuples of scalars."""
+    """What an observer gives to a controller: tuples of scalars."""
 
-    x: Sequence  # level estimate, one per tank [cm]
+    x: Sequence[Any]  # level estimate, one per tank [cm]
     # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
-    d: Sequence = ()
+    d: Sequence[Any] = ()
 
 
 class Sample(NamedTuple):
-    """The world at t_k, before it moves: tuples of scalars."""
+    """State and signals at t_k, before the plant moves: tuples of scalars."""
 
     t: Any  # time [s]
-    x: Sequence  # levels, one per tank [cm]
-    y: Sequence  # measured levels, one per tank [cm]
-    x_hat: Sequence  # estimated levels, one per tank [cm]
+    x: Sequence[Any]  # levels, one per tank [cm]
+    y: Sequence[Any]  # measured levels, one per tank [cm]
+    x_hat: Sequence[Any]  # estimated levels, one per tank [cm]
     # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
-    d_hat: Sequence
-    r: tuple  # setpoint, one per output [cm]
-    e: tuple  # tracking error of the true output, x - r, one per output [cm]
-    command: Sequence  # what the law asked for, one per pump [V]
-    applied: Sequence  # the command within the pumps' limits, one per pump [V]
-    u: Sequence  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
-    spilled: Sequence  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
+    d_hat: Sequence[Any]
+    r: tuple[Any, ...]  # setpoint, one per output [cm]
+    e: tuple[Any, ...]  # tracking error of the true output, x - r, one per output [cm]
+    command: Sequence[Any]  # what the controller commanded, one per pump [V]
+    applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
+    u: Sequence[Any]  # inputs at the plant over [t_k, t_k + dt), one per pump [V]
+    spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
-    shortfall: Sequence = ()
+    shortfall: Sequence[Any] = ()
 
 
 class Trajectory(NamedTuple):
-    """A run for people: arrays with one row per saved sample. Row k is the world at t_k before it
-    moves.
-    """
+    """A run as arrays with one row per saved sample; row k is at t_k, before the plant moves."""
 
     t: Any  # (rows,) [s]
     x: Any  # (rows, tanks) [cm]
@@ -84,4 +96,4 @@ class Trajectory(NamedTuple):
     command: Any  # (rows, pumps) [V]
     applied: Any  # (rows, pumps) [V]
     u: Any  # (rows, pumps) [V]
-    spilled: Any  # (rows, tanks) volume lost over the rim since the start [cm^3]
+    spilled: Any  # (rows, tanks) overflow since the start [cm^3]

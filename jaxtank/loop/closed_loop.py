@@ -13,7 +13,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
-from jaxtank.core.clock import PIECE, Piece
+from jaxtank.core.clock import CHUNK, Chunk
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.instruments.base import Actuator, Sensor
@@ -51,7 +51,7 @@ def inputs(loop, clock, names, key, piece=None, samples=0):
     number, its `samples` alone.
     """
     if piece is not None:
-        clock = Piece(first=piece * PIECE, samples=samples, dt=clock.dt)
+        clock = Chunk(first=piece * CHUNK, samples=samples, dt=clock.dt)
     r, dr, ddr = loop.reference.sample(clock)
     d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
     window = None

@@ -17,7 +17,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
-from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.records import Trajectory
 from jaxtank.core.tree import parameters, with_values
@@ -136,9 +136,9 @@ def evaluate_compiled(loop, clock, names, key, checkpoint):
     carry = (initial(loop, clock), ms.start(run, names))
     if checkpoint:
         state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    elif clock.samples > PIECE and is_pointwise(loop):
-        whole, rest = divmod(clock.samples, PIECE)
-        piece = lambda c, number, samples=PIECE: (
+    elif clock.samples > CHUNK and is_pointwise(loop):
+        whole, rest = divmod(clock.samples, CHUNK)
+        piece = lambda c, number, samples=CHUNK: (
             scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0],
             None,
         )

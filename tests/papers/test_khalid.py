@@ -27,7 +27,8 @@ from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.run import evaluate_compiled
-from jaxtank.presets import khalid
+from jaxtank.presets import khalid as paper
+from jaxtank.presets.loops import khalid
 
 DT = 2.0
 PRESET = presets.load("khalid")
@@ -39,7 +40,7 @@ def law(kind, **changes):
 
 @functools.cache
 def closed(kind, where="S2", mode="unconstrained", du=0.5, r_w=1e-2):
-    """(loop, Trajectory as host arrays) of a scenario; what is not static shares one compiled run."""
+    """(loop, Trajectory in numpy) of a scenario; what is not static shares one compiled run."""
     loop = with_values(
         khalid.build(kind, where, mode), {"controller.du_limit": du, "controller.r_w": r_w}
     )
@@ -49,7 +50,7 @@ def closed(kind, where="S2", mode="unconstrained", du=0.5, r_w=1e-2):
 def summary(kind, *setting, **more):
     """What the tables print of a run, one entry per output or pump."""
     loop, run = closed(kind, *setting, **more)
-    edge = khalid.edges(loop.reference, run)
+    edge = paper.edges(loop.reference, run)
     held = (run.u < 3e-6) | (run.u > 3.0 - 3e-6)
     return {
         "rmse": np.sqrt(np.mean(run.e**2, axis=0)),
@@ -184,7 +185,7 @@ def test_laguerre_functions_are_impulse_responses(a):
 @pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("pole", [0.0, 0.4])
 def test_slopes_of_laguerre_functions_by_their_pole(pole):
-    """At a = 0 too, where a power would have none: the one-sided limit is that of the polynomial."""
+    """At a = 0 too, where a power would have none: the one-sided limit is the polynomial's."""
     f = lambda a: laguerre_functions(a, 4, 12)
     slope, step = jax.jacfwd(f)(jnp.float64(pole)), 1e-6
     np.testing.assert_allclose(
@@ -492,7 +493,7 @@ def short_gpc(where, mode, r_w):
     )
     run = jax.tree.map(np.asarray, jaxtank.simulate(loop, khalid.CLOCK))
     return np.sqrt(np.mean(run.e**2, axis=0)), [
-        pair["overshoot"][0] for pair in khalid.edges(loop.reference, run)
+        pair["overshoot"][0] for pair in paper.edges(loop.reference, run)
     ]
 
 
@@ -567,8 +568,15 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
         if limited:
             least = np.concatenate([np.full(ahead * pumps, -du), np.tile(-u, ahead)])
             most = np.concatenate([np.full(ahead * pumps, du), np.tile(3.0 - u, ahead)])
-            bounds = [{"type": "ineq", "fun": lambda z, most=most, least=least: np.concatenate([most - rows @ z, rows @ z - least]),
-                       "jac": lambda z: np.concatenate([-rows, rows])}]  # fmt: skip
+            bounds = [
+                {
+                    "type": "ineq",
+                    "fun": lambda z, most=most, least=least: np.concatenate(
+                        [most - rows @ z, rows @ z - least]
+                    ),
+                    "jac": lambda z: np.concatenate([-rows, rows]),
+                }
+            ]
             cost, slope = (
                 (lambda z, pull=Psi @ error: z @ Omega @ z + 2 * z @ pull),
                 (lambda z, pull=Psi @ error: 2 * (Omega @ z + pull)),
@@ -669,13 +677,26 @@ def test_a_programme_whose_limits_are_far_is_the_linear_law(kind):
 def in_centimetres(loop):
     """The same loop in cm: every leaf by its own unit."""
     plant = dataclasses.replace(
-        loop.plant, area=loop.plant.area * 1e4, drain=loop.plant.drain * 1e4, pipe=loop.plant.pipe * 1e4, knee=1e-2, units=("cm", "U0"),
-        pump_gain=loop.plant.pump_gain * 1e6, gravity=loop.plant.gravity * 100, rim=loop.plant.rim * 100)  # fmt: skip
+        loop.plant,
+        area=loop.plant.area * 1e4,
+        drain=loop.plant.drain * 1e4,
+        pipe=loop.plant.pipe * 1e4,
+        knee=1e-2,
+        units=("cm", "U0"),
+        pump_gain=loop.plant.pump_gain * 1e6,
+        gravity=loop.plant.gravity * 100,
+        rim=loop.plant.rim * 100,
+    )
     ours, ref = loop.controller, loop.reference
     return dataclasses.replace(
-        loop, plant=plant, x0=loop.x0 * 100,
-        controller=dataclasses.replace(ours, model=plant, operating_point=ours.operating_point * 100, r_w=ours.r_w * 1e4),
-        reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100))  # fmt: skip
+        loop,
+        plant=plant,
+        x0=loop.x0 * 100,
+        controller=dataclasses.replace(
+            ours, model=plant, operating_point=ours.operating_point * 100, r_w=ours.r_w * 1e4
+        ),
+        reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100),
+    )
 
 
 @pytest.mark.slow_for("laguerre-unconstrained")
@@ -699,7 +720,7 @@ def test_centimetres_change_nothing(kind, mode):
     "kind, mode", [("laguerre-mimo", UNC), pytest.param("gpc-mimo", QP, marks=LATER)]
 )
 def test_exchanged_tanks_give_exchanged_answers(kind, mode):
-    """Tanks made unlike, then exchanged with all that belongs to them; the pipe joins the same two."""
+    """Tanks made unlike, then exchanged with all that is theirs; the pipe joins the same two."""
     drain = np.array([78.5e-6, 60e-6])
     values = {
         "plant.drain": drain,
@@ -1006,7 +1027,7 @@ def test_published_claims_are_measured():
             np.asarray, jaxtank.simulate(case.loop, case.clock, save_every=save_every)
         )
 
-    found = khalid.measured(run)
+    found = paper.measured(run)
     assert set(found) == set(PRESET.published)
     for name, published in PRESET.published.items():
         if not isinstance(published.value, str):

@@ -17,7 +17,7 @@ from tuning.report.tables import dumps
 
 
 def trajectory_csv(run, rig_units=DEFAULT):
-    """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
+    """Return a trajectory as CSV with units; disturbance estimates where there are any."""
     known = bool(np.asarray(run.d_hat).any())
     kept = {
         n: v

@@ -23,7 +23,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
 from jaxtank.export.source import export
 from jaxtank.plants.network import network
-from jaxtank.rig import schema as rig_words
+from jaxtank.rig import lines as rig_lines
 from tuning.cli import main
 
 SAMPLES = 10_000
@@ -132,7 +132,7 @@ def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
 @pytest.mark.slow
 @needs_gcc
 def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, monkeypatch):
-    """As above 40 variables, where the factor is found in loops; of 4, which compile in less time."""
+    """As above 40 variables, where loops find the factor; of 4, which compile in less time."""
     monkeypatch.setattr(jaxtank.analysis.qp, "UNROLLED", 3)
     case = presets.find("khalid/laguerre-constrained")
     case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt, "controller.rows": 3})
@@ -473,7 +473,7 @@ HOSTILE = [
 
 def exported(folder, name, language):
     """The text that `jaxtank export` writes of a rig with a hostile name."""
-    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_words.toml(name)))
+    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_lines.toml(name)))
     words = [
         "export",
         str(folder / "rig.toml"),
