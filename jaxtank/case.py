@@ -66,7 +66,7 @@ class Case:
     covariance: (names (n,), covariance (n, n) in their units) of parameters that were identified
     together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its header}, where
     a log of this rig names them otherwise; names: {"tank" or "pump": a name of each, "" for none},
-    where a rig gives them.
+    where a rig gives them; safety: settings of its safety filter (`with_safety_filter`), or None.
     """
 
     name: str
@@ -83,6 +83,7 @@ class Case:
     covariance: tuple | None = None
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     names: Mapping[str, tuple] = dataclasses.field(default_factory=dict)
+    safety: Mapping[str, Any] | None = None
 
     def replace(self, **changes: Any) -> "Case":
         """A copy with the named fields changed."""
@@ -152,7 +153,12 @@ class Case:
         (0, 1)
         """
         found, _ = self.safety_design(**settings)
-        return self.replace(loop=dataclasses.replace(self.loop, safety_filter=found))
+        loop = dataclasses.replace(self.loop, safety_filter=found)
+        return self.replace(loop=loop, safety=settings)
+
+    def without_safety_filter(self) -> "Case":
+        """Return the case without a safety filter."""
+        return self.replace(loop=dataclasses.replace(self.loop, safety_filter=None), safety=None)
 
     def _widths(self):
         """The box of plants that the case itself describes."""

@@ -74,7 +74,7 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 from jaxtank.case import Case
 from jaxtank.rig.components import register
 from jaxtank.rig.lines import toml
-from jaxtank.rig.read import from_table, load, loads, open_case
+from jaxtank.rig.read import filtered, from_table, load, loads, open_case
 from jaxtank.rig.validate import (
     check,
     check_free,
@@ -107,6 +107,7 @@ __all__ = [
     "clock_warnings",
     "complete",
     "dump",
+    "filtered",
     "from_table",
     "has",
     "is_change",

@@ -15,7 +15,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validate
-from jaxtank.rig.entry import Sizes, read_value
+from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
 
@@ -179,7 +179,21 @@ def from_table(table: Mapping[str, Any]) -> Case:
     for name, read in TUNING.items():
         if name in table:
             case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
-    return validate.check(case)
+    return filtered(validate.check(case))
+
+
+def filtered(case: Case, on: bool | None = None) -> Case:
+    """Return the case with the safety filter of its settings, designed for its present values.
+
+    Parameters
+    ----------
+    case : Case
+    on : True: with default settings where it has none; False: without a filter
+    """
+    if on is False:
+        return case.without_safety_filter()
+    settings = case.safety if case.safety is not None or not on else {}
+    return case if settings is None else case.with_safety_filter(**settings)
 
 
 TUNING = {
@@ -189,13 +203,16 @@ TUNING = {
     "uncertain": lambda case, table: validate.check_uncertain(case.loop, table),
     "covariance": lambda case, table: validate.check_covariance(case.loop, table),
     "log": lambda case, table: validate.check_log(case.loop.plant, table),
+    "safety_filter": lambda case, table: read_entry(
+        SECTIONS["safety_filter"], table, sizes_of(case.loop.plant)
+    ),
     "scenario": lambda case, table: tuple(
         validate.scenario(case, entry, i) for i, entry in enumerate(table)
     ),
 }
 """{section: function (case, its table)} of what is read after the values are set."""
 
-FIELDS = {"scenario": "scenarios"}
+FIELDS = {"scenario": "scenarios", "safety_filter": "safety"}
 """{section: field of Case}, where it has another name."""
 
 

@@ -255,6 +255,30 @@ COVARIANCE = (
     Key("names", "parameters, an array's entry by name[i]", "texts"),
     Key("matrix", "their covariance, in their units", "any"),
 )
+SAFETY_FILTER = (
+    _optional(
+        "limit",
+        "(n,) level that each tank may not pass; left out: [limits] max_level, else its rim",
+        "list",
+        "cm",
+    ),
+    _optional(
+        "band",
+        "(n,) largest difference of reading and level; left out: 6 standard deviations of the"
+        " noise, half an ADC step and the offset",
+        "list",
+        "cm",
+    ),
+    _optional(
+        "rate", "how fast a level may approach its limit (kappa)", unit="1/s", low=0.0, strict=True
+    ),
+    _optional(
+        "widths",
+        "half width of the interval of each parameter of the plant, by name; left out: those of"
+        " [covariance] or [uncertain]",
+        "table",
+    ),
+)
 SCENARIO = (
     _optional("name", "what reports call it", "text"),
     Key("seed", "of its sensor noise", "integer", low=0, high=2**31 - 1, default=0),
@@ -324,6 +348,12 @@ _ALL = (
         COVARIANCE,
         prose="Parameters that vary together, as `jaxtank identify` writes them; used in the place"
         " of [uncertain].",
+    ),
+    Section(
+        "safety_filter",
+        SAFETY_FILTER,
+        prose="Caps on the pumps under which no level passes its limit on any plant of the"
+        " intervals; what is proved is in `jaxtank show`.",
     ),
     Section(
         "scenario",

@@ -3,6 +3,7 @@
 Imported by `write`.
 """
 
+import dataclasses
 import tomllib
 
 import numpy as np
@@ -47,6 +48,12 @@ def sections(case, tankwise=False):
     ------
     InputError for a case that no file can describe.
     """
+    if case.loop.safety_filter is not None and case.safety is None:
+        raise InputError(
+            f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
+            " Case.with_safety_filter"
+        )
+    case = case.replace(loop=dataclasses.replace(case.loop, safety_filter=None))
     origin, same = (None, ()) if tankwise else origin_of(case)
     try:
         top, *built = _building(case, origin, same)
@@ -236,6 +243,8 @@ def _tuning(case):
         names, rows = case.covariance
         values = {"names": names, "matrix": [list(map(float, row)) for row in rows]}
         found.append(block(SECTIONS["covariance"], values))
+    if case.safety is not None:
+        found.append(block(SECTIONS["safety_filter"], dict(case.safety), case.loop.units))
     if case.log:
         bare = {"unit": "-", "doc": ""}
         columns = [Line(slot, plain(spec), bare) for slot, spec in case.log.items()]

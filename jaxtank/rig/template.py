@@ -9,6 +9,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.plants.network import TankNetwork
 from jaxtank.rig import components
 from jaxtank.rig import schedule as scheduling
 from jaxtank.rig.lines import Block, Line, suggestion, toml
@@ -264,6 +265,14 @@ def _covariance(case):
     }
 
 
+def _safety_filter(case):
+    """Limits at the rims."""
+    plant = case.loop.plant
+    if case.safety is not None or not isinstance(plant, TankNetwork):
+        return None
+    return {"limit": np.asarray(plant.rim)}
+
+
 def _scenario(case):
     """A run with sensor noise of its own."""
     return {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}}
@@ -291,6 +300,7 @@ EXAMPLES = {
     "pour": _pour,
     "fault": _fault,
     "covariance": _covariance,
+    "safety_filter": _safety_filter,
     "scenario": _scenario,
     "log": _log,
 }

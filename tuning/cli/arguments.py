@@ -109,6 +109,12 @@ def changes():
         " same variable and knots for all gains",
     )
     option(found, "--dt", "S", "sampling period [s], short for --set clock.dt=S")
+    found.add_argument(
+        "--safety-filter",
+        action=argparse.BooleanOptionalAction,
+        help="caps on the pumps under which no level passes its limit on any plant that the case"
+        " calls uncertain (see jaxtank show); --no-safety-filter: without that of the rig file",
+    )
     return found
 
 

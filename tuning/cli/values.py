@@ -39,6 +39,7 @@ def open_case(args):
     values = settings(args)
     case = rig.check(rig.set_and_schedule(opened, values, schedule(args.schedule)))
     case, replaced = rig.overridden(case, values)
+    case = rig.filtered(case, args.safety_filter)
     if not args.quiet:
         for sentence in _warnings(args, opened, case, replaced):
             if sentence not in of_file:

@@ -15,7 +15,7 @@ from jaxtank.measures.catalogue import MEASURES, TIMES
 from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from tuning.problem.wording import count
-from tuning.report import tables
+from tuning.report import safety, tables
 from tuning.report.case_loop import actuator, called, own_name, sampled, sensor, signals
 
 WIDTH = 100
@@ -57,6 +57,7 @@ def json_of(case):
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
         "limits": tables.clean(dict(case.limits)),
         "objective": dict(case.objective),
+        "safety_filter": safety.certificates(case),
         "published": {
             n: [tables.clean(p.value), " ".join(filter(None, [p.unit, p.where]))]
             for n, p in published.items()
@@ -105,6 +106,7 @@ def text(case):
         _rig(case, page),
         _loop(case, page),
         _tuning(case, preset, page),
+        _safety(case, page),
         _all_parameters(page),
         _measured(case),
         _paper(case, preset, page),
@@ -150,6 +152,15 @@ def _tuning(case, preset, page):
         names = "; ".join(s.name for s in case.scenarios)
         lines += textwrap.wrap(f"scenarios of tune: {names}", WIDTH)
     return lines
+
+
+def _safety(case, page):
+    """The chapter on the safety filter: which limits on levels are proved."""
+    if page["safety_filter"] is None:
+        return []
+    heads, rows = safety.rows_of(case, page["safety_filter"])
+    table = grid(rows, heads, (4, 12, 9, 20, 10))
+    return [*_chapter("Limits on levels"), table, "", *_sentences(safety.sentences(case))]
 
 
 def _all_parameters(page):

@@ -1,0 +1,77 @@
+"""What is proved of the levels of a case: the tables of its safety filter.
+
+Imported by the page of `jaxtank show`.
+"""
+
+import math
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import local
+from tuning.report import tables
+
+
+def certificates(case):
+    """Return [{"tank", "limit", "certified", "why", "rate", "rate_bound", "gap", "reach"}], one for
+    each tank, of the safety filter that the case has or could have; tanks from 1; None where there
+    is no filter for its plant.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> [row["certified"] for row in certificates(presets.find("cascaded/pi"))]
+    [True, True]
+    """
+    try:
+        _, rows = case.safety_design(**(case.safety or {}))
+    except InputError:
+        return None
+    return [
+        {
+            "tank": row.tank + 1,
+            "limit": row.limit,
+            "certified": row.certified,
+            "why": row.reason,
+            "rate": row.rate,
+            "rate_bound": row.rate_bound,
+            "gap": tables.clean(row.gap),
+            "reach": tables.clean(row.reach),
+        }
+        for row in rows
+    ]
+
+
+def rows_of(case, found):
+    """Return (heads, rows) of the table of `certificates`, its numbers in the case's units."""
+    length = local("cm", case.loop.units)
+    heads = [
+        "tank",
+        f"limit [{length}]",
+        "certified",
+        "kappa, at most [1/s]",
+        f"gap [{length}]",
+        "",
+    ]
+    rows = [
+        [
+            row["tank"],
+            f"{row['limit']:.4g}",
+            "yes" if row["certified"] else "no",
+            f"{row['rate']:.3g}, {row['rate_bound']:.3g}",
+            "-" if row["gap"] is None or not math.isfinite(row["gap"]) else f"{row['gap']:.3g}",
+            row["why"],
+        ]
+        for row in found
+    ]
+    return heads, rows
+
+
+def sentences(case):
+    """Return what the table of `certificates` is about."""
+    on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"
+    return [
+        f"The safety filter is {on}.",
+        "certified: no plant of the case's intervals passes the limit, under any controller and for"
+        " readings within their band; a proof, or the condition that failed.",
+        "gap: by how much the filter lowers the level at which the nominal rig rests with its pumps"
+        " full; kappa: how fast a level may approach its limit.",
+    ]
