@@ -124,9 +124,9 @@ def identify(
     >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.load("cascaded").cases["open-loop"]
     >>> t = np.arange(30.0)
-    >>> data = tuning.log(t=t, u=0 * t + 3, y=t**2 / 200, tanks=[1])
+    >>> data = tuning.log(t=t, u=0 * t + 3, y=4.46 + 0.02 * t, tanks=[0])
     >>> result = tuning.identify(
-    ...     case, data, {"plant.pump_gain": (0.01, 9.0)}, start="case", starts=1, substeps=1)
+    ...     case, data, {"plant.pump_gain": (0.01, 0.2)}, start="case", starts=1, substeps=1)
     >>> result.status, list(result.parameters)
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
