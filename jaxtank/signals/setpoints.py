@@ -98,8 +98,9 @@ class Ramps(Signal):
         return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
 
     def plateaus(self, until: float = math.inf) -> np.ndarray:
-        """Return (plateaus, channels) values held between changes [cm], as host numbers: those whose
-        changes end before the next one and `until` [s].
+        """Return (plateaus, channels) values held between changes [cm], as host numbers.
+
+        Those whose changes end before the next one and `until` [s].
         """
         values, now = [], np.array(self.initial, dtype=float)
         values.append(now.copy())

@@ -11,9 +11,9 @@ SWITCH = "JAXTANK_XLA_OPTION"
 OFF = ("0", "off", "false", "no")
 KEY = "xla_cpu_small_while_loop_byte_threshold"
 ROLLED = "xla_cpu_disable_loop_unrolling"
-"""LLVM unrolls a short loop before it can be vectorised: a batch of 16 plants then runs as 16 single
-ones (36 against 11 ns per step and plant), and derivatives compile twice as long. A compiler that
-does not know the option ignores it.
+"""LLVM unrolls a short loop before it can be vectorised: a batch of 16 plants then runs as 16
+single ones (36 against 11 ns per step and plant), and derivatives compile twice as long. A compiler
+that does not know the option ignores it.
 """
 OPTION = f"{KEY}=100000000000,{ROLLED}"
 _FLAG = "--xla_backend_extra_options="
