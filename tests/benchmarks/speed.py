@@ -6,7 +6,7 @@ first use waits for.
 Within a block every line is measured in turn, round by round, in one process on one core: medians
 of core time, and of the ratio to its rival in the same round, with the range. Compilation is apart.
 "at most" is what we set out to reach. Nothing is asserted of time: machines differ. The structural
-causes are pinned in tests/test_compiled_loop.py.
+causes are pinned in tests/unit/loop/test_compiled_loop.py.
 """
 
 import dataclasses
@@ -329,7 +329,9 @@ from jaxtank.loop import run as loop
 case = presets.find("gouta2015/backstepping")
 gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
 names = ("rms_error_total",)
-for call in (lambda: loop.evaluate(case.loop, case.clock, names), lambda: loop.sensitivities(case.loop, case.clock, names, gains)):
+values = lambda: loop.evaluate(case.loop, case.clock, names)
+slopes = lambda: loop.sensitivities(case.loop, case.clock, names, gains)
+for call in (values, slopes):
     began = time.perf_counter()
     jax.block_until_ready(call())
     first = time.perf_counter() - began

@@ -3,7 +3,7 @@ measures.
 
 A target is the number of our re-derivation of the paper (S10 of its
 notes), which the tuned objective must reach to 1 % or half a unit of its last digit;
-tests/test_tuning_rows.py asks for it.
+tests/papers/test_tuning_rows.py asks for it.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Free, Scenario
-from jaxtank.presets import khalid, mirakhorli
+from jaxtank.presets.loops import khalid, mirakhorli
 
 
 class Bound(NamedTuple):
@@ -152,7 +152,7 @@ def unseen():
 
 
 GAINS = {"controller.K": mirakhorli.TUNABLE["controller.K"]}
-BLEND = {n: mirakhorli.TUNABLE[n] for n in mirakhorli.LAWS["hybrid"][2]}
+BLEND = {n: mirakhorli.TUNABLE[n] for n in mirakhorli.CONTROLLERS["hybrid"][2]}
 BOTH = {"controller.pairing": ["cross", "same"]}
 
 
@@ -172,7 +172,7 @@ def quadruple():
 
 
 def two_tank():
-    """{name: Row} of gouta2022: the whole run, noise of 0.02 cm, with delays between pump and tank."""
+    """{name: Row} of gouta2022: the whole run, noise of 0.02 cm, delays between pump and tank."""
     rows = {}
     for delay, target in {0.0: "0.505", 0.2: "0.534", 0.5: "0.579", 1.0: "0.657"}.items():
         values, name = {"actuator.delay": delay}, f"gouta2022-delay-{delay:g}"

@@ -16,7 +16,8 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.step_size import StepWarning, check_run, doubts
 from tuning.problem import scenarios as sc
-from tuning.uncertainty.distributions import Correlated, Draws
+from tuning.uncertainty.distributions import Correlated
+from tuning.uncertainty.draws import Draws
 
 MOST = 16
 """Runs that are made to see whether a level is thrown up in one."""
@@ -65,9 +66,6 @@ LARGEST_CURVATURE = 24
 HELD_OUT = 1_000_003
 """Offset of the seeds of the validation from those of the search."""
 
-REPORTED = tuple(m for m in ms.MEASURES if m not in ms.TIMES.values())
-"""Measures in a result, before and after."""
-
 
 def felt(problem, z):
     """Percent by which the objective changes when each parameter alone goes 10 % up or down (of its
@@ -98,7 +96,7 @@ def unexercised(problem, search, first):
     if not flat.any():
         return idle
     names, here = (
-        tuple(m for m in REPORTED if ms.serves(m, problem.loop)),
+        tuple(m for m in ms.reported() if ms.serves(m, problem.loop)),
         table_of(problem, problem.values(point.z)),
     )
 
@@ -282,7 +280,7 @@ def table_of(problem, values) -> list[Any]:
     table: list[Any] = [None] * len(problem.lanes)
     for group in problem.groups:
         loop = problem.lanes[group.lanes[0]].case.loop
-        names = (*(m for m in REPORTED if ms.serves(m, loop)), *ms.TIMES.values())
+        names = (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.TIMES.values())
         measures, _ = sc.values_of(group, names, points)
         for j, lane in enumerate(group.lanes):
             table[lane] = {m: np.asarray(v)[0, j] for m, v in measures.items()}

@@ -1,0 +1,105 @@
+"""What several test files use: where files are, ranks of folders, small routines. On pytest's path
+(pyproject.toml), so that every test imports it by name.
+"""
+
+import contextlib
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from jaxtank.core.tree import parameters
+from jaxtank.presets import Free
+from tuning.cli import main
+
+ROOT = Path(__file__).parents[1]
+TESTS = ROOT / "tests"
+DATA = TESTS / "data"
+RIGS = DATA / "rigs"
+CASCADED_TANKS = DATA / "cascaded_tanks.csv"  # its source and licence: data/README.md
+
+# Folders of both packages: a folder imports those of its own or of an earlier line.
+RANKS = [
+    "jaxtank.core jaxtank.xla",
+    "jaxtank.signals jaxtank.instruments jaxtank.plants",
+    "jaxtank.analysis",
+    "jaxtank.controllers jaxtank.observers jaxtank.measures",
+    "jaxtank.loop",
+    "jaxtank.case",
+    "jaxtank.presets",
+    "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
+    "tuning.problem tuning.storage",
+    "tuning.uncertainty tuning.identification tuning.optimal_input",
+    "tuning.search",
+    "tuning.report",
+    "tuning.bench",
+    "tuning.cli",
+]
+RANK = {folder: rank for rank, folders in enumerate(RANKS) for folder in folders.split()}
+
+ONE_FUNCTION = 'xla_cpu_small_call="true"'
+
+
+def loops_in(compiled):
+    """Number of loops that a compiled program runs as one function."""
+    return compiled.as_text().count(ONE_FUNCTION)
+
+
+def in_metres(plant):
+    """The same rig of centimetres with lengths in m and flows in m^3/s."""
+    powers = {
+        "area": 2,
+        "drain": 2,
+        "orifice": 2,
+        "pipe": 2,
+        "pump_gain": 3,
+        "gravity": 1,
+        "rim": 1,
+        "knee": 1,
+    }
+    return dataclasses.replace(
+        plant,
+        **{name: getattr(plant, name) * 1e-2**power for name, power in powers.items()},
+        units=("m", "V"),
+    )
+
+
+class Output(NamedTuple):
+    """What a command returned and printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self):
+        """The one object on stdout; refuses NaN and infinity, which are not JSON."""
+        return json.loads(self.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+def command(*words):
+    """Run the command in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.main(list(words))
+    return Output(code, out.getvalue(), err.getvalue())
+
+
+def assert_same_case(a, b):
+    """Names, clocks, every leaf and static field, limits, free parameters and objective agree."""
+    assert (a.name, a.clock) == (b.name, b.clock)
+    # components, static fields, absent leaves
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)
+    assert parameters(a.loop).keys() == parameters(b.loop).keys()
+    for name, value in parameters(a.loop).items():
+        other = parameters(b.loop)[name]
+        assert np.shape(value) == np.shape(other) and np.array_equal(value, other), name
+    assert a.limits.keys() == b.limits.keys()
+    assert all(np.array_equal(limit, b.limits[measure]) for measure, limit in a.limits.items())
+    assert {n: Free(*s) for n, s in a.free.items()} == {n: Free(*s) for n, s in b.free.items()}
+    assert dict(a.objective) == dict(b.objective)

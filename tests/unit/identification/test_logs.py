@@ -1,0 +1,550 @@
+"""Logs as files: what is read of them, and one line with the place for each that cannot be used."""
+
+import re
+
+import numpy as np
+import pytest
+from helpers import command
+
+import tuning
+from jaxtank import presets, rig
+from jaxtank.core.errors import DataError, InputError
+from tuning.identification import data_checks
+from tuning.identification.csv_log import read_log, split_header
+
+HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
+
+
+def rows(count=8):
+    """Cells of `count` samples of a rise of the four levels of the quadruple tank, pumps at 3 and
+    2.8 V.
+    """
+    return [
+        [str(k), "3", "2.8", f"{0.9 + 0.1 * k:.2f}", f"{0.8 + 0.2 * k:.2f}", "1", "2"]
+        for k in range(count)
+    ]
+
+
+def text(header=HEADER, cells=None, separator=",", eol="\n"):
+    """A file of these cells."""
+    cells = rows() if cells is None else cells
+    return eol.join([header, *(separator.join(row) for row in cells)]) + eol
+
+
+def changed(row, column, cell):
+    """The rows with one cell changed."""
+    cells = rows()
+    cells[row][column] = cell
+    return cells
+
+
+@pytest.fixture(scope="module")
+def case():
+    return presets.load("mirakhorli").cases["sfc"]
+
+
+@pytest.fixture
+def read(tmp_path, case):
+    """read(text or bytes, **options) -> Log of a file with it."""
+
+    def reader(content, loop=None, **options):
+        path = tmp_path / "log.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return read_log(path, case.loop if loop is None else loop, **options)
+
+    return reader
+
+
+def same(found, reference):
+    """Whether two logs hold the same numbers."""
+    for name in ("t", "u", "y"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(reference, name), rtol=1e-12, atol=0
+        )
+    return found.tanks == reference.tanks and found.in_volts == reference.in_volts
+
+
+def test_a_plain_file(read):
+    found = read(text())
+    assert found.samples == 8 and found.tanks == (0, 1, 2, 3) and found.in_volts == (False,) * 4
+    np.testing.assert_array_equal(found.t, np.arange(8.0))
+    np.testing.assert_array_equal(found.u, np.tile([3.0, 2.8], (8, 1)))
+    np.testing.assert_allclose(found.y[:, 0], 0.9 + 0.1 * np.arange(8), rtol=1e-12)
+    assert list(found.lines) == list(range(2, 10)) and found.headers == tuple(HEADER.split(","))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "\ufeff" + text(),
+        text(eol="\r\n"),
+        text(eol="\r"),
+        text(HEADER.replace(",", "\t"), separator="\t"),
+        text(HEADER.replace(",", ";"), separator=";"),
+        "# rig 3, autumn\n\n" + text().replace("\n3,", "\n\n# a note, with commas, in it\n3,"),
+        "\n".join(line + "," for line in text().splitlines()),
+        text().replace("\n", ",,\n").replace(",,\n", "\n", 1),
+        text(
+            ",".join(f'"{h}"' for h in HEADER.split(",")),
+            [[f'"{c}"' for c in row] for row in rows()],
+        ),
+        text(HEADER.replace(",", ", "), separator=" , "),
+        text(HEADER + ",remark,remark", [[*row, "valve open", "?"] for row in rows()]),
+        text().rstrip("\n"),
+        text(HEADER.replace(" [cm]", "_cm").replace(" [V]", "_V").replace("t [s]", "time_s")),
+        text(
+            HEADER.replace("[", "(")
+            .replace("]", ")")
+            .replace("pump", "u")
+            .replace("h", "Level ")
+            .replace("t (s)", "Time (s)")
+        ),
+        text(cells=[[f"{float(c):.6e}" for c in row] for row in rows()]),
+    ],
+    ids=[
+        "byte-order mark",
+        "CRLF",
+        "CR",
+        "tabs",
+        "semicolons",
+        "comments",
+        "separator at the end",
+        "separators at the end of rows",
+        "quotes",
+        "spaces",
+        "other columns",
+        "no newline at the end",
+        "units behind a line",
+        "other words",
+        "exponents",
+    ],
+)
+def test_the_same_log_in_other_clothes(read, content):
+    assert same(read(content), read(text()))
+
+
+def test_columns_in_any_order_and_levels_that_are_not_there(read):
+    order = [4, 0, 2, 1, 3]
+    found = read(
+        text(
+            ",".join(HEADER.split(",")[i] for i in order),
+            [[row[i] for i in order] for row in rows()],
+        )
+    )
+    whole = read(text())
+    assert found.tanks == (0, 1)
+    np.testing.assert_array_equal(found.y, whole.y[:, :2])
+    np.testing.assert_array_equal(found.u, whole.u)
+
+
+def test_units_of_the_header(read):
+    cells = [
+        [
+            f"{float(r[0]) / 60:.12f}",
+            str(1000 * float(r[1])),
+            r[2],
+            *(str(float(c) * 10) for c in r[3:]),
+        ]
+        for r in rows()
+    ]
+    found = read(text("t [min],pump1 [mV],pump2 [V],h1 [mm],h2 [mm],h3_mm,h4 (mm)", cells))
+    whole = read(text())
+    np.testing.assert_allclose(found.t, whole.t, atol=1e-9)
+    np.testing.assert_allclose(found.u, whole.u, rtol=1e-12)
+    np.testing.assert_allclose(found.y, whole.y, rtol=1e-12)
+
+
+def test_units_of_a_rig_in_metres_and_flows(read):
+    loop = presets.load("calofir").cases["backstepping"].loop
+    found = read("t [ms],pump1 [l/min],h1 [cm],h2 [mm]\n0,3,5,13\n1000,3,6,14\n2000,0,7,15\n", loop)
+    np.testing.assert_allclose(found.t, [0, 1, 2])
+    np.testing.assert_allclose(found.u[:, 0], [5e-5, 5e-5, 0])  # 3 l/min = 3e-3 m^3 / 60 s
+    np.testing.assert_allclose(found.y, [[0.05, 0.013], [0.06, 0.014], [0.07, 0.015]])
+
+
+def test_a_level_in_volts_is_the_sensors(read):
+    found = read("t [s],pump1 [V],pump2 [V],h2 [cm],h1 [mV]\n0,3,3,1,200\n1,3,3,2,300\n")
+    assert found.tanks == (0, 1) and found.in_volts == (True, False)
+    np.testing.assert_allclose(found.y, [[0.2, 1], [0.3, 2]])
+
+
+def test_decimal_commas(read):
+    comma = text(
+        HEADER.replace(",", ";"), [[c.replace(".", ",") for c in row] for row in rows()], ";"
+    )
+    assert same(read(comma, decimal=","), read(text()))
+    with pytest.raises(DataError, match=r"line 2, column 'pump2 \[V\]': '2.8' has a point"):
+        read(text(HEADER.replace(",", ";"), separator=";"), decimal=",")
+    with pytest.raises(InputError, match="decimal"):
+        read(text(), decimal="x")
+
+
+def test_missing_readings(read):
+    cells = changed(3, 4, "")
+    for row, word in ((4, "NaN"), (5, "na"), (6, "-"), (7, "null")):
+        cells[row][4] = word
+    found = read(text(cells=cells))
+    assert list(np.isnan(found.y[:, 1])) == [False] * 3 + [True] * 5
+    assert np.isfinite(np.delete(found.y, 1, axis=1)).all()
+
+
+def test_columns_named_by_option_or_rig(read, case):
+    content = text(
+        "when,left,right [mV],a,b,c,h4 [cm]",
+        [[r[0], r[1], str(1000 * float(r[2])), *r[3:]] for r in rows()],
+    )
+    columns = {
+        "t": ("when", "s"),
+        "pump1": ("left", "V"),
+        "pump2": "right [mV]",
+        "h1": ("a", "cm"),
+        "h2": ("b", "cm"),
+        "h3": ("c", "cm"),
+    }
+    assert same(read(content, columns=columns), read(text()))
+    with pytest.raises(InputError, match="unknown column 'h9'"):
+        read(content, columns={"h9": "a"})
+    with pytest.raises(DataError, match="no column 'lft' for pump1; nearest: left"):
+        read(content, columns={**columns, "pump1": "lft"})
+    # a column named for one slot is not taken for another by its own name
+    found = read(
+        text("t [s],pump1 [V],pump2 [V],h2 [cm],h1 [cm],h3 [cm],h4 [cm]"),
+        columns={"h1": "h2 [cm]", "h2": "h1 [cm]"},
+    )
+    assert same(found, read(text()))
+
+
+def test_a_level_is_left_out_by_none(read, case):
+    """Whether its header names it, or the [log] table of a rig; a pump, or the time, is needed."""
+    assert read(text(), columns={"h3": "none", "h1": "none"}).tanks == (1, 3)
+    table = {"h1": "h3 [cm]", "h3": "h1 [cm]"}
+    assert read(text(), columns=table | {"h3": "none"}).tanks == (0, 1, 3)
+    assert rig.loads(rig.dump(case.replace(log={"h3": "none", "h4": "none"}))).log == {
+        "h3": "none",
+        "h4": "none",
+    }
+    for slot in ("t", "pump2"):
+        with pytest.raises(InputError, match=f"column {slot} = none: only a level may be left out"):
+            read(text(), columns={slot: "none"})
+    with pytest.raises(DataError, match="no column for a level"):
+        read(text(), columns=dict.fromkeys(("h1", "h2", "h3", "h4"), "none"))
+
+
+def test_the_log_table_of_a_rig_file(tmp_path, read, case):
+    table = {"t": ("when", "s"), "pump1": "left [V]", "pump2": ("right", "mV"), "h2": ("b", "mm")}
+    path = tmp_path / "rig.toml"
+    path.write_text(rig.dump(case.replace(log=table)))
+    again = rig.load(path)
+    assert again.log == table
+    found = read("when,left [V],right,b\n0,3,2800,10\n1,3,2800,20\n", columns=again.log)
+    assert found.tanks == (1,)
+    np.testing.assert_allclose(found.y[:, 0], [1, 2])
+    np.testing.assert_allclose(found.u, [[3, 2.8]] * 2)
+
+
+def test_init_shows_a_log_table_that_works(tmp_path, read):
+    """With its comment signs taken away the example is a table for a file of such columns."""
+    code, out, _ = command("init", "mirakhorli/sfc")
+    assert code == 0
+    whole, example = out.split("# Columns of the experiment data", 1)
+    table = "\n".join(line.removeprefix("#") for line in example.splitlines()[1:])
+    (tmp_path / "rig.toml").write_text(whole + table + "\n")
+    columns = rig.load(tmp_path / "rig.toml").log
+    assert set(columns) == {"t", "pump1", "pump2", "h1", "h2", "h3", "h4"}
+    header = ",".join(name for name, _ in columns.values())
+    assert same(read(text(header), columns=columns), read(text()))
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        ("h1 [cm]", ("h1", "cm")),
+        ("h1(cm)", ("h1", "cm")),
+        ("pump1_V", ("pump1", "V")),
+        ("pump_1", ("pump_1", None)),
+        ("flow_l/min", ("flow", "l/min")),
+        ("h1", ("h1", None)),
+        ("upper_tank", ("upper_tank", None)),
+    ],
+)
+def test_a_header_in_parts(header, expected):
+    assert split_header(header) == expected
+
+
+def bad(cells=None, header=HEADER):
+    return text(header, cells)
+
+
+BAD = {
+    "empty": ("", r"is empty"),
+    "comments only": ("# nothing\n\n", r"is empty"),
+    "header only": (HEADER + "\n", r"has a header, but no samples"),
+    "no header": (
+        text().split("\n", 1)[1],
+        r"line 1: has numbers where the columns' names should be",
+    ),
+    "single sample": (bad(rows(1)), r"has 1 sample, at least 2 are needed"),
+    "duplicated time": (
+        bad(changed(3, 0, "2")),
+        r"line 5, column 't \[s\]': time 2 s is that of the sample before",
+    ),
+    "backward time": (
+        bad(changed(3, 0, "0.5")),
+        r"line 5, column 't \[s\]': time 0.5 s is 1.5 s before",
+    ),
+    "time missing": (bad(changed(3, 0, "")), r"line 5, column 't \[s\]': is empty"),
+    "time as a date": (
+        bad(changed(0, 0, "2024-01-01 00:00")),
+        r"line 2, column 't \[s\]': '2024-01-01 00:00' is not a number",
+    ),
+    "gap": (
+        bad([*rows(5), ["60", *rows(1)[0][1:]]]),
+        r"line 7, column 't \[s\]': a gap of 56 s after 4 s.*--gap 56",
+    ),
+    "no unit": (bad(header=HEADER.replace("h1 [cm]", "h1")), r"line 1, column 'h1': has no unit"),
+    "unit of another kind": (
+        bad(header=HEADER.replace("h1 [cm]", "h1 [s]")),
+        r"line 1, column 'h1 \[s\]': unit 's'.*must be one of",
+    ),
+    "unknown unit": (
+        bad(header=HEADER.replace("h2 [cm]", "h2 [furlong]")),
+        r"column 'h2 \[furlong\]': unit 'furlong' cannot be",
+    ),
+    "pump in percent": (
+        bad(header=HEADER.replace("pump1 [V]", "pump1 [%]")),
+        r"column 'pump1 \[%\]': unit '%' cannot be.*V, mV",
+    ),
+    "mm called cm": (
+        bad(changed(4, 3, "85")),
+        r"line 6, column 'h1 \[cm\]': h1 = 85 cm.*rim is 30 cm.*another unit.*'h1 \[mm\]'",
+    ),
+    "mV called V": (
+        bad([[r[0], "3000", *r[2:]] for r in rows()]),
+        r"line 2, column 'pump1 \[V\]': pump1 = 3000 V.*'pump1 \[mV\]'",
+    ),
+    "V called mV": (
+        bad(header=HEADER.replace("pump2 [V]", "pump2 [mV]")),
+        r"column 'pump2 \[mV\]'.*0.0028 V.*5 V.*'pump2 \[V\]'",
+    ),
+    "m called cm": (
+        bad([[*r[:3], *(f"{float(c) / 100:.4f}" for c in r[3:])] for r in rows()]),
+        r"column 'h2 \[cm\]': no level reads more than.*'h2 \[m\]'",
+    ),
+    "volts of another sensor": (
+        bad(changed(2, 3, "9"), HEADER.replace("h1 [cm]", "h1 [V]")),
+        r"line 4.*h1 = 9 V.*range is 5 V",
+    ),
+    "decimal comma": (
+        text(HEADER.replace(",", ";"), [[c.replace(".", ",") for c in r] for r in rows()], ";"),
+        (
+            r"line 2, column 'pump2 \[V\]': '2,8' is not a number: a decimal comma\? read it with"
+            r" --decimal ,"
+        ),
+    ),
+    "decimal comma between commas": (
+        bad([[c.replace(".", ",") for c in r] for r in rows()]),
+        r"line 2: 10 cells under 7 .*--decimal ,",
+    ),
+    "duplicate header": (
+        bad(header=HEADER.replace("h2 [cm]", "h1 [cm]")),
+        r"line 1: .*'h1 \[cm\]'.*both look like h1",
+    ),
+    "two for one": (
+        bad(header=HEADER.replace("h2 [cm]", "y1 [cm]")),
+        r"line 1: columns 'h1 \[cm\]' and 'y1 \[cm\]' both look like h1",
+    ),
+    "no pump": (
+        bad(header=HEADER.replace("pump2 [V]", "valve [V]")),
+        r"line 1: no column for pump2.*--column pump2=HEADER",
+    ),
+    "no time": (bad(header=HEADER.replace("t [s]", "n")), r"line 1: no column for t"),
+    "no level": (
+        "t [s],pump1 [V],pump2 [V],a\n0,3,3,1\n1,3,3,1\n",
+        r"line 1: no column for a level",
+    ),
+    "letters": (bad(changed(3, 3, "abc")), r"line 5, column 'h1 \[cm\]': 'abc' is not a number"),
+    "units below the header": (
+        text(HEADER + "\ns,V,V,cm,cm,cm,cm"),
+        r"line 2, column 't \[s\]': 's' is not a number",
+    ),
+    "infinite": (bad(changed(3, 3, "inf")), r"line 5, column 'h1 \[cm\]': 'inf' is not finite"),
+    "too large": (
+        bad(changed(3, 3, "1e400")),
+        r"line 5, column 'h1 \[cm\]': '1e400' is not finite",
+    ),
+    "underscore": (bad(changed(3, 3, "1_0")), r"line 5, column 'h1 \[cm\]': '1_0' is not a number"),
+    "digits of another script": (bad(changed(3, 3, "٣")), r"line 5, column 'h1 \[cm\]'"),
+    "input missing": (
+        bad(changed(3, 1, "")),
+        r"line 5, column 'pump1 \[V\]': is empty: every sample needs",
+    ),
+    "short row": (text() + "9,3\n", r"line 10: 2 cells under 7 column names"),
+    "long row": (bad([*rows(3), [*rows(1)[0], "1"]]), r"line 5: 8 cells under 7"),
+    "no reading": (
+        bad([[*r[:4], "", *r[5:]] for r in rows()]),
+        r"column 'h2 \[cm\]': h2 has no reading",
+    ),
+    "nothing read": (bad([[*r[:3], "", "", "", ""] for r in rows()]), r"has no reading"),
+    "open quote": (
+        text().replace("1.20", '"1.20'),
+        r"line 4: a quotation mark opens and does not close",
+    ),
+    "long cell": (
+        bad(changed(3, 3, "1" * 300)),
+        r"line 5, column 'h1 \[cm\]': a cell of 300 characters",
+    ),
+    "longer cell": (bad(changed(3, 3, "1" * 200_000)), r"line 5: field larger"),
+    "zero byte": (text() + "\0", r"not text"),
+    "latin 1": (text().encode().replace(b"2.8", b"2\xb78"), r"is not UTF-8 text"),
+    "another file": (b"\x89PNG\r\n\x1a\n" + bytes(range(256)), r"is not UTF-8 text"),
+    "negative level": (bad(changed(3, 3, "-12")), r"line 5, column 'h1 \[cm\]': h1 = -12 cm"),
+    "negative input": (bad(changed(3, 2, "-2.8")), r"line 5, column 'pump2 \[V\]': pump2 = -2.8 V"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path):
+    content, words = BAD[name]
+    path, out = tmp_path / "log.csv", tmp_path / "out"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    code, said, told = command(
+        "identify", "mirakhorli/sfc", "--data", str(path), "--out", str(out), "--quiet"
+    )
+    assert code == 5 and said == "" and not out.exists()
+    assert (
+        told.count("\n") == 1
+        and told.endswith("\n")
+        and told.startswith(("jaxtank: log", "jaxtank: file"))
+        and "log.csv" in told
+    )
+    with pytest.raises(DataError, match=words):
+        raise DataError(told.strip())
+
+
+@pytest.mark.parametrize(
+    ("header", "columns", "words"),
+    [
+        (
+            HEADER.replace("pump2 [V]", "pump1 [V]"),
+            ["pump2=h4 [cm];V"],
+            r"line 1: columns 'pump1 \[V\]' and 'pump1 \[V\]'",
+        ),
+        (
+            HEADER.replace("h2 [cm]", "h1 [cm]"),
+            ["h1=h1 [cm]"],
+            r"line 1: two columns are called 'h1 \[cm\]'",
+        ),
+        (
+            HEADER.replace("h1 [cm],h2 [cm]", "level,level"),
+            ["h1=level;cm"],
+            r"line 1: two columns are called 'level'",
+        ),
+        (
+            HEADER.replace("h1 [cm],h2 [cm]", "level, level "),
+            ["h1=level;cm"],
+            r"line 1: two columns are called 'level'",
+        ),
+        (
+            HEADER.replace("h1 [cm]", "level"),
+            ["h1=level;cm", "h2=level;cm"],
+            r"line 1: column 'level' is given for h1 and for h2",
+        ),
+    ],
+)
+def test_a_log_with_a_column_twice_is_refused(header, columns, words, tmp_path):
+    (tmp_path / "log.csv").write_text(bad(header=header))
+    options = [word for column in columns for word in ("--column", column)]
+    code, said, told = command(
+        "identify", "mirakhorli/sfc", "--data", str(tmp_path / "log.csv"), *options, "--quiet"
+    )
+    assert code == 5 and said == "" and told.count("\n") == 1
+    assert re.search(words, told), told
+
+
+def test_no_file_and_a_folder(tmp_path):
+    for path, words in ((tmp_path / "none.csv", "does not exist"), (tmp_path, "is not a file")):
+        code, said, told = command(
+            "identify", "mirakhorli/sfc", "--data", str(path), "--out", str(tmp_path / "out")
+        )
+        assert code == 5 and said == "" and told.count("\n") == 1 and words in told
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_bad_log_among_several(tmp_path):
+    (tmp_path / "good.csv").write_text(text())
+    (tmp_path / "bad.csv").write_text(bad(changed(3, 0, "2")))
+    code, _, told = command(
+        "identify",
+        "mirakhorli/sfc",
+        "--data",
+        str(tmp_path / "good.csv"),
+        "--data",
+        str(tmp_path / "bad.csv"),
+    )
+    assert code == 5 and "bad.csv, line 5" in told
+
+
+def test_a_pump_without_a_true_limit_may_be_faint():
+    """khalid's input is a dimensionless one with limits of +-1000 in name only."""
+    loop = presets.load("khalid").cases["gpc"].loop
+    found = tuning.log(t=np.arange(5.0), u=np.full(5, 2.0), y=np.full((5, 2), 0.2))
+    data_checks.check_fits(found, loop)
+
+
+def test_a_pump_that_stands_still_is_no_mistake(case):
+    u = np.stack([np.full(5, 3.0), np.zeros(5)], axis=1)
+    data_checks.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"t": np.arange(4.0)}, "shapes"),
+        ({"u": np.full((5, 2), np.nan)}, r"sample 1: pump1 = nan"),
+        ({"y": np.full((5, 4), np.inf)}, r"sample 1: h1 = inf"),
+        ({"tanks": (0, 0, 1, 2)}, "two columns"),
+        ({"tanks": (0, 1)}, "4 channels of levels"),
+        ({"t": [0, 1, 2, 3, "x"]}, "must be arrays of numbers"),
+        ({"t": [0.0, 1, 1, 2, 3]}, "sample 3: time 1 s is that"),
+    ],
+)
+def test_arrays_that_are_no_log(change, words):
+    whole = {"t": np.arange(5.0), "u": np.ones((5, 2)), "y": np.ones((5, 4))}
+    with pytest.raises(DataError, match=words):
+        tuning.log(**(whole | change))
+
+
+def test_a_log_of_another_rig(case):
+    whole = {"t": np.arange(5.0), "u": np.ones((5, 2)), "y": np.ones((5, 4))}
+    with pytest.raises(DataError, match="has 1 pump columns, the rig 2 pumps"):
+        data_checks.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
+    with pytest.raises(DataError, match="measures tank 8, the rig has 4"):
+        data_checks.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
+
+
+def test_gaps_are_counted_in_usual_steps():
+    t = np.array([0.0, 1, 2, 3, 5, 6, 7])
+    found = tuning.log(t=t, u=np.ones(7), y=np.ones(7))
+    with pytest.raises(DataError, match=r"sample 5: a gap of 2 s after 3 s.*--gap 2$"):
+        data_checks.check_gaps(found)
+    data_checks.check_gaps(found, 2.0)
+    data_checks.check_gaps(
+        tuning.log(t=np.array([0.0, 1, 2.4, 3, 4.4, 5]), u=np.ones(6), y=np.ones(6))
+    )
+
+
+def test_a_part_keeps_its_lines(read):
+    found = read(text()).part(2, 5)
+    assert (
+        found.samples == 3
+        and list(found.lines) == [4, 5, 6]
+        and found.where(0, 0) == "log.csv, line 4, column 't [s]'"
+    )
+
+
+def test_a_long_log_is_read(read):
+    """A day at 0.1 s: the reading itself, in a few seconds."""
+    n = 100_000
+    body = "\n".join(f"{k / 10:.1f},3,2.8,{k % 7}.5,2,1,{k % 3}" for k in range(n))
+    found = read(f"{HEADER}\n{body}\n")
+    assert found.samples == n and found.y[-1, 0] == (n - 1) % 7 + 0.5 and found.lines[-1] == n + 1

@@ -1,0 +1,299 @@
+"""Pictures of what lies behind a run: the numbers in them are those of the run, and what matters is
+said.
+"""
+
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
+
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.records import Trajectory
+from jaxtank.plots import diagnostics, responses
+
+
+@pytest.fixture
+def ax():
+    figure, axes = plt.subplots()
+    yield axes
+    plt.close(figure)
+
+
+def made(rows=1001, **fields):
+    """A run of two outputs, four tanks and two pumps that stands still, but for the fields that are
+    given.
+    """
+    t = np.linspace(0.0, 100.0, rows)
+    shapes = {
+        "x": 4,
+        "y": 4,
+        "x_hat": 4,
+        "d_hat": 4,
+        "r": 2,
+        "e": 2,
+        "command": 2,
+        "applied": 2,
+        "u": 2,
+        "spilled": 4,
+    }
+    return Trajectory(**({"t": t} | {n: np.ones((rows, m)) for n, m in shapes.items()} | fields))
+
+
+def columns(*values):
+    return np.stack(values, axis=1)
+
+
+def test_a_style_takes_back_its_own_settings_and_no_others():
+    """A notebook's backend starts with the first figure and switches the interactive mode on; where
+    that is inside, it must stay on.
+    """
+    before = dict(plt.rcParams)
+    try:
+        with responses.styled({"lines.linewidth": 7.0}):
+            assert (
+                plt.rcParams["figure.dpi"] == responses.STYLE["figure.dpi"] != before["figure.dpi"]
+            )
+            assert plt.rcParams["lines.linewidth"] == 7.0
+            plt.rcParams["interactive"] = True
+        assert plt.rcParams["interactive"] is True
+        assert {**plt.rcParams, "interactive": before["interactive"]} == before
+        with pytest.raises(ValueError), responses.styled():
+            raise ValueError
+        assert plt.rcParams["figure.dpi"] == before["figure.dpi"]
+    finally:
+        plt.rcParams.update({"interactive": before["interactive"]})
+
+
+def test_phase_is_one_level_over_the_other_with_both_rims(ax):
+    t = np.linspace(0.0, 1.0, 1001)
+    run = made(x=columns(t, t, 5 * t, 29 * t**2))
+    diagnostics.phase(ax, {"after": (run, responses.AFTER, "-")}, (2, 3), [30.0] * 4, "cm")
+    line, first, last = ax.lines
+    np.testing.assert_array_equal(line.get_xydata(), run.x[:, 2:])
+    assert tuple(first.get_xydata()[0]) == (0.0, 0.0) and tuple(last.get_xydata()[0]) == (5.0, 29.0)
+    assert ax.get_xlabel() == "level of tank 3 [cm]" and ax.get_ylabel() == "level of tank 4 [cm]"
+    assert ax.get_ylim()[1] > 30.0 and ax.get_xlim()[1] < 30.0  # only the rim that is near
+
+
+def test_saturation_tells_the_share_and_when(ax):
+    t = np.linspace(0.0, 100.0, 1001)
+    # 12 V is not past 12 V
+    run = made(command=columns(np.where(t < 25.0, 13.0, 5.0), np.where(t >= 90.0, -1.0, 12.0)))
+    diagnostics.saturation(ax, {"run": run}, [0.0, 0.0], [12.0, 12.0])
+    assert [label.get_text() for label in ax.get_yticklabels()] == [
+        "pump 1\n25 % up, 0 % down",
+        "pump 2\n0 % up, 10.1 % down",
+    ]
+    strips = [
+        c
+        for c in ax.collections
+        if isinstance(c, PolyCollection) and len(c.get_paths()) and len(c.get_paths()[0].vertices)
+    ]
+    up, _, _, down = (c.get_paths()[0].vertices for c in strips[:4])
+    y = ax.get_yticks()
+    assert up[np.abs(up[:, 1] - y[0]) > 1e-9, 0].max() == pytest.approx(
+        25.0, abs=100.0 / diagnostics.SLICES
+    )
+    assert down[np.abs(down[:, 1] - y[1]) > 1e-9, 0].min() == pytest.approx(
+        90.0, abs=100.0 / diagnostics.SLICES
+    )
+    assert up[:, 1].max() > y[0] and down[:, 1].min() < y[1]
+    assert {"past the upper limit", "past the lower limit"} == set(
+        ax.get_legend_handles_labels()[1]
+    )
+
+
+def test_a_chattering_pump_is_a_strip_of_half_the_height(ax):
+    flip = np.arange(1001) % 2 * 20.0
+    diagnostics.saturation(
+        ax, {"run": made(command=columns(flip, flip))}, [-1.0, -1.0], [12.0, 12.0]
+    )
+    vertices = ax.collections[0].get_paths()[0].vertices
+    heights = vertices[vertices[:, 1] > ax.get_yticks()[0] + 1e-9, 1] - ax.get_yticks()[0]
+    np.testing.assert_allclose(heights / 0.42, 0.5, atol=0.13)  # four or five samples to a slice
+
+
+def test_estimate_and_disturbance_are_the_runs_own(ax):
+    t = np.linspace(0.0, 1.0, 1001)
+    run = made(
+        x=columns(t, t, t, t),
+        y=columns(t + 0.1, t, t, t),
+        x_hat=columns(t + 0.2, t, t, t),
+        d_hat=columns(t - 1, t, t, t),
+    )
+    diagnostics.estimate(ax, run, 0, "m")
+    found = {line.get_label(): line.get_ydata() for line in ax.lines}
+    assert ax.get_ylabel() == "level [m]"
+    for name, offset in (("measured", 0.1), ("true", 0.0), ("estimated", 0.2)):
+        np.testing.assert_allclose(found[name], t + offset)
+    ax.clear()
+    diagnostics.estimate(ax, run, 1)
+    assert "measured" not in {line.get_label() for line in ax.lines}  # it is what is true
+    ax.clear()
+    diagnostics.disturbance(ax, run, 0, inflow=2 * t, unit="m/s")
+    found = {line.get_label(): line.get_ydata() for line in ax.lines}
+    np.testing.assert_allclose(found["estimated"], t - 1)
+    np.testing.assert_allclose(found["inflow disturbance"], 2 * t)
+    assert ax.get_ylabel() == "d_hat [m/s]"
+
+
+def limit(name, value, bound):
+    return {"name": name, "limit": bound, "value": value, "margin": bound - value, "unit": "cm"}
+
+
+def test_margins_are_shares_of_the_limit_with_the_nearest_first(ax):
+    rows = [limit("far", 15.0, 30.0), limit("broken", 33.0, 30.0), limit("met", 30.0, 30.0)]
+    diagnostics.margins(ax, rows)
+    np.testing.assert_allclose(
+        [bar.get_width() for bar in ax.patches], [-10.0, 0.0, 50.0], atol=1e-12
+    )
+    assert [bar.get_facecolor() for bar in ax.patches] == [
+        to_rgba(c) for c in (responses.FORBIDDEN, responses.AFTER, responses.AFTER)
+    ]
+    names = [label.get_text() for label in ax.get_yticklabels()]
+    assert (
+        names == ["broken\n33 of 30 cm", "met\n30 of 30 cm", "far\n15 of 30 cm"]
+        and ax.yaxis_inverted()
+    )
+    assert list(ax.lines[0].get_ydata()) == [1]  # a bar without length is marked
+
+
+def test_margins_beyond_what_can_be_shown_are_counted(ax):
+    diagnostics.margins(
+        ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(diagnostics.MANY + 3)]
+    )
+    assert len(ax.patches) == diagnostics.MANY and "3 with larger margins not shown" in ax.get_title()
+    assert ax.get_yticklabels()[0].get_text().startswith(f"tank {diagnostics.MANY + 2}")
+
+
+def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
+    points = [
+        {"limit": 12.0, "status": "converged", "objective": 0.1},
+        {"limit": 10.0, "status": "not_converged", "objective": 0.2},
+        {"limit": 8.0, "status": "infeasible", "objective": 0.3},
+    ]
+    diagnostics.tradeoff(ax, points, "max_level", "cm", "cm")
+    joined, *marks = ax.lines
+    np.testing.assert_array_equal(joined.get_xydata(), [[10.0, 0.2], [12.0, 0.1]])
+    assert {line.get_label(): line.get_xydata().tolist() for line in marks} == {
+        "converged": [[12.0, 0.1]],
+        "not converged": [[10.0, 0.2]],
+        "limit cannot be held": [[8.0, 0.3]],
+    }
+    assert ax.get_xlabel() == "limit of max_level [cm]" and ax.get_ylabel() == "objective [cm]"
+
+
+@pytest.mark.parametrize(("tanks", "labelled"), [(1, {0}), (2, {0, 1}), (3, {1, 2}), (4, {2, 3})])
+def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
+    """With three tanks the panel below the second stays empty: the times stand below the second."""
+    table = {
+        "tank": [{"area": 10.0, "rim": 30.0, "drain": 0.1, "level": 3.0}] * tanks,
+        "pump": [{"gain": 5.0, "to": 1, "high": 12.0}],
+        "law": {"kind": "open-loop", "initial": [3.0]},
+        "reachable": False,
+    }
+    t = np.linspace(0.0, 10.0, 11)
+    bands = {"t": t, "r": np.full((11, 1), 3.0), "x": np.full((5, 11, tanks), 3.0)}
+    figure = responses.fan(rig.from_table(table).loop, bands, "bands")
+    figure.canvas.draw()
+    panels = figure.axes[:tanks]
+    assert {i for i, ax in enumerate(panels) if ax.get_xlabel() == "time [s]"} == labelled
+    assert {
+        i
+        for i, ax in enumerate(panels)
+        if any(label.get_visible() and label.get_text() for label in ax.get_xticklabels())
+    } == labelled
+    plt.close(figure)
+
+
+def test_a_rig_of_many_tanks_is_drawn_on_one_page():
+    """Four panels side by side, and of thirty tanks between the sixteen that come nearest to their
+    rims.
+    """
+    n, t = 32, np.linspace(0.0, 10.0, 5)
+    plant = SimpleNamespace(tanks=n, pumps=2, outputs=(0, 31), rim=np.full(n, 10.0))
+    loop = SimpleNamespace(
+        plant=plant,
+        units=("cm", "V"),
+        actuator=SimpleNamespace(low=np.zeros(2), high=np.full(2, 9.0)),
+    )
+    x = np.ones((5, 1)) * np.linspace(1.0, 9.0, n)
+    run = SimpleNamespace(t=t, x=x, r=x[:, [0, 31]], e=0.0 * x[:, [0, 31]], u=np.ones((5, 2)))
+    figure = responses.responses(loop, {"run": run}, title="battery")
+    titles = [ax.get_title() for ax in figure.axes if ax.get_visible()]
+    assert [word for word in titles if word.startswith("tank ")] == [
+        "tank 1",
+        "tank 32",
+        *[f"tank {i}" for i in range(16, 32)],
+    ]
+    assert (
+        figure.get_size_inches()[0] < 20
+        and "of the 30 tanks between, the 16" in figure.get_suptitle()
+    )
+    plt.close(figure)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 12])
+def test_every_run_is_drawn_and_can_be_told_from_the_others(count):
+    loop = presets.find("mirakhorli/sfc").loop
+    runs = {f"run {i}": made(x=columns(*np.full((4, 1001), 1.0 + 0.1 * i))) for i in range(count)}
+    figure = responses.responses(loop, runs)
+    panels = [ax for ax in figure.axes if ax.get_visible()]
+    assert len(panels) == 8
+    for ax in panels:
+        lines = [line for line in ax.lines if line.get_label() in runs]
+        assert [line.get_label() for line in lines] == list(runs)
+        assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == count
+    (legend,) = figure.legends
+    figure.canvas.draw()
+    box = legend.get_window_extent()
+    assert (
+        {text.get_text() for text in legend.get_texts()} >= set(runs)
+        and box.x0 >= 0
+        and box.x1 <= figure.bbox.x1
+    )
+    plt.close(figure)
+
+
+def test_the_rim_is_in_every_panel_of_a_fan():
+    """As a line, or in words where it stands far above all levels."""
+    loop = presets.find("mirakhorli/sfc").loop
+    rims = np.asarray(loop.plant.rim)
+    t = np.linspace(0.0, 10.0, 11)
+    top = rims * [1.1, 0.6, 0.3, 0.2]
+    figure = responses.fan(
+        loop, {"t": t, "r": np.ones((11, 2)), "x": np.ones((5, 11, 4)) * top}, "fan"
+    )
+    for i, ax in enumerate(figure.axes):
+        (line,) = [line for line in ax.lines if line.get_label().startswith("rim")]
+        if i < 3:
+            assert list(line.get_ydata()) == [rims[i]] * 2 and ax.get_ylim()[1] > rims[i]
+        else:
+            assert (
+                line.get_label() == f"rim {rims[i]:g} cm, above the picture"
+                and ax.get_ylim()[1] < rims[i]
+            )
+    plt.close(figure)
+
+
+def test_no_responses_of_no_run(gouta):
+    with pytest.raises(InputError, match="no run to draw"):
+        responses.responses(gouta("ngpc").loop, {})
+
+
+def test_units_of_parameters_are_never_set_as_mathematics(ax):
+    """Those of a controller of one's own may be any text."""
+    odd = r"$\x{$"
+    x = np.linspace(1.0, 2.0, 5)
+    responses.curve(ax, x, x, 0 * x, "K", odd, "cm", (1.0, 1.0), (2.0, 2.0), False)
+    ax.figure.canvas.draw()
+    ax.clear()
+    a, b = np.meshgrid(x, x)
+    responses.contours(
+        ax, a, b, a + b, a - 3, ("K", "L"), (odd, odd), "cm", (1.0, 1.0), (2.0, 2.0), (False, False)
+    )
+    ax.figure.canvas.draw()

@@ -1,0 +1,105 @@
+"""What the page of an ensemble says, beside numbers worked out from its draws."""
+
+import dataclasses
+import importlib
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import tuning
+from jaxtank import measures as measured
+from jaxtank import presets, rig
+
+SHORT = {"clock.dt": 1.0, "clock.duration": 200.0}
+OPTIONS = {"key": 0, "fan": False}
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig.set_values(presets.load("cascaded").cases["pi"], SHORT)
+
+
+def row(page, label):
+    """The cells of one row of the table of measures: unit, mean, its interval, sd, ..."""
+    line = next(line for line in page.splitlines() if line.startswith(label))
+    return [cell.strip() for cell in line.removeprefix(label).split("  ") if cell.strip()]
+
+
+def test_a_single_draw_is_told_without_a_spread(case):
+    """The rig has two tanks: a measure of several entries has no spread either."""
+    one = tuning.ensemble(case, samples=1, **OPTIONS)
+    page = repr(one)
+    for tank in (0, 1):
+        unit, mean, interval, sd, *others = row(page, f"max_level of tank {tank + 1}")
+        assert (
+            interval == sd == "-"
+            and {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
+            and unit == "V"
+        )
+    assert "1 run finite: a standard deviation" in page
+
+
+@pytest.mark.parametrize(
+    "failed, words",
+    [
+        ([True, False], "1 run finite: a standard deviation"),
+        ([True, True], "0 runs finite: a standard deviation"),
+    ],
+)
+def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
+    two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))
+    page = repr(two)
+    assert words in page
+    for tank in (1, 2):
+        assert row(page, f"max_level of tank {tank}")[2:4] == ["-", "-"]
+
+
+def test_an_interval_of_a_mean_ends_where_the_measure_does(case):
+    """Skew draws, whose mean and 1.96 standard errors reach past what the measure can be; the
+    settling time alone may be negative.
+    """
+    four = tuning.ensemble(
+        case,
+        samples=4,
+        measures=("overflow_volume", "saturated_fraction", "settling_time", "iae"),
+        **OPTIONS,
+    )
+    skew, share = np.array([0.0, 0.0, 0.0, 3.0]), np.array([1.0, 1.0, 1.0, 0.2])
+    measures = {
+        "overflow_volume": np.stack([skew, skew + 10], axis=1),
+        "saturated_fraction": share[:, None],
+        "settling_time": skew[:, None],
+        "iae": skew[:, None],
+    }
+    found = dataclasses.replace(four, measures=measures, limits=[]).summary()
+
+    def plain(values):
+        half = stats.norm.ppf(0.975) * np.std(values, ddof=1) / np.sqrt(len(values))
+        return values.mean() - half, values.mean() + half
+
+    ends = {name: np.array(found[name]["mean_interval95"]) for name in measures}
+    assert plain(skew)[0] < 0.0 and plain(share)[1] > 1.0
+    np.testing.assert_allclose(ends["overflow_volume"][:, 0], [0.0, plain(skew)[1]], rtol=1e-7)
+    np.testing.assert_allclose(ends["overflow_volume"][:, 1], plain(skew + 10), rtol=1e-7)
+    np.testing.assert_allclose(ends["saturated_fraction"][:, 0], [plain(share)[0], 1.0], rtol=1e-7)
+    np.testing.assert_allclose(ends["settling_time"][:, 0], plain(skew), rtol=1e-7)
+    np.testing.assert_allclose(ends["iae"][:, 0], [0.0, plain(skew)[1]], rtol=1e-7)
+    assert {m for m, spec in measured.MEASURES.items() if spec.low is None} == {"settling_time"}
+
+
+def test_two_draws_have_a_spread(case):
+    assert "spread:" not in repr(tuning.ensemble(case, samples=2, **OPTIONS))
+
+
+def test_a_fan_of_some_draws_says_of_which(case, monkeypatch):
+    from tuning.report import uncertainty
+
+    monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
+    for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):
+        found = tuning.ensemble(case, samples=samples, key=0)
+        drawn = uncertainty.figures(found)
+        title = drawn["fan"].get_suptitle() or drawn["fan"].axes[0].get_title()
+        assert title == f"{case.name}: {words}"
+        for figure in drawn.values():
+            figure.clf()
