@@ -224,9 +224,7 @@ def test_a_level_is_left_out_by_none(read, case):
         "h4": "none",
     }
     for slot in ("t", "pump2"):
-        with pytest.raises(
-            InputError, match=f"column {slot} = none: only a level may be left out"
-        ):
+        with pytest.raises(InputError, match=f"column {slot} = none: only a level may be left out"):
             read(text(), columns={slot: "none"})
     with pytest.raises(DataError, match="no column for a level"):
         read(text(), columns=dict.fromkeys(("h1", "h2", "h3", "h4"), "none"))
@@ -248,7 +246,7 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
     """With its comment signs taken away the example is a table for a file of such columns."""
     code, out, _ = command("init", "mirakhorli/sfc")
     assert code == 0
-    whole, example = out.split("# Which column", 1)
+    whole, example = out.split("# Columns of the experiment data", 1)
     table = "\n".join(line.removeprefix("#") for line in example.splitlines()[1:])
     (tmp_path / "rig.toml").write_text(whole + table + "\n")
     columns = rig.load(tmp_path / "rig.toml").log

@@ -849,7 +849,8 @@ def test_distributions_are_put_into_words():
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
     assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"
     assert (
-        in_words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (uniform, all entries together)"
+        in_words(Uniform(low=0.0, high=0.05, tied=True))
+        == "0 to 0.05 (uniform, all entries together)"
     )
     assert in_words(Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
     assert in_words(pair) == "2 parameters, correlated, with a covariance"
