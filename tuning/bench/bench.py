@@ -11,6 +11,7 @@ import statistics
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -156,7 +157,7 @@ def measure(rounds=7):
 C_LOOP = "C loop, backstepping"
 
 
-def _calls(cases):
+def _calls(cases) -> dict[str, Callable[[], Any]]:
     """{name: call} of what is timed: the cases, and two derivatives of the first one."""
     first = cases[CASES[0]]
     gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
@@ -166,7 +167,7 @@ def _calls(cases):
         return measures["rms_error_total"]
 
     derivative = jax.jit(jax.jacfwd(error))
-    calls = {
+    calls: dict[str, Callable[[], Any]] = {
         name: functools.partial(lp.evaluate, case.loop, case.clock, MEASURES)
         for name, case in cases.items()
     }
