@@ -1,7 +1,4 @@
-"""`jaxtank bench`: time of a closed-loop step here, beside a C loop of the same arithmetic.
-
-Imported by the command line and the benchmarks.
-"""
+"""`jaxtank bench`: time of a closed-loop step here, beside a C loop; for command and benchmarks."""
 
 import ctypes
 import functools
@@ -56,10 +53,7 @@ def c_loop(folder):
 
 
 def c_runner(function, case, rk4=True):
-    """Return a function that calls the C loop with the numbers of `case`.
-
-    It returns (rms error [cm], highest levels [cm]); the case has backstepping as printed.
-    """
+    """Return a call of the C loop for a case: () -> (rms error [cm], highest levels [cm])."""
     plant, controller, clock = case.loop.plant, case.loop.controller, case.clock
     numbers = np.concatenate(
         [
