@@ -178,7 +178,9 @@ def _scenario_table(result):
         ]
         for s in shown
     ]
-    found = [table(rows, ["scenario", "weight", "objective before", "after", "limits held after"])]
+    found: list[str] = [
+        table(rows, ["scenario", "weight", "objective before", "after", "limits held after"])
+    ]
     if many:
         held = sum(s["limits_held"]["after"] for s in scenarios)
         kept = f"; limits held after in {held}" if limited else ""

@@ -20,7 +20,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
 from tuning.problem.scenarios import Lane, groups_of, values_of
-from tuning.report import sensitivity_tables
+from tuning.report.studies import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
