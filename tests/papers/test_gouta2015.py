@@ -222,6 +222,7 @@ PLANT_B = [
 ]
 
 
+@pytest.mark.slow_for("ngpc-30s", "backstepping-30s", "backstepping-20s", "backstepping-ff-30s")
 @pytest.mark.parametrize("row", PLANT_B, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_plant_b_rows_of_the_acceptance_table(row):
     (

@@ -306,7 +306,9 @@ def test_printed_sign_leaves_its_offset():
         np.testing.assert_allclose(r.e[paper.quiet(r.t)].mean(axis=0), (-0.095, -0.076), atol=1e-3)
 
 
-@pytest.mark.parametrize(("tau", "limit"), [(0.13, 0.05), (1.3, 0.12)])
+@pytest.mark.parametrize(
+    ("tau", "limit"), [pytest.param(0.13, 0.05, marks=pytest.mark.slow), (1.3, 0.12)]
+)
 def test_delay_margin(tau, limit):
     """The largest stable delay of S at l = 10 (notes S7.2): a kick dies out at it and does not two
     samples later.
