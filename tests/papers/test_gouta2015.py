@@ -300,6 +300,7 @@ VARIANTS = [  # case, overrides, RMS1, RMS2
 ]
 
 
+@pytest.mark.slow_for("ngpc-values0-0.053-0.1271", "backstepping-ff-values2-0.0602-0.1406")
 @pytest.mark.parametrize(
     "name, values, rms1, rms2", VARIANTS, ids=lambda v: v if isinstance(v, str) else None
 )
@@ -607,6 +608,7 @@ def test_the_inversion_inverts():
         np.testing.assert_allclose(b @ np.column_stack(columns), np.eye(2), atol=1e-12)
 
 
+@pytest.mark.slow_for("ngpc", "backstepping-ff")
 @pytest.mark.parametrize("kind", ["ngpc", "backstepping", "backstepping-ff"])
 def test_an_equilibrium_stays(gouta, kind):
     case = gouta(kind)

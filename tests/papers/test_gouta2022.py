@@ -87,6 +87,7 @@ ROWS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow_for("d=0 E", "d=0 S", "const d E", "const d S", "DZ A")
 @pytest.mark.parametrize("name", ROWS)
 def test_acceptance_table(name):
     case, values, change, u, e, ts, tr, d = ROWS[name]
@@ -337,6 +338,7 @@ TABLE6 = {  # notes S7.3, delay 0.5 s: RMS u, RMS e, ts, tr as printed there
 }
 
 
+@pytest.mark.slow_for("pi", "pi-ff", "pid")
 @pytest.mark.parametrize("name", TABLE6)
 def test_baselines(name):
     found = paper.figures(run(name, {"actuator.delay": 0.5}))
@@ -495,6 +497,7 @@ def test_published_parameters_are_those_of_the_cases():
     assert float(loop.plant.pump_gain[0]) == pytest.approx(10 * published["plant.pump_gain"].value)
 
 
+@pytest.mark.slow_for("pid-ff")
 @pytest.mark.parametrize("name", ["chadpc", "pid-ff", "fopi"])
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
 

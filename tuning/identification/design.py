@@ -323,7 +323,8 @@ def _largest_deviation(estimation, z, experiment, scale):
     None where it is infinite. scale: factor on the noise of the channels.
     """
     t, u, x0, tanks = experiment
-    noise = dict.fromkeys(tanks, float(np.mean(estimation.noise)) * scale)
+    usual = float(np.mean(estimation.noise)) * scale
+    noise: dict[int, float] = {i: usual for i in tanks}
     for c, (tank, volts) in enumerate(estimation.data.channels):
         if not volts:
             noise[tank] = float(estimation.noise[c]) * scale

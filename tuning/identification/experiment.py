@@ -136,16 +136,7 @@ def log(
     ...
     jaxtank.core.errors.DataError: log, sample 2: time 0 s is that of the sample before: times ...
     """
-    try:
-        t, u, y = (np.asarray(v, dtype=float) for v in (t, u, y))
-    except (TypeError, ValueError):
-        raise DataError(f"{name}: t, u and y must be arrays of numbers") from None
-    u, y = (v[:, None] if v.ndim == 1 else v for v in (u, y))
-    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y):
-        raise DataError(
-            f"{name}: t, u and y have shapes {t.shape}, {u.shape}, {y.shape}: must share their"
-            " first dimension"
-        )
+    t, u, y = _arrays(name, t, u, y)
     tanks = tuple(range(y.shape[1])) if tanks is None else tuple(int(i) for i in tanks)
     in_volts = (False,) * len(tanks) if in_volts is None else tuple(bool(v) for v in in_volts)
     if not len(tanks) == len(in_volts) == y.shape[1]:
@@ -173,6 +164,21 @@ def log(
     _check_finite(found)
     _check_times(found)
     return found
+
+
+def _arrays(name, t, u, y):
+    """Return (samples,), (samples, pumps) and (samples, channels) arrays; raise DataError."""
+    try:
+        t, u, y = (np.asarray(v, dtype=float) for v in (t, u, y))
+    except (TypeError, ValueError):
+        raise DataError(f"{name}: t, u and y must be arrays of numbers") from None
+    u, y = (v[:, None] if v.ndim == 1 else v for v in (u, y))
+    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y):
+        raise DataError(
+            f"{name}: t, u and y have shapes {t.shape}, {u.shape}, {y.shape}: must share their"
+            " first dimension"
+        )
+    return t, u, y
 
 
 def _check_finite(found):

@@ -21,7 +21,8 @@ from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import check_data, check_float64, check_length, first_samples
 from tuning.identification.design import remedies
 from tuning.identification.identified_case import bare
-from tuning.identification.least_squares import Fit, profile_likelihood, solve
+from tuning.identification.least_squares import Fit, solve
+from tuning.identification.least_squares import profile_likelihood as _profile
 from tuning.identification.problem import Estimation
 from tuning.identification.proposal import check_law
 from tuning.identification.residuals import quality, validate
@@ -142,50 +143,58 @@ def identify(
     check_length(logs)
     memo = Memo()
     if folder is not None:
-        settings = {**options, "loss": loss, "iterations": iterations, "gap": gap}
-        memo = Log(folder, _problem(case, logs, partial, settings), resume)
+        given = {**options, "loss": loss, "iterations": iterations, "gap": gap}
+        memo = Log(folder, _problem(case, logs, partial, given), resume)
     if ready is not None:
         ready()
     fits, interrupted = _searches(memo, partial, starts, seed, loss, iterations, progress)
-    ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
-    if not ranked:
+    first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
+    if not np.isfinite(first.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
-    estimation, best, validation = _final_fit(
-        partial, ranked[0], logs, kept, options, loss, iterations
-    )
-    best, spread, fit_quality = _spread(estimation, best, loss, iterations)
-    parameters = spread.parameters()
-    status = _status(case, best, parameters, interrupted)
+    settings = {"loss": loss, "iterations": iterations}
+    estimation, best, validation = _final_fit(partial, first, logs, kept, options, settings)
+    best, spread, fit_quality = _spread(estimation, best, settings)
     return Identification(
         case=case,
         estimation=estimation,
         fit=best,
-        status=status,
-        parameters=parameters,
-        levels=spread.levels(),
-        covariance=spread.covariance_of_parameters(),
+        **_estimates(case, estimation, best, spread, interrupted),
         quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
-        directions=spread.directions(),
-        remedies=(remedies(estimation, best, spread) if status is Status.NOT_IDENTIFIABLE else []),
-        starts=[
-            {
-                "cost": f.cost,
-                "evaluations": f.evaluations,
-                "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12),
-            }
-            for f in fits
-        ],
+        starts=_agreement(fits, first.cost),
         validation=validation,
-        profile=(
-            profile_likelihood(estimation, best, spread, loss)
-            if profile and not interrupted
-            else None
-        ),
+        profile=None if interrupted or not profile else _profile(estimation, best, spread, loss),
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
     )
+
+
+def _estimates(case, estimation, best, spread, interrupted):
+    """Return status, estimates with intervals, and what is not identifiable."""
+    parameters = spread.parameters()
+    status = _status(case, best, parameters, interrupted)
+    unclear = status is Status.NOT_IDENTIFIABLE
+    return {
+        "status": status,
+        "parameters": parameters,
+        "levels": spread.levels(),
+        "covariance": spread.covariance_of_parameters(),
+        "directions": spread.directions(),
+        "remedies": remedies(estimation, best, spread) if unclear else [],
+    }
+
+
+def _agreement(fits, least):
+    """Return {"cost", "evaluations", "agrees"} of each search; least: the lowest cost."""
+    return [
+        {
+            "cost": f.cost,
+            "evaluations": f.evaluations,
+            "agrees": bool(f.cost <= least * AGREE + 1e-12),
+        }
+        for f in fits
+    ]
 
 
 def _check_options(loss, **counts):
@@ -250,21 +259,21 @@ def _search(memo, estimation, z, loss, iterations):
     )
 
 
-def _final_fit(partial, first, logs, kept, options, loss, iterations):
+def _final_fit(partial, first, logs, kept, options, settings):
     """Return (Estimation, Fit, validation) to all samples, from the best of the first searches."""
-    best = solve(partial, partial.unknowns(first), loss, iterations)
+    best = solve(partial, partial.unknowns(first), **settings)
     estimation, validation = partial, None
     if any(n < one.samples for n, one in zip(kept, logs)):
         same = {"substeps": partial.substeps, "noise": partial.noise}
         estimation = Estimation(partial.case, logs, **(options | same))
         validation = validate(estimation, partial, best, kept)
-        best = solve(estimation, partial.unknowns(best), loss, iterations)
+        best = solve(estimation, partial.unknowns(best), **settings)
     # branch gains may leave the ranges of gain and split: the same search in these themselves
     if not _within(estimation, best):
         plain = estimation.without_branch_gains()
         p = plain.coordinates.point(estimation.coordinates.values(best.p))
         begin = np.concatenate([p, best.levels.ravel() / plain.level_scale])
-        estimation, best = plain, solve(plain, np.clip(begin, *plain.box), loss, iterations)
+        estimation, best = plain, solve(plain, np.clip(begin, *plain.box), **settings)
     if not np.isfinite(best.cost):
         raise DataError(
             f"{logs[0].name}: the fit to the first {kept[0]} samples diverges when simulated over"
@@ -282,18 +291,18 @@ def _within(estimation, fit):
     )
 
 
-def _spread(estimation, best, loss, iterations):
+def _spread(estimation, best, settings):
     """Return (Fit, Spread, quality): where something is not identifiable, of a fit near nominal."""
     found = quality(estimation, best)
     spread = Spread(estimation, best, found)
     if spread.open.any():
-        best = _nearest(estimation, best, spread.scale, loss, iterations)
+        best = _nearest(estimation, best, spread.scale, settings)
         found = quality(estimation, best)
         spread = Spread(estimation, best, found)
     return best, spread, found
 
 
-def _nearest(estimation, best, scale, loss, iterations):
+def _nearest(estimation, best, scale, settings):
     """Return a Fit in the 95 % region about `best` that is near the case's own values.
 
     A search along an insensitive direction ends at an arbitrary point of it.
@@ -301,9 +310,8 @@ def _nearest(estimation, best, scale, loss, iterations):
     nominal = estimation.nominal()
     most = best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
     for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
-        near = solve(
-            estimation, nominal, loss, iterations, tolerance=1e-8, prior=(nominal, strength)
-        )
+        prior = (nominal, strength)
+        near = solve(estimation, nominal, tolerance=1e-8, prior=prior, **settings)
         if near.residual.size and near.residual @ near.residual <= most:
             return near
     return best

@@ -156,15 +156,15 @@ def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=
             start = estimation.unknowns(one)
             rise[j] = max(2 * (one.cost - fit.cost) / inflate, 0.0)
             values[j] = float(estimation.coordinates.values(one.p)[name])
-    ends = [_crossing(values[side], rise[side]) for side in (downward, upward)]
-    if ends[0] is not None and ends[1] is not None:
-        ends = sorted(ends)
+    low, high = (_crossing(values[side], rise[side]) for side in (downward, upward))
+    if low is not None and high is not None and high < low:
+        low, high = high, low
     return {
         "name": name,
         "unit": next(b.unit for b in estimation.bounds if b.name == name),
         "values": values.tolist(),
         "rise": rise.tolist(),
-        "interval95": ends,
+        "interval95": [low, high],
     }
 
 

@@ -2,6 +2,8 @@
 validation set. Imported by `problem`, `confidence`, `fit` and reports.
 """
 
+from typing import Any
+
 import numpy as np
 
 from jaxtank.core.errors import InputError
@@ -163,7 +165,7 @@ def validate(estimation, partial, fit, kept):
     y = np.where(estimation.mask, estimation.data.y, np.nan)
     residual, sample = y - predicted, np.arange(y.shape[1])
     fitted = sample < np.array(kept)[:, None]  # (logs, samples)
-    found = {"samples": [int(n) for n in kept]}
+    found: dict[str, Any] = {"samples": [int(n) for n in kept]}
     for side, rows in (("fitted", fitted), ("held_back", ~fitted)):
         found[side] = {"rmse": [], "nrmse_percent": []}
         for c in range(y.shape[-1]):
