@@ -355,7 +355,12 @@ def rows(table, quick):
         )
 
 
-@pytest.mark.slow_for("S2-laguerre-constrained-0.1", "S2-laguerre-constrained-0.5")
+@pytest.mark.slow_for(
+    "S2-laguerre-constrained-0.1",
+    "S2-laguerre-constrained-0.5",
+    "S2-laguerre-unconstrained-0.5",
+    "S1-laguerre-constrained-0.1",
+)
 @pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):
     where, kind, mode, du, rmse, over, under, up, down, rms_u, travel, held, top = row

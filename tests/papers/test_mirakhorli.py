@@ -1324,9 +1324,7 @@ def test_every_published_number_that_can_be_measured_is():
     )
     published = load("mirakhorli").published
     assert set(found) <= set(published)
-    verdicts = {
-        name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")
-    }
+    verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
     assert [verdicts[f"rise time, {law}"] for law in ("SMC", "SFC", "hybrid")] == [
