@@ -34,7 +34,7 @@ COMMANDS = {
         *["--free", "plant.pump_gain[0]=0.02:0.1", "--free", "plant.orifice[0]=0.02:0.08", "--free", "plant.drain[1]=0.02:0.08"],
     ],
 }  # fmt: skip
-AFRESH = re.compile(r"no evaluations\.jsonl|no ensemble to go on with|had ended")
+AFRESH = re.compile(r"holds no checkpoint to continue|had ended")
 PATIENCE = 300.0  # s
 
 

@@ -14,12 +14,12 @@ from tuning.problem import problem as objective
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.problem.scenarios import coarse_clock
-from tuning.search.baseline import run_measures
+from tuning.problem.reported import run_measures
 from tuning.search.driver import Search
 from tuning.search.kkt import optimality
 from tuning.search.methods import METHODS
 from tuning.search.screening import distinct_starts, screen, sobol, spectral_radius
-from tuning.storage.evaluation_log import Memo
+from tuning.storage.evaluation_log import EvaluationCache
 
 LBFGS = pytest.param("lbfgs", marks=pytest.mark.slow)
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
@@ -66,19 +66,19 @@ def test_backstepping_under_the_rims(gouta, limited):
     assert again["rms_error_total"] == pytest.approx(limited.objective["after"], rel=1e-9)
 
 
-def test_the_answer_says_which_tank_is_tight_and_when(limited):
+def test_the_answer_names_the_tank_with_an_active_limit_and_when(limited):
     tight = min(limited.constraints, key=lambda c: c["margin"])
     assert tight["tank"] == 3 and tight["measure"] == "max_level" and 0 <= tight["margin"] < 1e-3
     # as setpoint 2 comes down to 10 cm and tank 3 has to carry tank 1
     assert 800 < tight["time_s"] < 840
-    assert f"tight: max_level of tank 3 at {tight['time_s']:.2f} s" in limited.message
+    assert f"active limit: max_level of tank 3 at {tight['time_s']:.2f} s" in limited.message
     assert (
-        "starting values break a limit (max_level of tank 3" in limited.message
+        "starting values violate a limit (max_level of tank 3" in limited.message
         and "tank 4" in limited.message
     )
 
 
-def test_the_answer_says_which_gain_is_barely_felt(gouta, limited):
+def test_the_answer_names_the_gain_that_the_objective_is_insensitive_to(gouta, limited):
     """k acts through k + k1 alone; at the answer a tenth of it changes the error by a hundredth of
     a percent (checked by runs).
     """
@@ -92,11 +92,12 @@ def test_the_answer_says_which_gain_is_barely_felt(gouta, limited):
     )
     error = float(jaxtank.evaluate(less.loop, less.clock, "rms_error_total")["rms_error_total"])
     np.testing.assert_allclose(
-        k["felt_percent"], 100 * abs(error / limited.objective["after"] - 1), rtol=1e-4
+        k["sensitivity_percent"], 100 * abs(error / limited.objective["after"] - 1), rtol=1e-4
     )
     assert (
-        "controller.k is barely felt" in limited.message
-        and "controller.k1 is barely felt" not in limited.message
+        "controller.k ended at its upper bound 5 1/s; the objective is insensitive to it (10 %"
+        in limited.message
+        and "insensitive to controller.k1" not in limited.message
     )
 
 
@@ -286,7 +287,7 @@ def test_forward_and_reverse_derivatives_of_the_problem_agree(gouta, monkeypatch
     z = problem.start()
     forward = problem.point(z)
     monkeypatch.setattr(objective, "FORWARD_LIMIT", 9)
-    problem.memo = Memo()
+    problem.cache = EvaluationCache()
     reverse = problem.point(z)
     np.testing.assert_allclose(reverse.gradient, forward.gradient, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(reverse.margin_slopes, forward.margin_slopes, rtol=1e-9, atol=1e-10)
@@ -301,9 +302,9 @@ class Bowl:
     """
 
     limits = (Limit("max_level", 0, 1.0),)
-    rooms = np.ones(1)
+    limit_scales = np.ones(1)
     bounds = ()
-    model = None
+    model, risk = None, "mean"
 
     def point(self, z):
         g = np.array([2 * (z[0] - 0.7), 8 * (z[1] - 0.2)])
@@ -435,7 +436,7 @@ def test_chatter_is_told_and_drawn(gouta):
     sample.
     """
     from tuning.report.artifacts import run_for_people
-    from tuning.search.result import message
+    from tuning.search.messages import messages_of
 
     wild = gouta("backstepping", {"clock.dt": 0.1, "controller.k": 22.0})
     # and not the same sample of every pair
@@ -443,14 +444,9 @@ def test_chatter_is_told_and_drawn(gouta):
     result = quick(gouta)
     calm = result.measures["before"]
     told = {"before": calm, "after": run_measures(wild.loop, wild.clock, None)}
-    z = [
-        float(b.to_unit(p["after"]))
-        for b, p in zip(result.problem.bounds, result.parameters.values())
-    ]
-    assert "the pumps travel" in message(result.replace(measures=told), z, [None, None], 0)
-    assert "the pumps travel" not in message(
-        result.replace(measures={"before": calm, "after": calm}), z, [None, None], 0
-    )
+    codes = lambda measures: [m.code for m in messages_of(result.replace(measures=measures))]
+    assert "input-total-variation" in codes(told)
+    assert "input-total-variation" not in codes({"before": calm, "after": calm})
 
 
 @pytest.mark.filterwarnings("error")
@@ -464,5 +460,5 @@ def test_an_objective_of_zero_gives_no_share_and_no_warning():
     )
     assert (
         result.objective["after"] == 0.0
-        and result.parameters["controller.Kc[0]"]["felt_percent"] is None
+        and result.parameters["controller.Kc[0]"]["sensitivity_percent"] is None
     )

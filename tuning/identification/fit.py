@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-import jaxtank
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
@@ -25,8 +24,9 @@ from tuning.identification.identified_case import bare, proposed
 from tuning.identification.problem import Estimation, Fit, check_length
 from tuning.identification.proposal import check_law
 from tuning.problem.status import Status
-from tuning.storage.batch_store import digest
-from tuning.storage.evaluation_log import Log, Memo, folder_of
+from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
+from tuning.storage.fingerprint import digest, fingerprint
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001
@@ -158,7 +158,7 @@ def identify(
     Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log
     that cannot be used.
     """
-    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
+    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     if not jax.config.read("jax_enable_x64"):
         raise InputError(
             "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
@@ -190,21 +190,28 @@ def identify(
         options["substeps"] = Estimation(case, logs, **options).substeps
     partial = Estimation(case, begin, **options)
     check_length(logs)
-    memo = Memo()
+    cache = EvaluationCache()
     if folder is not None:
-        memo = Log(
-            folder,
-            _problem(
-                case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}
-            ),
-            resume,
+        what = fingerprint(
+            case,
+            command="identify",
+            logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
+            free=partial.bounds,
+            held_back=[one.samples for one in partial.logs],
+            noise=partial.noise,
+            substeps=partial.substeps,
+            start=start,
+            loss=loss,
+            iterations=iterations,
+            gap=gap,
         )
+        cache = EvaluationLog(folder, what, resume)
     if ready is not None:
         ready()
     fits, interrupted = [], False
     try:
         for z in partial.begin(starts, seed):
-            fits.append(_search(memo, partial, z, loss, iterations))
+            fits.append(_search(cache, partial, z, loss, iterations))
             if progress is not None:
                 progress(fits[-1])
     except KeyboardInterrupt:
@@ -285,8 +292,8 @@ def identify(
     )
 
 
-def _search(memo, estimation, z, loss, iterations):
-    """The Fit of a first search from z. One that a memo knows is where it ended, without its
+def _search(cache, estimation, z, loss, iterations):
+    """The Fit of a first search from z. One that the cache knows is where it ended, without its
     residual and jacobian.
     """
     made = []
@@ -301,7 +308,7 @@ def _search(memo, estimation, z, loss, iterations):
             float(made[0].status),
         )
 
-    p, own, cost, evaluations, status = memo.recall("search", [z], compute)
+    p, own, cost, evaluations, status = cache.recall("search", [z], compute)
     if made:
         return made[0]
     none = np.zeros((0, estimation.size))
@@ -315,22 +322,6 @@ def _search(memo, estimation, z, loss, iterations):
         status=int(status),
         loss=loss,
     )
-
-
-def _problem(case, logs, partial, options):
-    """What two runs must share for one to go on where the other ended: {what: text}."""
-    return {
-        "command": "identify",
-        "case": digest([np.asarray(leaf) for leaf in jax.tree.leaves(case.loop)]),
-        "logs": digest([np.asarray(v) for one in logs for v in (one.t, one.u, one.y)]),
-        "free": repr([tuple(b) for b in partial.bounds]),
-        "held back": repr([one.samples for one in partial.logs]),
-        "noise": repr(partial.noise.tolist()),
-        "substeps": repr(partial.substeps),
-        **{n: repr(options[n]) for n in ("start", "loss", "iterations", "gap")},
-        "jaxtank": jaxtank.__version__,
-        "jax": jax.__version__,
-    }
 
 
 def _within(estimation, fit):

@@ -25,6 +25,7 @@ def json_of(result):
         "success": result.success,
         "status": str(result.status),
         "message": result.message,
+        "messages": [{"code": m.code, "text": m.text} for m in result.messages],
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
@@ -34,11 +35,11 @@ def json_of(result):
         },
         "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
         "units": units(result.tuned.loop.units),
-        "constraints": clean(result.constraints),
+        "constraints": clean([c.to_json() for c in result.constraints]),
         "evaluations": result.evaluations,
         "scenarios": scenario_rows(result),
         "starts": clean(result.starts),
-        "mirror": clean(result.mirrored),
+        "symmetry": clean(result.symmetry),
         "choices": clean(result.choices),
         "optimality": clean(result.optimality),
         "curvature": clean(result.curvature),
@@ -74,7 +75,7 @@ def parts_of(result):
             number(p["before"]),
             number(p["after"]),
             f"{number(p['lower'])} : {number(p['upper'])}",
-            "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
+            "-" if p["sensitivity_percent"] is None else f"{number(p['sensitivity_percent'], 2)} %",
             (
                 "not exercised, kept"
                 if not p["exercised"]
@@ -162,14 +163,14 @@ def _whose(result, others):
     if not problem.scenarios:
         return []
     what = "plants" if result.certificate is not None else "scenarios"
-    weighted = len({lane.weight for lane in problem.lanes}) > 1
+    weighted = len({run.weight for run in problem.runs}) > 1
     of = {
         "mean": "the weighted mean" if weighted else "the mean",
         "cvar": f"the mean of the worst {100 * TAIL:g} %",
         "worst": "the worst",
     }
     rest = "; the other rows: the case's own run, on its own plant" if others else ""
-    return [f"objective: {of[problem.risk]} of {len(problem.lanes)} {what}{rest}"]
+    return [f"objective: {of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
 
 
 def worst_of_scenarios(constraints):
@@ -192,13 +193,13 @@ def scenario_rows(result):
     if not problem.scenarios:
         return []
     rows = []
-    for i, lane in enumerate(problem.lanes):
-        mine = [limit for limit in problem.limits if limit.lane == i]
+    for i, run in enumerate(problem.runs):
+        mine = [limit for limit in problem.limits if limit.run == i]
         sides = {k: t[i] for k, t in result.tables.items()}
         rows.append(
             {
-                "name": lane.name,
-                "weight": lane.weight,
+                "name": run.name,
+                "weight": run.weight,
                 "objective": clean({k: problem.cost(row) for k, row in sides.items()}),
                 "limits_held": {
                     k: all(limit.margin(row) >= 0 for limit in mine) for k, row in sides.items()

@@ -12,6 +12,7 @@ from jaxtank.core.files import check_folder
 from tuning.report.artifacts import earlier, run_for_people, trajectory_csv, write_result
 from tuning.report.tables import dumps, number, objective_unit
 from tuning.report.tuning import json_of, parts_of, worst_of_scenarios
+from tuning.search.result import Message
 
 
 def result_key(result):
@@ -158,7 +159,7 @@ def page_of(result, drawn, command=None):
         + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
         facts,
-        result.message.split("; "),
+        [m.text for m in result.messages],
         html.drawings(drawn, CAPTIONS),
         parts_of(result)[1:],
         command,
@@ -219,7 +220,7 @@ def _landscape(ax, result, unit):
         )
     first, second = sorted(
         np.argsort(
-            [-(p["felt_percent"] or 0.0) for p in result.parameters.values()], kind="stable"
+            [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()], kind="stable"
         )[:2]
     )
     side = np.linspace(0.0, 1.0, 24)
@@ -273,7 +274,7 @@ def save(result, folder, command=None):
     rig_text, why = rig_of(result)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called result.save
-        result = result.replace(message=f"{result.message}; {why}")
+        result = result.replace(messages=(*result.messages, Message("no-rig-file", why)))
     key = result_key(result)
     runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
     files = {

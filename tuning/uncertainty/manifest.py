@@ -23,7 +23,7 @@ WORDS = {
 }
 
 
-def told(case, limits):
+def notes(case, limits):
     """What the manifest says of a case and its limits: {"rig": text of a rig file, or None where no
     file describes it, "limits": dict}.
     """
@@ -81,7 +81,7 @@ def restore(folder):
     """
     manifest = batch_store.read_manifest(folder)
     bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
-    asked = manifest.get("told")
+    asked = manifest.get("notes")
     if bad or not isinstance(asked, dict) or not isinstance(asked.get("limits"), dict):
         raise InputError(
             f"{str(folder)!r}: the manifest does not say what its shards are of; give the case and"

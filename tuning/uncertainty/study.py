@@ -24,8 +24,9 @@ from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
-from tuning.storage import batch_store
-from tuning.storage.evaluation_log import folder_of
+from tuning.storage.batch_store import BatchStore
+from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.distributions import Draws, stated
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
@@ -204,7 +205,7 @@ def ensemble(
     process runs its share of the batches and all get the whole. Numbers of a draw do not depend on
     any of it. Returns an Ensemble (None for a shard). Raises InputError before anything is run.
     """
-    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
+    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     if shard is not None and not (
         isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]
     ):
@@ -237,14 +238,22 @@ def ensemble(
     count = -(-samples // lanes)
     store: Any = None
     if folder is not None:
-        manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
-        manifest["told"] = shards.told(case, case.limits if limits is None else limits)
-        store = batch_store.Store(
+        what = fingerprint(
+            case,
+            distributions=shards.to_json(distributions),
+            samples=samples,
+            key=key,
+            draws=draws,
+            measures=wanted,
+            lanes=lanes,
+        )
+        store = BatchStore(
             folder,
-            manifest,
-            resume,
+            what,
+            shards.notes(case, case.limits if limits is None else limits),
+            resume=resume,
             shared=shard is not None or jax.process_count() > 1,
-            anew=not merge,
+            begin=not merge,
         )
     mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
     mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
@@ -455,20 +464,3 @@ def _trajectories(loop, values, indices, seed, clock, every):
         return run.t, run.r, run.x, run.u
 
     return jax.vmap(one)(values, indices)
-
-
-def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
-    leaves, structure = jax.tree.flatten(case.loop)
-    return {
-        "case": case.name,
-        "loop": batch_store.digest([np.asarray(v) for v in leaves]),
-        "structure": batch_store.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
-        "clock": repr(case.clock),
-        "distributions": shards.to_json(distributions),
-        "samples": samples,
-        "key": key,
-        "draws": draws,
-        "measures": list(wanted),
-        "lanes": lanes,
-        "jax": jax.__version__,
-    }

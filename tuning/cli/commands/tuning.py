@@ -46,10 +46,10 @@ def _tune(args):
     limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
     if sweep:  # before the search, which would be lost
         from tuning.problem.limits import resolve_in
-        from tuning.problem.scenarios import check_scenarios, lanes_of
+        from tuning.problem.scenarios import check_scenarios, runs_of
 
         runs = check_scenarios(case, case.scenarios if scenarios is None else scenarios)
-        resolve_in(lanes_of(case, runs, seed), {sweep[0]: sweep[1][0]})
+        resolve_in(runs_of(case, runs, seed), {sweep[0]: sweep[1][0]})
     folder = args.resume or args.out
     choices, varied = choices_of(args), distributions_of(args, case)
     only = (args.samples, args.fresh, args.back_off)
