@@ -3,8 +3,9 @@
 Imported by `problem`, `search` and `uncertainty`.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,6 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.plants.base import Plant
 from jaxtank.rig import check_limits
 from tuning.problem.scenarios import ScenarioRun
 
@@ -31,7 +31,8 @@ NO_OVERFLOW = 1e-6
 """
 
 
-class Limit(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Limit:
     """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in one run.
 
     The value is in the measure's unit; run is the scenario's index in `Problem.runs`.
@@ -40,7 +41,7 @@ class Limit(NamedTuple):
     --------
     >>> limit = Limit("max_level", 2, 30.0)
     >>> limit.label, limit.sign, limit.margin({"max_level": np.array([9.0, 8.0, 29.5])})
-    ('max_level of tank 3', 1, 0.5)
+    ('max_level of tank 3', 1.0, 0.5)
     """
 
     measure: str
@@ -50,7 +51,7 @@ class Limit(NamedTuple):
     scenario: str = ""
 
     @property
-    def sign(self) -> int:
+    def sign(self) -> float:
         """+1 for an upper limit, -1 for a lower one."""
         return ms.MEASURES[self.measure].sense
 
@@ -95,9 +96,9 @@ def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
     >>> limit_scale(Limit("saturated_fraction", 0, 0.0), loop)
     0.001
     """
-    length, rim = loop.units[0], np.asarray(loop.plant.rim)
-    # no other plant overflows, and some have no area to name
-    area = np.asarray(loop.plant.area) if loop.plant.overflow else 1.0
+    plant: Any = loop.plant  # of any class: no other plant overflows, and some have no area to name
+    length, rim = loop.units[0], np.asarray(plant.rim)
+    area = np.asarray(plant.area) if plant.overflow else 1.0
     size = {
         length: float(np.max(rim)),
         f"{length}^3": float(np.max(rim * area)),
@@ -162,7 +163,7 @@ def resolve_in(
     return found
 
 
-def _without_overflow(measure: str, index: int, value: float, plant: Plant) -> tuple[str, float]:
+def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:
     """Return (measure, value) of a limit; one at a rim that is physics limits the overflow."""
     if plant.overflow and measure == "max_level" and value >= np.asarray(plant.rim)[index]:
         return "overflow_volume", NO_OVERFLOW * float(plant.area[index] * plant.rim[index])
@@ -182,16 +183,15 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     ('', [False])
     """
     spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
-    since = (
-        np.asarray(loop.disturbance.since(clock))
-        if hasattr(loop.disturbance, "since")
-        else np.full(1, -1.0)
-    )
-    if spec.pours and hasattr(loop.disturbance, "since"):
+    disturbance: Any = loop.disturbance
+    reference: Any = loop.reference
+    timed = hasattr(disturbance, "since")
+    since = np.asarray(disturbance.since(clock)) if timed else np.full(1, -1.0)
+    if spec.pours and timed:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    if spec.windows and hasattr(loop.reference, "windows"):
-        steps = [np.asarray(step) for _, step, *_ in loop.reference.windows(clock)]
+    if spec.windows and hasattr(reference, "windows"):
+        steps = [np.asarray(window[1]) for window in reference.windows(clock)]
         why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"
-        return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
+        return why, [not np.any((np.asarray(s) != 0.0) & (since < 0.0)) for s in steps]
     return "", [False] * ms.entries(measure, loop.plant)

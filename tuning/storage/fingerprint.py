@@ -3,6 +3,7 @@
 Imported by every command that keeps a checkpoint: `tune`, `identify`, `ensemble`.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -69,7 +70,9 @@ def fingerprint(case: Case, **what: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value that JSON has no form for: an array as a list, anything else as text."""
+    """Return a value that JSON has no form for: arrays and dataclasses as lists, else as text."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return list(vars(value).values())
     if isinstance(value, np.generic | np.ndarray | jax.Array):
         return np.asarray(value).tolist()
     return repr(value)
