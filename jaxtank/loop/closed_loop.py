@@ -5,7 +5,6 @@ of every sample beforehand.
 import dataclasses
 import functools
 import warnings
-from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +16,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import PIECE, Piece
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.loop.step import Inputs, State
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
@@ -31,10 +29,10 @@ class ClosedLoop:
     """Everything that takes part in a run, and the levels it starts from."""
 
     plant: Plant
-    sensor: LevelSensor
+    sensor: Sensor
     observer: Observer
     controller: Controller
-    actuator: PumpBank
+    actuator: Actuator
     reference: Signal
     disturbance: Signal | None = None
     faults: Faults | None = None
@@ -56,12 +54,12 @@ def inputs(loop, clock, names, key, piece=None, samples=0):
     d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
     window = None
     if ms.wants_windows(names):
-        if not hasattr(loop.reference, "windows"):
+        window = loop.reference.windows(clock)
+        if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
             )
-        window = loop.reference.windows(clock)
-    since = cast(Any, loop.disturbance).since(clock) if hasattr(loop.disturbance, "since") else None
+    since = None if loop.disturbance is None else loop.disturbance.since(clock)
     if since is None and ms.wants_pours(names):
         raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
     if since is not None and window is not None:
@@ -107,6 +105,7 @@ def initial(loop, clock):
         observer=typed(loop.observer.init(x0)),
         controller=typed(loop.controller.init(x0, u0)),
         actuator=typed(loop.actuator.init(clock)),
+        sensor=typed(loop.sensor.init(x0)),
         excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
     )
 

@@ -21,6 +21,7 @@ class State(NamedTuple):
     observer: Any
     controller: Any
     actuator: Any
+    sensor: Any = ()
     excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
 
 
@@ -54,7 +55,7 @@ def step(loop, clock, state, now):
     """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
-    y = loop.sensor.read(state.x, now.xi)
+    y, sensor = loop.sensor.step(state.sensor, state.x, now.xi, clock.dt)
     made = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = made.estimate, made.command, made.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
@@ -73,7 +74,8 @@ def step(loop, clock, state, now):
         spilled=spilled,
         shortfall=shortfall,
     )
-    return moved._replace(observer=made.observer, controller=made.controller), sample
+    moved = moved._replace(observer=made.observer, controller=made.controller, sensor=sensor)
+    return moved, sample
 
 
 def decide(loop, observer, controller, tick, y):
@@ -95,7 +97,7 @@ def decide(loop, observer, controller, tick, y):
     """
     estimate, observer = loop.observer.step(observer, tick, y)
     command, controller = commanded(loop, controller, tick, estimate)
-    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    metric = loop.controller.input_metric(estimate) if loop.actuator.allocates else None
     applied = loop.actuator.limit(command, metric)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
@@ -109,7 +111,7 @@ def move(loop, clock, state, applied, now):
     are.
     """
     t = time_of(state, clock)
-    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
+    u, actuator = loop.actuator.step(state.actuator, applied, clock.dt)
     plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
     driving = materialised(loop.actuator.driving(u))
     found = advance(

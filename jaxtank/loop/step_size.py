@@ -5,7 +5,7 @@ Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the
 
     lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(knee))    [1/s]
 
-of the film of `numerics.root`, and a Runge-Kutta step h follows it while lambda h is below 2.785
+of the film of `numerics.smooth_sqrt`, and a Runge-Kutta step h follows it while lambda h is below 2.785
 (rk4) or 2 (midpoint), the ends of their stability regions on the negative axis (Hairer & Wanner
 1996, sec. IV.2). Beyond, a level that should rest at 0 is thrown up again and again. How high
 depends on lambda h alone, counted in knees, and is found here by doing it: 9 knees at 6.6, 160 at

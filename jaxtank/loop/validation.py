@@ -10,10 +10,11 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from jaxtank.core.checks import check_leaves
 from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
-from jaxtank.core.tree import check_leaves, is_component
+from jaxtank.core.tree import is_component
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
@@ -102,7 +103,7 @@ def check(
             f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks:"
             " give one inflow per tank"
         )
-    if actuator.saturation == "boxqp" and (plant.pumps != 2 or not loop.controller.allocates):
+    if actuator.allocates and (plant.pumps != 2 or not loop.controller.allocates):
         raise InputError(
             "actuator.saturation = 'boxqp': needs two pumps and a law with a cost to allocate by"
             " (its input_metric)"
@@ -121,12 +122,7 @@ def check(
         check_caught(own, name)
     if not _traced(plant):
         check_step(loop, clock)
-    _check_order(actuator, "low", "high")
-    if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
-        _check_order(actuator, "stop", "dead_zone", equal=True)
-    if actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse":
-        _check_order(actuator, "dead_zone", "pulse")
-        _check_order(actuator, "pulse", "high", equal=True)
+    actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
         if not _traced(actuator):
@@ -155,17 +151,3 @@ def _plants(tree, prefix=""):
 
 def _traced(*trees):
     return any(isinstance(v, Tracer) for v in jax.tree.leaves(trees))
-
-
-def _check_order(actuator, lower, upper, equal=False):
-    """Raise InputError unless each pump's `lower` is below its `upper` (or equal to it)."""
-    a, b = getattr(actuator, lower), getattr(actuator, upper)
-    if _traced(a, b):
-        return
-    for i, (low, high) in enumerate(zip(np.ravel(a), np.ravel(b))):
-        if not (low <= high if equal else low < high):
-            most = "at most" if equal else "below"
-            raise InputError(
-                f"actuator.{lower}[{i}] = {low:g} V: must be {most} actuator.{upper}[{i}] ="
-                f" {high:g} V"
-            )

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import nothing, plus
-from jaxtank.core.numerics import at_least, magnitude, root_of_mean
+from jaxtank.core.numerics import lower_clip, magnitude, root_of_mean
 
 BAND = 0.05
 """Half width of the recovery band, as a share of the setpoint [-]."""
@@ -182,7 +182,9 @@ def _past(sample, window):
     step.
     """
     return tuple(
-        at_least(jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0)
+        lower_clip(
+            jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0
+        )
         for (target, step, _, _), r, e in zip(window, sample.r, sample.e)
     )
 
@@ -197,7 +199,7 @@ def _update_deviation(run, state, sample, rest):
 
 def _over_rim(run, sample):
     """Rise past the rim [cm], one per tank."""
-    return tuple(at_least(x - h, 0.0) for x, h in zip(sample.x, run.rim))
+    return tuple(lower_clip(x - h, 0.0) for x, h in zip(sample.x, run.rim))
 
 
 def _changes(state, sample):

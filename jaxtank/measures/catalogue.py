@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxtank.core.errors import unknown
 from jaxtank.core.kahan import totals
-from jaxtank.core.numerics import at_least, root_of_mean
+from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import (
     ACCUMULATORS,
@@ -73,7 +73,7 @@ def _rise(run, acc):
 
 
 def _overshoot_percent(run, acc):
-    return 100.0 * at_least(_extremes("overshoot")(run, acc), 0.0)
+    return 100.0 * lower_clip(_extremes("overshoot")(run, acc), 0.0)
 
 
 MEASURES = {
@@ -405,8 +405,9 @@ def serves(name, loop):
         return False
     if "shortfall" in spec.needs and not loop.plant.bottom:
         return False
-    return (not spec.windows or hasattr(loop.reference, "windows")) and (
-        not spec.pours or hasattr(loop.disturbance, "since")
+    onset = None if loop.disturbance is None else loop.disturbance.onset
+    return (not spec.windows or loop.reference.changes is not None) and (
+        not spec.pours or onset is not None
     )
 
 

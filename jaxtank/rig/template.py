@@ -68,8 +68,8 @@ def _measures(case, but):
     """Names of the measures that a run of the case has, without those in `but`."""
     known = {m: spec for m, spec in MEASURES.items() if m not in but and m not in TIMES.values()}
     poured, stepped = (
-        hasattr(case.loop.disturbance, "since"),
-        hasattr(case.loop.reference, "windows"),
+        case.loop.disturbance is not None and case.loop.disturbance.onset is not None,
+        case.loop.reference.changes is not None,
     )
     return [
         m

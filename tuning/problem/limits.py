@@ -183,15 +183,14 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     ('', [False])
     """
     spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
-    disturbance: Any = loop.disturbance
-    reference: Any = loop.reference
-    timed = hasattr(disturbance, "since")
-    since = np.asarray(disturbance.since(clock)) if timed else np.full(1, -1.0)
-    if spec.pours and timed:
+    onset = None if loop.disturbance is None else loop.disturbance.since(clock)
+    since = np.full(1, -1.0) if onset is None else np.asarray(onset)
+    if spec.pours and onset is not None:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    if spec.windows and hasattr(reference, "windows"):
-        steps = [np.asarray(window[1]) for window in reference.windows(clock)]
+    windows = loop.reference.windows(clock) if spec.windows else None
+    if windows is not None:
+        steps = [np.asarray(window[1]) for window in windows]
         why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"
-        return why, [not np.any((np.asarray(s) != 0.0) & (since < 0.0)) for s in steps]
+        return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
     return "", [False] * ms.entries(measure, loop.plant)

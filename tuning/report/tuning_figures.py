@@ -42,7 +42,7 @@ def figures(result, runs=None):
     tanks = {
         limit.index: limit.value
         for limit in result.problem.limits
-        if limit.measure == "max_level" and limit.lane == 0
+        if limit.measure == "max_level" and limit.run == 0
     }
     limits = [
         tanks.get(i, np.asarray(result.tuned.loop.plant.rim)[i])

@@ -9,8 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import check_value, describe, get_value, is_real, shortened, split_index
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value, is_real, split_index
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -387,14 +387,10 @@ def _infeasible(case, values):
     """(N,) True where a plateau of the reference has no steady state within rims and pumps; None
     where the plant has no closed form.
     """
-    plant = case.loop.plant
-    if (
-        getattr(plant, "pipes", None) != ()
-        or plant.pumps != len(plant.outputs)
-        or not hasattr(case.loop.reference, "plateaus")
-    ):
+    plant, plateaus = case.loop.plant, case.loop.reference.plateaus(case.clock.duration)
+    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs) or plateaus is None:
         return None
-    plateaus = jnp.asarray(np.array(case.loop.reference.plateaus(case.clock.duration)))
+    plateaus = jnp.asarray(np.array(plateaus))
     count = len(next(iter(values.values())))
     size, found = min(count, RESTS), []
     # the last draw repeated past the end, so that every block is of one size
