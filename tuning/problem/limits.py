@@ -3,9 +3,12 @@
 Imported by `problem`, `search` and `uncertainty`.
 """
 
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
+
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -188,7 +191,7 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     if spec.pours and onset is not None:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    windows = loop.reference.windows(clock) if spec.windows else None
+    windows = cast(Any, loop.reference).windows(clock) if spec.windows else None
     if windows is not None:
         steps = [np.asarray(window[1]) for window in windows]
         why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"

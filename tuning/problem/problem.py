@@ -3,6 +3,9 @@
 Imported by `search`, and as `tuning.Problem`.
 """
 
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

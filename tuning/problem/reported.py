@@ -3,6 +3,9 @@
 Imported by `search` and by `jaxtank simulate`.
 """
 
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
+
 from typing import Any
 
 import numpy as np

@@ -3,6 +3,11 @@
 Imported by `problem`, `search` and `uncertainty`.
 """
 
+# jax's transformations have no complete types
+# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -33,6 +38,9 @@ FEWEST = 200
 
 Measures = dict[str, Any]
 """{name: array}."""
+
+Shape = tuple[Any, tuple[bool, ...], int]
+"""Structure of the loop, which leaves differ, number of runs."""
 
 
 def screening_clock(clock: Clock) -> Clock:
@@ -87,7 +95,7 @@ class Group(NamedTuple):
     keys: Any  # (runs,) or None
 
     @property
-    def shape(self) -> tuple[Any, tuple[bool, ...], int]:
+    def shape(self) -> Shape:
         """What the compiled functions are specialised to."""
         return self.structure, self.apart, len(self.runs)
 
@@ -163,8 +171,10 @@ def groups_of(runs: Sequence[ScenarioRun]) -> list[Group]:
     """Return the Groups of runs that share a compiled loop, in the order of their first run."""
     sorts: dict[Any, list[tuple[int, list[Any]]]] = {}
     for i, run in enumerate(runs):
+        leaves: list[Any]
+        structure: Any
         leaves, structure = jax.tree.flatten(run.case.loop)
-        sort = (structure, tuple(np.shape(v) for v in leaves), run.case.clock, run.key is None)
+        sort: Any = (structure, tuple(np.shape(v) for v in leaves), run.case.clock, run.key is None)
         sorts.setdefault(sort, []).append((i, leaves))
     found: list[Group] = []
     for (structure, _, clock, quiet), members in sorts.items():
@@ -222,35 +232,37 @@ def reverse_slopes_of(
     return _reverse(group.leaves, group.keys, group.shape, group.clock, tuple(names), order, theta)
 
 
-def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Any) -> Any:
+def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) -> Any:
     """Return function(loop, key) over the runs of a group; one run runs as it would alone."""
     structure, apart, count = shape
+
+    def one(leaves: Any, key: Any) -> Any:
+        return function(jax.tree.unflatten(structure, leaves), key)
+
     if count == 1:
-        one = jax.tree.unflatten(
-            structure,
-            leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)],
-        )
-        return jax.tree.map(lambda v: v[None], function(one, None if keys is None else keys[0]))
-    return jax.vmap(
-        lambda leaves, key: function(jax.tree.unflatten(structure, leaves), key),
-        in_axes=(tuple(0 if a else None for a in apart), None if keys is None else 0),
-        axis_size=count,
-    )(leaves, keys)
+        mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
+        found: Any = one(mine, None if keys is None else keys[0])
+        return jax.tree.map(_first_axis, found)
+    axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
+    return jax.vmap(one, in_axes=axes, axis_size=count)(leaves, keys)
+
+
+def _first_axis(value: Any) -> Any:
+    """Return an array with an axis for its one run in front."""
+    return value[None]
 
 
 @functools.partial(
     jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE
 )
 def _values(
-    leaves: Any, keys: Any, shape: Any, clock: Clock, names: tuple[str, ...], points: Any
+    leaves: Any, keys: Any, shape: Shape, clock: Clock, names: tuple[str, ...], points: Any
 ) -> Any:
     def at(values: Any) -> Any:
-        return _mapped(
-            lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key),
-            leaves,
-            keys,
-            shape,
-        )
+        def one(loop: ClosedLoop, key: Any) -> Any:
+            return lp.evaluate_and_flag(with_values(loop, values), clock, names, key)
+
+        return _mapped(one, leaves, keys, shape)
 
     return jax.vmap(at)(points)
 
@@ -263,7 +275,7 @@ def _values(
 def _slopes(
     leaves: Any,
     keys: Any,
-    shape: Any,
+    shape: Shape,
     clock: Clock,
     names: tuple[str, ...],
     order: tuple[str, ...],
@@ -271,21 +283,18 @@ def _slopes(
     squares: Any,
 ) -> Any:
     several = shape[-1] > 1
-    return _mapped(
-        lambda loop, key: sensitivities_compiled(
-            loop, clock, names, order, values, key, squares, several
-        ),
-        leaves,
-        keys,
-        shape,
-    )
+
+    def one(loop: ClosedLoop, key: Any) -> Any:
+        return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
+
+    return _mapped(one, leaves, keys, shape)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order"))
 def _reverse(
     leaves: Any,
     keys: Any,
-    shape: Any,
+    shape: Shape,
     clock: Clock,
     names: tuple[str, ...],
     order: tuple[str, ...],
@@ -293,12 +302,12 @@ def _reverse(
 ) -> Any:
     def one(loop: ClosedLoop, key: Any) -> Any:
         def run(theta: Any) -> Any:
-            measures = lp.evaluate_for_reverse(
-                with_values(loop, dict(zip(order, theta))), clock, names, key
-            )
+            here = with_values(loop, dict(zip(order, theta)))
+            measures: Any = lp.evaluate_for_reverse(here, clock, names, key)
             return measures, measures
 
-        slopes, measures = jax.jacrev(run, has_aux=True)(theta)
+        derivative: Any = jax.jacrev(run, has_aux=True)
+        slopes, measures = derivative(theta)
         return measures, slopes
 
     return _mapped(one, leaves, keys, shape)
