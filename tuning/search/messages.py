@@ -26,6 +26,9 @@ starts-agree                     how many searches ended at the answer
 permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on the validation set or on new plants
 limits-hold-out-of-sample        no limit was violated on new plants (`tune_robust`)
+scenario-bound                   bound of the violation probability (`tune_robust`)
+constraints-tightened            the search kept inside the limits (`back_off=`)
+support-scenarios                violations on new plants that were to be expected
 screened-at-true-step            screening points were unstable at the coarse step only
 non-finite-points                trial points gave non-finite numbers
 best-of-choices                  which discrete choice is best (`choices=`)

@@ -55,7 +55,7 @@ def fingerprint(case: Case, **what: Any) -> dict[str, Any]:
     >>> from jaxtank import presets
     >>> found = fingerprint(presets.find("cascaded/pi"), seed=0, limits=[("max_level", 30.0)])
     >>> found["case"], found["seed"], found["limits"]
-    ('pi', 0, [['max_level', 30.0]])
+    ('cascaded/pi', 0, [['max_level', 30.0]])
     """
     leaves, structure = jax.tree.flatten(case.loop)
     return {

@@ -12,9 +12,9 @@ from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from tuning.problem import problem as objective
 from tuning.problem.limits import Limit
-from tuning.problem.problem import Point, Problem
-from tuning.problem.scenarios import coarse_clock
+from tuning.problem.problem import ROOT, Point, Problem
 from tuning.problem.reported import run_measures
+from tuning.problem.scenarios import screening_clock
 from tuning.search.driver import Search
 from tuning.search.kkt import optimality
 from tuning.search.methods import METHODS
@@ -73,6 +73,11 @@ def test_the_answer_names_the_tank_with_an_active_limit_and_when(limited):
     # as setpoint 2 comes down to 10 cm and tank 3 has to carry tank 1
     assert 800 < tight["time_s"] < 840
     assert f"active limit: max_level of tank 3 at {tight['time_s']:.2f} s" in limited.message
+    assert tight.active and tight.multiplier == limited.optimality["multipliers"][tight.name] > 0
+    assert tight.before == limited.measures["before"]["max_level"][2] > tight.limit
+    assert sum(row.active for row in limited.constraints) == sum(
+        m.code == "limit-active" for m in limited.messages
+    )
     assert (
         "starting values violate a limit (max_level of tank 3" in limited.message
         and "tank 4" in limited.message
@@ -130,7 +135,7 @@ def test_the_true_step_decides_on_gains_that_only_the_coarse_step_makes_unstable
     step's 2/0.01 s is not.
     """
     problem = Problem(gouta("backstepping"))
-    coarse = coarse_clock(problem.clock)
+    coarse = screening_clock(problem.clock)
     assert coarse.dt == pytest.approx(0.1)
     at = lambda k: np.array([[float(problem.bounds[0].to_unit(k)), 0.3]])
     for k, unstable in ((5.0, False), (19.0, False), (21.0, True), (45.0, True)):
@@ -328,6 +333,47 @@ class Bowl:
 
 
 @pytest.mark.slow_for("start1-lbfgs")
+class PerfectFit(Bowl):
+    """A cost that is exactly 0 at (0.5, 0.5): sum of squares `inner` of two residuals.
+
+    "square": the cost is the root of `inner`, whose slope does not exist there; "cost": `inner`.
+    """
+
+    limits, limit_scales, objective = (), np.ones(0), {ROOT: 1.0}
+
+    def __init__(self, model):
+        self.model = model
+
+    def point(self, z):
+        jacobian = np.array([[1.0, 0.0], [2.0, 3.0]])
+        residual = jacobian @ (np.asarray(z) - 0.5)
+        inner, slope, normal = (
+            residual @ residual,
+            2 * jacobian.T @ residual,
+            2 * jacobian.T @ jacobian,
+        )
+        cost = inner
+        if self.model == "square":
+            cost = np.sqrt(inner)
+            slope = slope / (2 * cost) if cost > 0 else np.zeros(2)
+        return Point(z, cost, slope, normal, np.zeros(0), np.zeros((0, 2)), ())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("model", ["square", "cost"])
+@pytest.mark.parametrize("start", [(0.9, 0.1), (0.5, 0.5)])
+def test_trf_ends_at_an_objective_of_exactly_zero(model, start):
+    problem = PerfectFit(model)
+    first = problem.point(np.array([0.9, 0.1]))
+    search = Search(problem, first, lambda s: None)
+    assert METHODS["trf"](search, np.array(start), 60)
+    assert search.best.cost <= 1e-12 * first.cost
+    np.testing.assert_allclose(search.best.z, (0.5, 0.5), atol=1e-6)
+    # the point itself, where value, slope and every residual of the model are 0
+    assert problem.point(np.array([0.5, 0.5])).cost == 0.0
+    assert any(point.cost == 0.0 for point in search.memory.values()) == (start == (0.5, 0.5))
+
+
 @pytest.mark.parametrize("method", ["slsqp", "lbfgs", "adam"])
 @pytest.mark.parametrize("start", [(0.1, 0.9), (0.9, 0.1)])
 def test_methods_on_a_bowl_with_a_known_answer(method, start):
