@@ -1,15 +1,18 @@
 """Numbers that describe a run, accumulated in the time loop: memory does not grow with its length."""
 
-from jaxtank.measures.accumulators import Run
+from jaxtank.measures.accumulators import Accumulator, Run
 from jaxtank.measures.catalogue import (
     MEASURES,
     SQUARES,
     TIMES,
+    Measure,
     check_names,
     entries,
     needs,
     placed,
     read,
+    register,
+    reported,
     residual_weights,
     residuals,
     serves,
@@ -25,12 +28,16 @@ __all__ = [
     "MEASURES",
     "SQUARES",
     "TIMES",
+    "Accumulator",
+    "Measure",
     "Run",
     "check_names",
     "entries",
     "needs",
     "placed",
     "read",
+    "register",
+    "reported",
     "residual_weights",
     "residuals",
     "serves",

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.core.errors import unknown
+from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.kahan import totals
 from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.core.units import DEFAULT, local
@@ -348,11 +348,38 @@ SQUARES = tuple(m for m, spec in MEASURES.items() if spec.residual)
 """Measures that are sums of squares over the run."""
 
 
+def register(name, measure, accumulators=None):
+    """Add a measure of one's own, known by `name` wherever measures are named from then on.
+
+    Parameters
+    ----------
+    name : a name that no other measure has
+    measure : Measure
+    accumulators : {name: Accumulator}, what it needs besides ACCUMULATORS
+
+    Raises
+    ------
+    InputError
+        For a name that another measure or accumulator has.
+    """
+    for known, added in ((MEASURES, {name: measure}), (ACCUMULATORS, accumulators or {})):
+        for key, value in added.items():
+            if known.get(key, value) is not value:
+                raise InputError(f"{key!r} is taken: choose another name")
+        known.update(added)
+    return measure
+
+
 def check_names(names):
     """Raise InputError for a name that is no measure."""
     for name in names:
         if name not in MEASURES:
             raise unknown("measure", name, MEASURES)
+
+
+def reported():
+    """Return the names of the measures in a result: all but the times of others."""
+    return tuple(m for m in MEASURES if m not in TIMES.values())
 
 
 def placed(field):

@@ -4,7 +4,6 @@ does a hundredth of each.
 
 import dataclasses
 import functools
-import importlib
 import json
 import math
 import subprocess
@@ -31,6 +30,9 @@ from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps
+from tuning.uncertainty import feasibility
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import probabilities, spread_of
 
 DT = 0.01
 LONG = [100_000, pytest.param(10_000_000, marks=pytest.mark.slow)]
@@ -304,13 +306,12 @@ def test_memory_of_a_million_draws():
 
 def test_steady_states_are_looked_for_in_blocks(monkeypatch):
     """The same answer whatever the size of a block, one that does not divide the draws too."""
-    module = importlib.import_module("tuning.uncertainty.study")
     case = presets.find("gouta2015/backstepping")
-    draws = module.Draws(case.loop, module.spread_of(case))
-    values = draws.values(module.probabilities("random", draws.dimensions, 300, 0))
-    whole = module._infeasible(case, values)
-    monkeypatch.setattr(module, "RESTS", 128)
-    np.testing.assert_array_equal(module._infeasible(case, values), whole)
+    draws = Draws(case.loop, spread_of(case))
+    values = draws.values(probabilities("random", draws.dimensions, 300, 0))
+    whole = feasibility.infeasible(case, values)
+    monkeypatch.setattr(feasibility, "BLOCK", 128)
+    np.testing.assert_array_equal(feasibility.infeasible(case, values), whole)
     assert 0 < whole.sum() < 300
 
 

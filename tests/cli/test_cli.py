@@ -627,7 +627,8 @@ def test_what_is_set_holds_in_the_scenarios_of_the_case():
     cost = sum(w * float(np.sum(values[m])) for m, w in case.objective.items())
     assert said.json["scenarios"][0]["objective"]["before"] == pytest.approx(cost, rel=1e-9)
     assert (
-        "note: --set sensor.noise takes the place of the value of 1 scenario ('noise')" in said.err
+        "note: --set sensor.noise also replaces the value of sensor.noise in 1 scenario ('noise')"
+        in said.err
     )
 
 

@@ -5,6 +5,7 @@ import ast
 import dataclasses
 import json
 import re
+from html.parser import HTMLParser
 from pathlib import Path
 
 import jax
@@ -25,6 +26,7 @@ from jaxtank.observers import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.rig import components
 from tuning.cli.main import main
+from tuning.optimal_input.perfect_information import InputBound
 from tuning.search import messages
 from tuning.search.messages import messages_of
 from tuning.search.result import constraint_rows
@@ -109,7 +111,7 @@ def test_a_registered_controller_and_observer_are_read_and_written(own):
 
 
 def test_save_writes_the_rig_file_of_a_registered_controller(tuned, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.report.tuning_figures.figures", lambda *_: {})
+    monkeypatch.setattr("tuning.report.tuning.figures", lambda *_: {})
     tuned.save(tmp_path)
     controller = rig.load(tmp_path / "rig.toml").loop.controller
     assert isinstance(controller, Proportional)
@@ -357,7 +359,7 @@ def test_the_message_on_a_bound_names_value_unit_and_sensitivity(tuned):
 def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
     folder = Path(messages.__file__).parent
     found = set()
-    for path in [*folder.glob("*.py"), folder.parent / "report" / "tuning_figures.py"]:
+    for path in [*folder.glob("*.py"), folder.parent / "report" / "tuning.py"]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
                 found |= {
@@ -441,8 +443,95 @@ def test_a_checkpoint_and_its_former_name_are_one_folder(own, run):
 
 
 def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
-    options = {"measures": ("max_level",), "limits": {}, "fan": False, "lanes": 2}
+    options = {"measures": ("max_level",), "limits": {}, "fan": False, "batch": 2}
     spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
     tuning.ensemble(own, spread, 4, checkpoint=tmp_path, shard=(1, 2), **options)
     with pytest.raises(InputError, match="1 of 2 batches are missing"):
         tuning.ensemble(own, spread, 4, checkpoint=tmp_path, resume=True, merge=True, **options)
+
+
+class Page(HTMLParser):
+    """The tags and the words of a fragment of HTML."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.text = [], []
+        self.feed(text)
+        self.words = set(" ".join(self.text).split())
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+NASTY = "a<script>alert(1)</script>\"'&b"
+
+
+@pytest.fixture(scope="module")
+def results(own, tuned):
+    """{name: result of each kind}, of a case whose name is hostile, under a class of one's own."""
+    with pytest.MonkeyPatch.context() as patch:  # a class that has no name in a file
+        patch.setattr(components, "REGISTERED", {})
+        for name in ("LAWS", "OBSERVERS"):
+            table = getattr(components, name)
+            left = {k: v for k, v in table.items() if v not in (Proportional, Offset)}
+            patch.setattr(components, name, type(table)(left))
+        case = own.replace(name=NASTY)
+        spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
+        t = np.arange(0.0, 60.0, 2.0)
+        level = 5.0 + 2.0 * np.sin(t / 10.0)
+        data = tuning.log(t=t, u=3.0 + np.cos(t), y=np.stack([level, level], axis=1))
+        free = {"plant.pump_gain": (0.1, 20.0)}
+        cell = {"name": NASTY, "value": 1.0, "limit": 2.0, "margin": 1.0, "time_s": None}
+        numbers = dict(cost=1.0, measures={}, u=np.zeros((3, 1)), interval=2.0, slope=0.0)
+        counts = dict(iterations=1, gradients=1, simulations=1, wall_s=0.1, interrupted=False)
+        yield {
+            "tuning": tuned.replace(case=case, tuned=case),
+            "ensemble": tuning.ensemble(case, spread, 4, measures=("max_level",), limits={}),
+            "sensitivity": tuning.sensitivity(case, spread, measures=["max_level"]),
+            "identification": tuning.identify(case, [data], free, starts=1, iterations=2),
+            "certificate": tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
+            "bound": InputBound(
+                case=case,
+                objective={NASTY: 1.0},
+                constraints=[cell],
+                holds=True,
+                closed_loop=None,
+                source="search",
+                grids=[],
+                **numbers,
+                **counts,
+            ),
+        }
+
+
+KINDS = ("tuning", "ensemble", "sensitivity", "identification", "certificate", "bound")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, kind):
+    result = results[kind]
+    page = Page(result._repr_html_())
+    assert "table" in page.tags and not {"script", "b"} & set(page.tags)
+    rule = {w for w in str(result).split() if not w.strip("-")}  # under the heads of a table
+    joined = " ".join(page.words)
+    for word in set(str(result).split()) - rule - {":"}:
+        assert word in page.words or word.rstrip(":") in page.words or word in joined, word
+    assert ("alert(1)" in joined) == (kind != "certificate")
+
+
+@pytest.mark.parametrize("kind", ("tuning", "identification"))
+def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_and_says_so(
+    results, kind, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(f"tuning.report.{kind}.figures", lambda *_: {})
+    with pytest.warns(UserWarning, match=r"rig\.toml is not written .*no name in a rig file"):
+        names = {path.name for path in results[kind].save(tmp_path)}
+    assert {"result.json", "report.html"} <= names and "rig.toml" not in names
+    assert names == {path.name for path in tmp_path.iterdir()}
+    assert (
+        "rig.toml is not written" in json.loads((tmp_path / "result.json").read_text())["message"]
+    )
+    assert "rig.toml is not written" in (tmp_path / "report.html").read_text()

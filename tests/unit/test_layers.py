@@ -10,15 +10,9 @@ from helpers import RANK
 import jaxtank
 import tuning
 
-# A result opens its report when .plot() or .save() is called; `python -m jaxtank` is the command.
-LAZY = {
-    ("tuning.identification.fit", "tuning.report.identification"),
-    ("tuning.search.result", "tuning.report.tuning"),
-    ("tuning.search.result", "tuning.report.tuning_figures"),
-    ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),
-    ("tuning.uncertainty.study", "tuning.report.uncertainty"),
-    ("jaxtank.__main__", "tuning.cli.main"),
-}
+# A result displays itself as HTML (and opens the module of its report by name); `python -m jaxtank`
+# is the command.
+LAZY = {("tuning.problem.result", "tuning.report.html"), ("jaxtank.__main__", "tuning.cli.main")}
 DRAWING = {"jaxtank.plots", "tuning.report", "tuning.cli"}  # folders that may import matplotlib
 
 

@@ -142,7 +142,7 @@ def test_commands_parse():
     assert len(COMMANDS) >= 30 and len(inline) >= 10
     for given in [*COMMANDS, *inline]:
         args, rest = parser().parse_known_args(given)
-        assert not rest and args.command in main.COMMANDS
+        assert not rest and callable(args.run)
 
 
 @pytest.mark.slow

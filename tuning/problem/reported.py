@@ -17,9 +17,6 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.problem import scenarios as sc
 from tuning.problem.problem import Problem
 
-REPORTED = tuple(m for m in ms.MEASURES if m not in ms.TIMES.values())
-"""Measures in a result, before and after; those of TIMES say when a level was reached."""
-
 
 def run_measures(loop: ClosedLoop, clock: Clock, key: Any) -> dict[str, np.ndarray]:
     """Return {measure: value} of everything that is reported of one run.
@@ -44,4 +41,4 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
 
 def _names(loop: ClosedLoop) -> tuple[str, ...]:
     """Return the measures that are reported of a loop, and when levels were reached."""
-    return (*(m for m in REPORTED if ms.serves(m, loop)), *ms.TIMES.values())
+    return (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.TIMES.values())

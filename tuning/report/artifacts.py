@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_together
 from jaxtank.core.units import DEFAULT
@@ -16,7 +17,7 @@ from tuning.report.tables import dumps
 
 
 def trajectory_csv(run, rig_units=DEFAULT):
-    """A trajectory as CSV with units in the header; estimates of disturbances where there are any."""
+    """Return a trajectory as CSV with units; disturbance estimates where there are any."""
     known = bool(np.asarray(run.d_hat).any())
     kept = {
         n: v
@@ -27,6 +28,24 @@ def trajectory_csv(run, rig_units=DEFAULT):
     out.write(",".join(kept) + "\n")
     np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
     return out.getvalue()
+
+
+def rig_text(case):
+    """Return (text of the rig file of a case, None), or (None, why there is none).
+
+    A plant or controller class that is not registered has no name in a rig file.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> text, why = rig_text(presets.find("cascaded/pi"))
+    >>> 'case = "cascaded/pi"' in text, why
+    (True, None)
+    """
+    try:
+        return rig.dump(case), None
+    except InputError as error:
+        return None, f"rig.toml is not written ({error})"
 
 
 def run_for_people(case, key=None, rows=3000):

@@ -8,11 +8,12 @@ import warnings
 
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.step_size import StepWarning, check_run, doubts
-from tuning.problem.reported import REPORTED, table_of
+from tuning.problem.reported import table_of
 
 CHECKED_RUNS = 16
 """Scenarios that are run, at most, to look for a step that is too long."""
@@ -98,7 +99,7 @@ def unexercised(problem, search, first):
             np.allclose(row[m], old[m], rtol=1e-9, atol=1e-12, equal_nan=True)
             for table in tables
             for row, old in zip(table, here)
-            for m in REPORTED
+            for m in ms.reported()
             if m in row
         )
 

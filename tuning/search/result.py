@@ -5,7 +5,6 @@ Words about it are made in `messages`, tables and files in `report`.
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from jaxtank.core.errors import unknown
 from jaxtank.plants.base import Plant
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Problem
+from tuning.problem.result import Result
 from tuning.problem.status import Status
 
 ACTIVE = 1e-3
@@ -133,8 +133,8 @@ class ConstraintRow:
         return dataclasses.asdict(self)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TuningResult:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class TuningResult(Result):
     """What `tune` found: print it for tables, `.plot()` for pictures, `.save(dir)` for files.
 
     Parameters
@@ -170,6 +170,8 @@ class TuningResult:
     >>> result = tuning.tune(presets.find("cascaded/pi"), starts=2)  # doctest: +SKIP
     >>> result["controller.Kc[0]"].after, result.status  # doctest: +SKIP
     """
+
+    REPORT = "tuning.report.tuning"
 
     case: Any
     tuned: Any
@@ -219,35 +221,9 @@ class TuningResult:
     def __iter__(self) -> Iterator[str]:
         return iter(self.parameters)
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the JSON object of `jaxtank tune --json`."""
-        from tuning.report.tuning import json_of
-
-        return json_of(self)
-
     def replace(self, **changes: Any) -> "TuningResult":
         """Return a copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, rig.toml, trajectory.csv, pictures and report.html to a folder.
-
-        command : the command line that the report names, if any. Returns the paths.
-        """
-        from tuning.report.tuning_figures import save
-
-        return save(self, folder, command)
-
-    def plot(self) -> dict[str, Any]:
-        """Return matplotlib figures {name: figure}: responses, convergence, landscape and more."""
-        from tuning.report.tuning_figures import figures
-
-        return figures(self)
-
-    def __repr__(self) -> str:
-        from tuning.report.tuning import text
-
-        return text(self)
 
 
 def constraint_rows(

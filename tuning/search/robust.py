@@ -15,11 +15,14 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.problem.problem import Problem
+from tuning.problem.result import Shown
 from tuning.search.result import Message, TuningResult
 from tuning.search.tuner import tune
-from tuning.uncertainty.distributions import Draws, stated
+from tuning.uncertainty.distributions import stated
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
-from tuning.uncertainty.study import Ensemble, ensemble
+from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 
 CONFIDENCE = 1e-6
@@ -49,6 +52,21 @@ class Certificate(NamedTuple):
     fresh: int  # new plants run afterwards
     broken: int  # of those, how many violated a limit
     interval95: list  # Clopper and Pearson
+
+    _repr_html_ = Shown._repr_html_
+    _lines = Shown._lines
+
+    def __str__(self):
+        low, high = self.interval95
+        rows = {
+            "plants of the search": self.scenarios,
+            "support scenarios": self.support,
+            "scenario bound": f"{self.bound:.2g} (confidence 1 - {CONFIDENCE:g})",
+            "new plants": self.fresh,
+            "new plants that violate a limit": self.broken,
+            "probability of violating a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
+        }
+        return "\n".join(f"{name}: {value}" for name, value in rows.items())
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):

@@ -31,7 +31,7 @@ class BatchStore:
     ----------
     folder : where the files are, or will be; shards of one ensemble may share it.
     problem : the `fingerprint` of the ensemble, with "measures", a list of names.
-    notes : what the manifest says besides, for `merge`; it does not decide a number.
+    origin : what the manifest holds besides, for `merge`; it does not decide a number.
     resume : True to continue with the batches that are there.
     shared : True where other shards write there, too.
     begin : whether resume may begin one of which a kill left nothing but its lock.
@@ -55,7 +55,7 @@ class BatchStore:
         self,
         folder: Folder,
         problem: Mapping[str, Any],
-        notes: Any = None,
+        origin: Any = None,
         *,
         resume: bool = False,
         shared: bool = False,
@@ -66,7 +66,7 @@ class BatchStore:
         path = self.folder / MANIFEST
         if path.exists():
             theirs = read_manifest(self.folder)
-            theirs.pop("notes", None)
+            theirs.pop("origin", None)
             self.checkpoint.check_same(theirs)
             if not (resume or shared) and any(self.folder.glob("part-*.npz")):
                 raise InputError(
@@ -76,7 +76,9 @@ class BatchStore:
             return
         if resume and not (begin and self.checkpoint.begun()):
             self.checkpoint.refuse_empty(MANIFEST)
-        self._write(path, json.dumps({**self.checkpoint.problem, "notes": notes}, indent=1) + "\n")
+        self._write(
+            path, json.dumps({**self.checkpoint.problem, "origin": origin}, indent=1) + "\n"
+        )
 
     def path(self, k: int) -> Path:
         """Return the file of batch k."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxtank.core.tree import get_value, with_values
 from tuning.problem import scenarios as sc
-from tuning.uncertainty.distributions import Correlated, Draws
+from tuning.uncertainty.distributions import Correlated
+from tuning.uncertainty.draws import Draws
 
 SEED_OFFSET = 1_000_003
 """Offset of the seeds of the validation set from those of the search."""

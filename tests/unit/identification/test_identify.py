@@ -25,7 +25,7 @@ from tuning.identification.design import candidates, compare_experiments, settle
 from tuning.identification.parametrisation import coordinates
 from tuning.identification.proposal import with_pi
 from tuning.problem.bounds import bounds
-from tuning.uncertainty.distributions import Draws
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
 
 recorded = pytest.mark.skipif(

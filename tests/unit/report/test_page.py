@@ -408,6 +408,47 @@ def test_a_complaint_would_be_heard(tmp_path):
     assert seen(tmp_path / "bad.html", tmp_path / "shot.png")[0]
 
 
+def probed(page, expression, width, folder):
+    """The page as the browser understood it, its title replaced by the value of `expression`."""
+    script = f"<script>document.title = {expression}</script></body>"
+    (folder / "probe.html").write_text(page.replace("</body>", script), encoding="utf-8")
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+    ]
+    flags += [
+        f"--window-size={width},1000",
+        f"--user-data-dir={folder / 'profile'}",
+        "--virtual-time-budget=2000",
+        "--dump-dom",
+    ]
+    options = {"capture_output": True, "text": True, "timeout": 120, "check": True}
+    return subprocess.run([BROWSER, *flags, (folder / "probe.html").as_uri()], **options).stdout
+
+
+@browser
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_fit_a_phone_and_scroll_once_they_are_tapped(folders, tmp_path, kind):
+    """None is wider than the text; an enlarged one is wider than its box, which scrolls."""
+    page = (folders[kind] / "report.html").read_text(encoding="utf-8")
+    probe = """
+        JSON.stringify([...document.querySelectorAll('figure > div')].map(box => {
+            const svg = box.querySelector('svg'), column = document.querySelector('main');
+            const right = e => e.getBoundingClientRect().right;
+            const fits = right(svg) <= right(column) + 0.5 && svg.clientWidth > 300;
+            box.focus();
+            const wide = box.parentElement.className === 'wide';
+            const scrolls = box.scrollWidth > box.clientWidth + 100;
+            return fits && scrolls === wide && getComputedStyle(box).overflowX === 'auto';
+        }))"""
+    dom = probed(page, probe, 390, tmp_path)
+    found = json.loads(dom[dom.index("<title>") + 7 : dom.index("</title>")])
+    assert len(found) == page.count("<figure ") and all(found), found
+
+
 @browser
 @pytest.mark.parametrize("width", [1400, 900, 390])
 def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
@@ -434,24 +475,7 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
         "Math.max(...[...document.querySelectorAll('.scroll, main')].map(e => e.scrollWidth -"
         " e.clientWidth))"
     )
-    (tmp_path / "probe.html").write_text(
-        whole.replace("</body>", f"<script>document.title = 'cut ' + {probe}</script></body>")
-    )
-    flags = [
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-dev-shm-usage",
-        "--disable-background-networking",
-    ]
-    flags += [
-        f"--window-size={width},1000",
-        f"--user-data-dir={tmp_path / 'profile'}",
-        "--virtual-time-budget=2000",
-        "--dump-dom",
-    ]
-    options = {"capture_output": True, "text": True, "timeout": 120, "check": True}
-    dom = subprocess.run([BROWSER, *flags, (tmp_path / "probe.html").as_uri()], **options).stdout
+    dom = probed(whole, f"'cut ' + {probe}", width, tmp_path)
     assert "<title>cut 0</title>" in dom, dom[dom.index("<title>") :][:60]
 
 

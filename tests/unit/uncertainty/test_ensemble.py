@@ -23,13 +23,14 @@ from jaxtank.presets import Scenario
 from tuning.search import robust
 from tuning.storage import batch_store
 from tuning.uncertainty import manifest, validation
-from tuning.uncertainty.distributions import Draws, parse, stated
+from tuning.uncertainty.distributions import parse, stated
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
 from tuning.uncertainty.sensitivity_study import what_varies
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-OPTIONS = {"samples": 50, "key": 3, "lanes": 16, "fan": False}
+OPTIONS = {"samples": 50, "key": 3, "batch": 16, "fan": False}
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +130,7 @@ if process >= 0:
     jax.distributed.initialize(sys.argv[4], 2, process)
 case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02})
 two = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-found = tuning.ensemble(case, two, samples=50, key=3, lanes=16, fan=False, devices=devices)
+found = tuning.ensemble(case, two, samples=50, key=3, batch=16, fan=False, devices=devices)
 np.savez(folder, **found.measures)
 """
 
@@ -173,11 +174,11 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
     path = tmp_path / "manifest.json"
     said = json.loads(path.read_text())
     for change, words in (
-        ({"notes": None}, "does not say"),
-        ({"notes": {"rig": None, "limits": {}}}, "no rig file describes"),
-        ({"notes": {"rig": "x = ", "limits": {}}}, "is not TOML"),
+        ({"origin": None}, "does not say"),
+        ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
+        ({"origin": {"rig": "x = ", "limits": {}}}, "is not TOML"),
         ({"samples": "50"}, "does not say"),
-        ({"lanes": 0}, "not one of this program"),
+        ({"batch": 0}, "not one of this program"),
         ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
         (
             {
@@ -293,7 +294,7 @@ def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
     """Whatever was done to it: a number, another batch in its place, its shape, or what it is said
     to be of.
     """
-    options = {"samples": 40, "lanes": 16, "key": 5, "measures": ("max_level",), "fan": False}
+    options = {"samples": 40, "batch": 16, "key": 5, "measures": ("max_level",), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
     paths = sorted(tmp_path.glob("part-*.npz"))
@@ -338,11 +339,11 @@ FORGED = {
 @pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
 def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
     """Whoever has the program can seal a batch: what it holds is looked at, too."""
-    options = {"samples": 8, "lanes": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
+    options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
     problem = batch_store.read_manifest(tmp_path)
-    store = batch_store.BatchStore(tmp_path, problem | {"notes": None}, resume=True)
+    store = batch_store.BatchStore(tmp_path, problem | {"origin": None}, resume=True)
     with np.load(store.path(1)) as table:
         arrays = {n: table[n] for n in table.files if n != "seal"}
     store.put(1, arrays | {name: forged(arrays[name])})
@@ -353,7 +354,7 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
 @pytest.mark.parametrize("measures", [[[[]]], [None], [{}]])
 def test_a_manifest_with_measures_that_are_no_names_is_refused(case, measures, tmp_path):
     tuning.ensemble(
-        case, folder=tmp_path, shard=(1, 2), samples=8, lanes=4, measures=("max_level",), fan=False
+        case, folder=tmp_path, shard=(1, 2), samples=8, batch=4, measures=("max_level",), fan=False
     )
     altered = batch_store.read_manifest(tmp_path) | {"measures": measures}
     (tmp_path / "manifest.json").write_text(json.dumps(altered))
@@ -418,7 +419,7 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
     assert all(v["count"] >= bad.sum() for v in found.violations())
     assert np.all(
         np.isfinite(found.summary()["rms_error"]["mean"])
-    ) and f"{bad.sum()} runs left the numbers" in repr(found)
+    ) and f"{bad.sum()} runs diverged" in repr(found)
 
 
 def test_plateaus_without_a_steady_state_are_counted(gouta):
@@ -840,17 +841,17 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
     }
 
 
-def test_distributions_are_told_in_words():
+def test_distributions_are_put_into_words():
     from tuning import Correlated, Normal, Uniform
-    from tuning.report.uncertainty import _words
+    from tuning.report.uncertainty import in_words
 
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
-    assert _words(Uniform(relative=0.1)) == "+-10 % (even)"
+    assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"
     assert (
-        _words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (even, all entries together)"
+        in_words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (uniform, all entries together)"
     )
-    assert _words(Normal(relative=0.05)) == "5 % sd (normal, cut at 3 sd)"
-    assert _words(pair) == "2 of them together, with a covariance"
+    assert in_words(Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
+    assert in_words(pair) == "2 parameters, correlated, with a covariance"
 
 
 def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain(case):

@@ -191,8 +191,8 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
     )
     (column,) = study.columns
     assert study.runs == len(x) == 32 * (D + 2)
-    np.testing.assert_allclose(column.felt["first"], other["S1"], atol=1e-9)
-    np.testing.assert_allclose(column.felt["total"], other["ST"], atol=1e-9)
+    np.testing.assert_allclose(column.effects["first"], other["S1"], atol=1e-9)
+    np.testing.assert_allclose(column.effects["total"], other["ST"], atol=1e-9)
 
     points = indices.morris_points(D, 8, seed=9)
     y = at_cube(points.reshape(-1, D))
@@ -201,7 +201,7 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
         case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
     ).columns
     for name in ("mu", "mu_star", "sigma"):
-        np.testing.assert_allclose(column.felt[name], np.array(other[name], dtype=float), atol=1e-9)
+        np.testing.assert_allclose(column.effects[name], np.array(other[name], dtype=float), atol=1e-9)
     own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
     assert column.nominal == pytest.approx(own, rel=1e-12)
 
@@ -252,17 +252,17 @@ def test_local_against_central_differences(case, monkeypatch):
             for s in (step, -step)
         ]
         want = np.concatenate([np.ravel(ends[0][m] - ends[1][m]) / (2 * step) for m in names])
-        got = np.array([c.felt["effect"][i] for c in study.columns])
+        got = np.array([c.effects["effect"][i] for c in study.columns])
         np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
         seen += int((np.abs(got) > 1e-3).sum())
     assert seen > 15
     column = study.columns[0]
-    assert column.felt["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.felt["effect"][0])
-    assert column.felt["elasticity"][0] == pytest.approx(
-        column.felt["effect"][0] / 0.05 / column.nominal
+    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.effects["effect"][0])
+    assert column.effects["elasticity"][0] == pytest.approx(
+        column.effects["effect"][0] / 0.05 / column.nominal
     )
-    assert np.isnan(column.felt["derivative"][2])
-    sizes = np.abs(column.felt["effect"])[study.order(column)]
+    assert np.isnan(column.effects["derivative"][2])
+    sizes = np.abs(column.effects["effect"])[study.order(column)]
     assert (np.diff(sizes) <= 0).all()
     shown = study.to_json()["parameters"]
     assert (
@@ -283,7 +283,7 @@ def test_batches_and_seeds(case):
     assert told[-1] == (96, 96)
     other = sensitivity(case, VARIED, seed=3, batch=7, **options)
     for a, b in zip(first.columns, other.columns):
-        np.testing.assert_allclose(a.felt["total"], b.felt["total"], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(a.effects["total"], b.effects["total"], rtol=1e-9, atol=1e-12)
     again, different = (
         sensitivity(case, VARIED, seed=3, **options),
         sensitivity(case, VARIED, seed=4, **options),
@@ -294,9 +294,9 @@ def test_batches_and_seeds(case):
         "max_level of tank 1",
     ]
     for a, b, c in zip(first.columns, again.columns, different.columns):
-        for name, value in a.felt.items():
-            np.testing.assert_array_equal(value, b.felt[name])
-        assert not np.array_equal(a.felt["total"], c.felt["total"])
+        for name, value in a.effects.items():
+            np.testing.assert_array_equal(value, b.effects[name])
+        assert not np.array_equal(a.effects["total"], c.effects["total"])
 
 
 def test_noise_is_the_same_in_every_run(case):
@@ -308,7 +308,7 @@ def test_noise_is_the_same_in_every_run(case):
     (column,) = sensitivity(
         noisy, varied, method="morris", samples=4, seed=6, measures="rms_error_total"
     ).columns
-    assert not column.felt["mu_star"][:4].any() and column.felt["mu_star"][4] > 0
+    assert not column.effects["mu_star"][:4].any() and column.effects["mu_star"][4] > 0
     own = jaxtank.evaluate(noisy.loop, noisy.clock, "rms_error_total", jax.random.key(6))[
         "rms_error_total"
     ]
@@ -321,7 +321,7 @@ def test_noise_may_vary_from_none(case):
     for column in sensitivity(
         case, varied, method="morris", samples=4, measures="input_travel"
     ).columns:
-        assert column.felt["mu"][0] > 0 and column.felt["mu"][0] == column.felt["mu_star"][0]
+        assert column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
 
 
 def test_runs_that_fail_are_counted_and_told(case):
@@ -344,7 +344,7 @@ def test_runs_that_fail_are_counted_and_told(case):
     said = study.to_json()
     assert said[
         "failed"
-    ] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
+    ] == count and f"{count} of {study.runs} runs diverged" in " ".join(said["notes"])
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
@@ -381,7 +381,7 @@ def test_estimators_leave_out_what_is_not_finite():
         ({"method": "sobol", "samples": True}, "samples = True"),
         ({"measures": "rms_eror"}, "nearest: rms_error"),
         ({"measures": "settling_time"}, "has no derivative"),
-        ({"measures": "recovery_time", "method": "sobol"}, "means nothing"),
+        ({"measures": "recovery_time", "method": "sobol"}, "is undefined for"),
         ({"spread": 1.5}, "spread = 1.5"),
         ({"spread": float("nan")}, "spread = nan"),
         ({"spread": 0.1, "distributions": VARIED}, "give one of them"),
@@ -515,7 +515,7 @@ jax.config.update("jax_num_cpu_devices", 3)
 case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0})
 for devices in (1, 3):
     found = tuning.sensitivity(case, method="morris", samples=6, batch=8, devices=devices, progress=lambda *done: print(*done))
-    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.felt.values() if hasattr(v, "tolist")])
+    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")])
 """
 
 
