@@ -37,7 +37,7 @@ COMMANDS = {
         "plant.drain[1]=0.02:0.08"],
     ],
 }  # fmt: skip
-AFRESH = re.compile(r"no evaluations\.jsonl|no ensemble to go on with|had ended")
+AFRESH = re.compile(r"holds no checkpoint to continue|had ended")
 PATIENCE = 300.0  # s
 
 

@@ -54,7 +54,7 @@ def _level_limits(result):
     limits = {
         limit.index: limit.value
         for limit in result.problem.limits
-        if limit.measure == "max_level" and limit.lane == 0
+        if limit.measure == "max_level" and limit.run == 0
     }
     rims = np.asarray(result.tuned.loop.plant.rim)
     return [limits.get(i, rims[i]) for i in range(result.tuned.loop.plant.tanks)]
@@ -172,8 +172,13 @@ def _contours(ax, result, unit):
     """The objective over the two parameters that it is most sensitive to, the others as tuned."""
     from jaxtank.plots import responses
 
+<<<<<<< HEAD
     problem, tuned, start = result.problem, _unit_values(result), result.problem.start()
     effect = [-(p["felt_percent"] or 0.0) for p in result.parameters.values()]
+=======
+    problem, after, before = result.problem, _unit_values(result), result.problem.start()
+    effect = [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()]
+>>>>>>> w5
     pair = sorted(np.argsort(effect, kind="stable")[:2])
     side = np.linspace(0.0, 1.0, 24)
     across, up = np.meshgrid(side, side)
