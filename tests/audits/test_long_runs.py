@@ -18,7 +18,7 @@ import jaxtank
 import tuning
 from jaxtank import presets
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.tree import component
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -189,7 +189,7 @@ def noisy(reference=None):
     """
     case = presets.find("gouta2015/backstepping-ff")
     loop, dt = case.loop, case.clock.dt
-    late = [PIECE * dt - 2.0, PIECE * dt + 3.0]
+    late = [CHUNK * dt - 2.0, CHUNK * dt + 3.0]
     return dataclasses.replace(
         loop,
         reference=reference
@@ -203,20 +203,20 @@ def noisy(reference=None):
     )
 
 
-@pytest.mark.parametrize("rest", [0, 1000])
-def test_a_run_in_pieces_is_the_run(rest):
-    """Longer runs are made in pieces of PIECE samples: measures against the trajectory of the same
+@pytest.mark.parametrize("rest", [pytest.param(0, marks=pytest.mark.slow), 1000])
+def test_a_run_in_chunks_equals_the_run_in_one(rest):
+    """Longer runs are made in chunks of CHUNK samples: measures against the trajectory of the same
     run, made in one.
     """
-    loop, long = noisy(), Clock(dt=0.01, duration=(PIECE * (1 if rest else 2) + rest - 1) * 0.01)
+    loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK * (1 if rest else 2) + rest - 1) * 0.01)
     key = jax.random.key(3)
-    assert is_pointwise(loop) and long.samples > PIECE
+    assert is_pointwise(loop) and long.samples > CHUNK
     found = jaxtank.evaluate(
         loop, long, ["ise", "max_level", "input_travel", "rms_input", "recovery_time"], key
     )
     run = jaxtank.simulate(loop, long, key)
     e, u = np.asarray(run.e), np.asarray(run.u)
-    assert np.ptp(np.asarray(run.r)[PIECE:]) > 0.5  # something happens in the second piece
+    assert np.ptp(np.asarray(run.r)[CHUNK:]) > 0.5  # something happens in the second piece
     np.testing.assert_allclose(found["ise"], (e**2).sum(axis=0) * 0.01, rtol=1e-9)
     np.testing.assert_allclose(found["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-9)
     np.testing.assert_allclose(
@@ -226,9 +226,9 @@ def test_a_run_in_pieces_is_the_run(rest):
 
 
 @pytest.mark.slow
-def test_slopes_through_pieces():
-    """Forward, in pieces of PIECE samples, against reverse, whose pieces are of another kind."""
-    loop, long = noisy(), Clock(dt=0.01, duration=(PIECE + 999) * 0.01)
+def test_slopes_through_chunks():
+    """Forward, in chunks of CHUNK samples, against reverse, whose pieces are of another kind."""
+    loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK + 999) * 0.01)
 
     def cost(evaluate, k):
         return evaluate(

@@ -537,6 +537,8 @@ def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
         "--quiet",
         "--iterations",
         "20",
+        "--validation",
+        "0",
     )
     assert said.code in (0, 3) and said.err == "", said.err
     found = said.json
@@ -599,6 +601,7 @@ NOISY = (
 NOISY += ("--set", "clock.duration=60", "--set", "sensor.noise=0.005")
 
 
+@pytest.mark.slow
 def test_what_is_set_holds_in_the_scenarios_of_the_case():
     said = say(*NOISY, "--json")
     own = {"clock.duration": 60.0, "sensor.noise": 0.005}
@@ -701,6 +704,8 @@ def test_too_few_iterations_end_with_3():
         "1",
         "--iterations",
         "1",
+        "--validation",
+        "0",
         "--json",
         "--quiet",
     )
@@ -1200,7 +1205,7 @@ def test_uncertainty_in_shards_is_that_of_one_run(here):
     for picture in (here / "one").glob("*.png"):
         assert_picture(picture)
     said = say("merge", CASE, *SHORT, *DRAWS, "--out", "two")
-    assert said.code == 2 and "no ensemble" in said.err
+    assert said.code == 2 and "no checkpoint to continue" in said.err
     done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "two", "--shard", "1/1")
     joined = done("merge", CASE, *SHORT, *DRAWS, "--out", "two", "--quiet", "--json").json
     assert joined | {"wall_s": 0} == one | {"wall_s": 0}

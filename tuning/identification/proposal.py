@@ -12,11 +12,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
-from jaxtank.analysis.steady_state import linearise
+from jaxtank.analysis.linear_model import linearise
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
-from jaxtank.rig.components import law_of
+from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 
@@ -75,7 +75,7 @@ def with_pi(case, inputs):
     table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
         {} if moving else {"bias": inputs.tolist()}
     )
-    controller = law_of(table, plant, start, loop.actuator.initial)
+    controller = controller_of(table, plant, start, loop.actuator.initial)
     free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
     free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
     free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}

@@ -1361,7 +1361,22 @@ def test_the_cascaded_tanks(cascaded):
     assert np.sqrt(np.mean((told - y) ** 2)) == pytest.approx(cascaded.quality["rmse"][0], rel=1e-9)
 
 
-def test_one_parameter_that_no_reading_feels_is_named_and_what_to_do_is_said(tmp_path):
+@pytest.mark.parametrize(
+    "free, advice",
+    [
+        pytest.param(
+            [],
+            "with --free NAME=LOW:HIGH what to estimate (all but plant.caught[0])",
+            marks=pytest.mark.slow,
+        ),
+        (
+            ["--free", "plant.pump_gain[0]=0.01:0.1", "--free", "plant.caught[0]=0:1"],
+            "leave plant.caught[0] out of --free",
+        ),
+    ],
+    ids=["default", "named"],
+)
+def test_a_parameter_that_no_reading_depends_on_is_named_with_a_remedy(free, advice, tmp_path):
     """Below the rims nothing is caught of an overflow."""
     case = presets.find("cascaded/pi")
     run = jaxtank.simulate(case.loop, case.clock, save_every=1)
@@ -1376,18 +1391,8 @@ def test_one_parameter_that_no_reading_feels_is_named_and_what_to_do_is_said(tmp
     )
     words = ["identify", "cascaded/pi", "--data", str(path), "--starts", "1", "--quiet"]
     words += ["--column", "t=t [s]", "--column", "pump1=pump1 [V]", "--column", "h2=h2 [V]"]
-    for free, advice in (
-        ([], "with --free NAME=LOW:HIGH what to estimate (all but plant.caught[0])"),
-        (
-            ["--free", "plant.pump_gain[0]=0.01:0.1", "--free", "plant.caught[0]=0:1"],
-            "leave plant.caught[0] out of --free",
-        ),
-    ):
-        code, said, told = command(*words, *free)
-        assert code == 5 and told.count("\n") == 1 and advice in told
-        assert "not identifiable from these data: plant.caught[0]: no rig is written" in told
-        assert (
-            "plant.caught[0] is not identifiable: " in " ".join(said.split())
-            and "What would identify it:" in said
-        )
-        assert "separately" not in told + said
+    code, said, told = command(*words, *free)
+    assert code == 5 and told.count("\n") == 1 and advice in told
+    assert "not identifiable from these data: plant.caught[0]: no rig is written" in told
+    assert "plant.caught[0] is not identifiable: " in " ".join(said.split())
+    assert "What would identify it:" in said and "separately" not in told + said

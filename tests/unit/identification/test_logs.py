@@ -246,7 +246,7 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
     """With its comment signs taken away the example is a table for a file of such columns."""
     code, out, _ = command("init", "mirakhorli/sfc")
     assert code == 0
-    whole, example = out.split("# Which column", 1)
+    whole, example = out.split("# Columns of the experiment data", 1)
     table = "\n".join(line.removeprefix("#") for line in example.splitlines()[1:])
     (tmp_path / "rig.toml").write_text(whole + table + "\n")
     columns = rig.load(tmp_path / "rig.toml").log

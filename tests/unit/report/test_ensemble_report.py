@@ -41,7 +41,11 @@ def test_a_single_draw_is_told_without_a_spread(case):
 
 
 @pytest.mark.parametrize(
-    "failed, words", [([True, False], "1 run finite: a standard deviation"), ([True, True], "0 runs finite: a standard deviation")]
+    "failed, words",
+    [
+        ([True, False], "1 run finite: a standard deviation"),
+        ([True, True], "0 runs finite: a standard deviation"),
+    ],
 )
 def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
     two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))
@@ -89,7 +93,7 @@ def test_two_draws_have_a_spread(case):
 
 
 def test_a_fan_of_some_draws_says_of_which(case, monkeypatch):
-    from tuning.report import uncertainty
+    from tuning.report.studies import uncertainty
 
     monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)
     for samples, words in ((5, "the first 3 of 5 draws"), (3, "3 draws")):
