@@ -34,6 +34,9 @@ LAZY = {
     ("tuning.uncertainty.sensitivity_study", "tuning.report.sensitivity_tables"),
     ("tuning.uncertainty.study", "tuning.report.uncertainty"),
     ("jaxtank.__main__", "tuning.cli.main"),
+    ("jaxtank.case", "jaxtank.plots.run"),
+    ("jaxtank.case", "jaxtank.rig.write"),
+    ("jaxtank.loop.trajectory", "jaxtank.plots.run"),
 }
 DRAWING = {"jaxtank.plots", "tuning.report", "tuning.cli"}  # folders that may import matplotlib
 

@@ -13,7 +13,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.presets import Mirror, Scenario
+from jaxtank.presets import Scenario, Symmetry
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.search import diagnostics, methods
@@ -533,7 +533,7 @@ def test_mirror_images_are_named_and_counted_once():
         diagnostics.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0})
         is None
     )
-    other = Problem(case.replace(mirror=Mirror("none", lambda v: {})))
+    other = Problem(case.replace(symmetry=Symmetry("none", lambda v: {})))
     assert diagnostics.mirror_of(other, [], result.problem.values(result.problem.start())) is None
 
 

@@ -56,6 +56,23 @@ def write_together(folder, files):
         raise
 
 
+def write_folder(folder, files):
+    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; return the
+    paths. Raises InputError for a folder that cannot be written to.
+    """
+    check_folder(folder)
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_together(folder, files)
+    except OSError as error:
+        raise InputError(
+            f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder"
+            " that can"
+        ) from None
+    return [folder / name for name in files]
+
+
 def sweep(folder):
     """Remove the unfinished files that a killed run left in a folder."""
     for path in Path(folder).glob(f".*{ASIDE}"):

@@ -1,12 +1,12 @@
 """Interoperability: a python-control system of any rig, the columns of a run for pandas or xarray."""
 
-from typing import Any
-
 import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium, linearise
 from jaxtank.core.errors import InputError
-from jaxtank.core.units import local
+from jaxtank.loop.trajectory import columns
+
+__all__ = ["columns", "to_control"]
 
 
 def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):
@@ -67,48 +67,3 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
         inputs=[f"pump{j + 1}" for j in range(plant.pumps)],
         outputs=[f"y_h{i + 1}" for i in outputs],
     )
-
-
-FIELDS = (
-    ("h", "x", "cm"),
-    ("y", "y", "cm"),
-    ("h_hat", "x_hat", "cm"),
-    ("r", "r", "cm"),
-    ("u", "u", "V"),
-    ("command", "command", "V"),
-    ("spilled", "spilled", "cm^3"),
-    ("d_hat", "d_hat", "cm/s"),
-)
-"""Columns of a run: (name, field of `Trajectory`, unit)."""
-
-
-def columns(run, units=("cm", "V"), dimension=None) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray.
-
-    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and what was lost over
-    the rims.
-
-    Parameters
-    ----------
-    run : Trajectory, as `jaxtank.simulate` returns it.
-    units : (length, pump input) of the rig, `loop.units`.
-    dimension : None, or the name of the one dimension that all columns share in xarray.
-
-    Returns
-    -------
-    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
-    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
-    `xarray.Dataset(columns(run, dimension="t"))`.
-    """
-    found = {("t", "s"): np.asarray(run.t)}
-    for name, field, unit in FIELDS:
-        values = np.asarray(getattr(run, field))
-        found |= {
-            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
-        }
-    if dimension is None:
-        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
-    return {
-        dimension if name == "t" else name: (dimension, values, {"units": unit})
-        for (name, unit), values in found.items()
-    }

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from jaxtank.case import Case, Free, Mirror, Scenario
+from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.controllers import ENMPC, PID
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import number
@@ -252,7 +252,7 @@ def trapezoids():
     )
 
 
-def _mirrored(values):
+def _exchanged(values):
     # 1.5/Tp is the gain of the error, l that of its integral's observer: the loop knows their sum
     # and product (notes S4.4)
     rates = [v for n, v in values.items() if n.startswith("observer.l")]
@@ -264,7 +264,7 @@ def _mirrored(values):
     }
 
 
-MIRROR = Mirror("the gain k = 1.5/Tp and the observer's l exchange roles", _mirrored)
+SYMMETRY = Symmetry("the gain k = 1.5/Tp and the observer's l exchange roles", _exchanged)
 
 
 def law(name, model):
@@ -465,7 +465,7 @@ def preset():
                 # V from sample to sample counts as 0.02 cm
                 objective={"mean_square_error": 1.0, "mean_square_travel": 0.04},
                 scenarios=(Scenario("noise", {"sensor.noise": "0.02 if zero"}, seed=1),),
-                mirror=MIRROR if "chadpc" in name else None,
+                symmetry=SYMMETRY if "chadpc" in name else None,
                 reachable=not name.endswith("-trapezoid"),
             )
             for name, (title, free) in LAWS.items()

@@ -24,8 +24,8 @@ from jaxtank.core.tree import (
 )
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.measures.catalogue import check_names, entries
-from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.measures import check_names, entries
+from jaxtank.measures import unit as measure_unit
 from jaxtank.rig import schedule
 from jaxtank.rig.schema import is_finite, is_numeric, name_of
 from jaxtank.rig.signals import steps

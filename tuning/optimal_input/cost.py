@@ -93,9 +93,7 @@ def look(loop, clock, terms, u, held):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), tuple(
-            excess(terms, held, sample)
-        )
+        return (state, ms.update(run, acc, sample, now.context)), tuple(excess(terms, held, sample))
 
     (_, acc), over = lp.scan(
         body,
@@ -117,7 +115,7 @@ def _search_cost(u, loop, clock, terms, held):
         state, acc, (before, travel, absolute), penalty = carry
         now, forces = xs
         state, sample = step(loop, clock, state, now)
-        acc = ms.update(run, acc, sample, now.window, now.since, now.rest)
+        acc = ms.update(run, acc, sample, now.context)
         if "input_travel" in soft:
             change = sum(_soft(a - b, held.knees[0]) for a, b in zip(sample.u, before))
             travel, before = travel + jnp.where(state.k == 1, 0.0, change), sample.u

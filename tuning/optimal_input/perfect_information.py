@@ -239,8 +239,6 @@ def _measures(case, found):
     """{name: value} of what can be said of the run with the inputs found."""
     loop = open_loop(case.loop, found["u"].T, found["interval"])
     names = tuple(
-        m
-        for m in ms.MEASURES
-        if ms.serves(m, loop) and m not in ("estimation_rms", *ms.TIMES.values())
+        m for m in ms.MEASURES if ms.serves(m, loop) and m not in ("estimation_rms", *ms.times())
     )
     return {m: np.asarray(v) for m, v in lp.evaluate(loop, case.clock, names).items()}

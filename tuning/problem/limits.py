@@ -137,16 +137,16 @@ def undefined(measure, case):
     Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has
     no step within the run, and recovery where nothing is poured.
     """
-    spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
+    wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     since = (
         np.asarray(loop.disturbance.since(clock))
         if hasattr(loop.disturbance, "since")
         else np.full(1, -1.0)
     )
-    if spec.pours and hasattr(loop.disturbance, "since"):
+    if "since" in wanted and hasattr(loop.disturbance, "since"):
         why = f"nothing is poured within its {clock.duration:g} s; add a pour ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    if spec.windows and hasattr(loop.reference, "windows"):
+    if "window" in wanted and hasattr(loop.reference, "windows"):
         steps = [np.asarray(step) for _, step, *_ in loop.reference.windows(clock)]
         why = (
             f"no setpoint is stepped within its {clock.duration:g} s; add a step"

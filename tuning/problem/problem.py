@@ -131,7 +131,7 @@ class Problem:
             return None
         if set(self.objective) == {ROOT} and len(self.lanes) == 1:
             return "square"
-        return "cost" if any(m == ROOT or m in ms.SQUARES for m in self.objective) else None
+        return "cost" if any(m == ROOT or m in ms.squares() for m in self.objective) else None
 
     def start(self) -> np.ndarray:
         """(P,) z of the case's own values. Raises InputError if one lies outside its range."""
@@ -304,7 +304,7 @@ class Problem:
 
     def _squares(self):
         """((measure, weight), ...) of the sums of squares that the Gauss-Newton matrix is made of."""
-        own = tuple((m, w) for m, w in self.objective.items() if m in ms.SQUARES)
+        own = tuple((m, w) for m, w in self.objective.items() if m in ms.squares())
         return (("mean_square_error", 1.0),) if ROOT in self.objective or not own else own
 
     def _curvature(self, matrix, measures, slopes):

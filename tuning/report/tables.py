@@ -2,11 +2,11 @@
 
 import json
 import math
-from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.units import DEFAULT
 
 
@@ -26,23 +26,6 @@ def numbers(value, digits=5):
     return "  ".join(number(v, digits) for v in np.ravel(value))
 
 
-def clean(value) -> Any:
-    """`value` for JSON: arrays as lists, NaN and infinity as null."""
-    if isinstance(value, dict):
-        return {k: clean(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [clean(v) for v in value]
-    if (
-        isinstance(value, (np.ndarray, np.generic))
-        or hasattr(value, "__jax_array__")
-        or type(value).__module__.startswith("jax")
-    ):
-        return clean(np.asarray(value).tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
-
-
 def reasons(measures):
     """{measure: why} for every measure that is absent or has an entry that is not a number."""
     absent = (m for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float))))
@@ -59,7 +42,7 @@ def measures_json(measures):
     """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
     return {
         **dict.fromkeys(_unserved()),
-        **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()}),
+        **clean({m: v for m, v in measures.items() if m not in ms.times()}),
     }
 
 

@@ -9,7 +9,8 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
-from tuning.report.artifacts import earlier, run_for_people, trajectory_csv, write_result
+from jaxtank.loop.trajectory import csv
+from tuning.report.artifacts import earlier, run_for_people, write_result
 from tuning.report.tables import dumps, number, objective_unit
 from tuning.report.tuning import json_of, parts_of, worst_of_scenarios
 
@@ -279,8 +280,8 @@ def save(result, folder, command=None):
     files = {
         "result.json": dumps(json_of(result)) + "\n",
         **({"rig.toml": rig_text} if rig_text else {}),
-        "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
-        "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
+        "trajectory.csv": csv(runs["after"], result.tuned.loop.units),
+        "before.csv": csv(runs["before"], result.case.loop.units),
     }
     stale = earlier(folder, CAPTIONS)
     if not rig_text and (folder / "result.json").is_file():

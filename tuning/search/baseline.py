@@ -5,7 +5,6 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
-from tuning.search.diagnostics import REPORTED
 
 
 def own_values(problem):
@@ -17,6 +16,6 @@ def run_measures(loop, clock, key):
     """{measure: value} of everything that is reported of a run, and when the highest and lowest
     levels were reached.
     """
-    names = tuple(m for m in REPORTED if ms.serves(m, loop))
-    values = lp.evaluate(loop, clock, (*names, *ms.TIMES.values()), key)
+    names = tuple(m for m in ms.reported() if ms.serves(m, loop))
+    values = lp.evaluate(loop, clock, (*names, *ms.times()), key)
     return {m: np.asarray(v) for m, v in values.items()}

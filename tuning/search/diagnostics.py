@@ -65,9 +65,6 @@ LARGEST_CURVATURE = 24
 HELD_OUT = 1_000_003
 """Offset of the seeds of the validation from those of the search."""
 
-REPORTED = tuple(m for m in ms.MEASURES if m not in ms.TIMES.values())
-"""Measures in a result, before and after."""
-
 
 def felt(problem, z):
     """Percent by which the objective changes when each parameter alone goes 10 % up or down (of its
@@ -98,7 +95,7 @@ def unexercised(problem, search, first):
     if not flat.any():
         return idle
     names, here = (
-        tuple(m for m in REPORTED if ms.serves(m, problem.loop)),
+        tuple(m for m in ms.reported() if ms.serves(m, problem.loop)),
         table_of(problem, problem.values(point.z)),
     )
 
@@ -240,15 +237,15 @@ def flat_words(problem, found):
 
 
 def mirror_of(problem, outcomes, values):
-    """The answer `values` with the gains exchanged that the case's `mirror` names; None where it
+    """The answer `values` with the gains exchanged that the case's `symmetry` names; None where it
     has none, or outside the ranges.
 
     Returns {"words", "values" {name: value}, "objective", "starts": indices of the searches that
         ended there rather than here}.
     """
-    if problem.case.mirror is None:
+    if problem.case.symmetry is None:
         return None
-    image = problem.case.mirror.image(values)
+    image = problem.case.symmetry.image(values)
     if not image or not all(n in values for n in image):
         return None
     there = {**values, **image}
@@ -267,7 +264,7 @@ def mirror_of(problem, outcomes, values):
     ]
     cost = float(problem.screen(z[None])[0][0])
     return {
-        "words": problem.case.mirror.words,
+        "words": problem.case.symmetry.words,
         "values": there,
         "objective": cost,
         "starts": starts,
@@ -282,7 +279,7 @@ def table_of(problem, values) -> list[Any]:
     table: list[Any] = [None] * len(problem.lanes)
     for group in problem.groups:
         loop = problem.lanes[group.lanes[0]].case.loop
-        names = (*(m for m in REPORTED if ms.serves(m, loop)), *ms.TIMES.values())
+        names = (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.times())
         measures, _ = sc.values_of(group, names, points)
         for j, lane in enumerate(group.lanes):
             table[lane] = {m: np.asarray(v)[0, j] for m, v in measures.items()}

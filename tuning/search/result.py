@@ -191,7 +191,7 @@ def _unlimited(problem):
     """Sentences on the entries of a limited measure that are undefined in every run: not limited."""
     words = []
     for measure in dict.fromkeys(
-        limit.measure for limit in problem.limits if ms.MEASURES[limit.measure].windows
+        limit.measure for limit in problem.limits if "window" in ms.refers_to([limit.measure])
     ):
         here = {limit.index for limit in problem.limits if limit.measure == measure}
         absent = [i + 1 for i in range(ms.entries(measure, problem.loop.plant)) if i not in here]

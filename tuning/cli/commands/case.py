@@ -5,6 +5,7 @@ it is.
 import sys
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.files import write_folder
 from tuning.cli.options import tell_written
 from tuning.cli.values import open_case, whole
 from tuning.cli.values import seed as seed_of
@@ -43,7 +44,7 @@ def show(args):
             for name in ("rig.svg", "rig.png"):  # of another rig
                 Path(args.out, name).unlink(missing_ok=True)
         else:
-            written = artifacts.write_files(Path(args.out), alone | artifacts.pngs(drawn))
+            written = write_folder(Path(args.out), alone | artifacts.pngs(drawn))
     print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
     tell_written(written, args)
     return 0
@@ -72,14 +73,14 @@ def export_law(args):
 
     from jaxtank.export.printer import function_name
     from jaxtank.export.source import export
-    from tuning.report import artifacts, tables
+    from tuning.report import tables
 
     text = export(case, args.lang, args.precision, args.name)
     name = args.name or function_name(case)
     if args.json:
         print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:
-        tell_written(artifacts.write_files(Path(args.out), {f"{name}.{args.lang}": text}), args)
+        tell_written(write_folder(Path(args.out), {f"{name}.{args.lang}": text}), args)
     elif not args.json:
         print(text, end="")
     return 0
@@ -123,7 +124,7 @@ def simulate(args):
         rows = [
             [m, ms.unit(m, case.loop.units), tables.numbers(values[m]), s.doc]
             for m, s in ms.MEASURES.items()
-            if m in values and m not in ms.TIMES.values()
+            if m in values and m not in ms.times()
         ]
         print(tables.table(rows, ["measure", "unit", "value", ""]))
     tell_written(written, args)
