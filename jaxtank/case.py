@@ -213,7 +213,8 @@ class Case:
             )
         for measure, limit in self.limits.items():
             side = "at least" if MEASURES[measure].sense < 0 else "at most"
-            rows.append(("limit", f"{measure} {side} {clean(limit)} {unit(measure, loop.units)}"))
+            of = "" if isinstance(limit, str) else f" {unit(measure, loop.units)}"
+            rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))
         weights = " + ".join(f"{w:g} {m}" for m, w in self.objective.items())
         return [*rows, ("objective", weights)]
 

@@ -553,7 +553,7 @@ def test_the_rig_that_was_fitted_to_the_paper():
     """
     case = rig.set_values(CASES["enmpc"], paper.PAPER_LIKE)
     found = [
-        paper.figures(type(t)(*(np.asarray(v) for v in t)))
+        paper.figures(jax.tree.map(np.asarray, t))
         for t in (
             jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(9)
         )

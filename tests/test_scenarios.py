@@ -131,7 +131,7 @@ def test_slopes_by_what_a_law_prepares_beforehand():
 def test_new_measures_against_the_trajectory():
     case = rig.set_values(presets.find("mirakhorli/sfc"), {"clock.duration": 100.0})
     t = jaxtank.simulate(case.loop, case.clock)
-    t = type(t)(*(np.asarray(v) for v in t))
+    t = jax.tree.map(np.asarray, t)
     names = ("mean_square_error", "mean_square_travel", "mean_square_overshoot", "input_deviation")
     found = jaxtank.evaluate(case.loop, case.clock, names)
     rest = jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[1]

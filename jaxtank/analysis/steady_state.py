@@ -1,5 +1,7 @@
 """What can be said of a rig before it is run: steady states, linear models."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +67,7 @@ def _from_known_speeds(plant, known, xp=jnp):
     return speeds, solution[len(free) :]
 
 
-def steady_along(plant, r):
+def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """The steady state of every sample of a reference: what a law of state feedback prepares before
     the loop.
 

@@ -45,7 +45,7 @@ def pointwise(method):
     return method
 
 
-def is_pointwise(part):
+def is_pointwise(part: Any) -> bool:
     """Whether what `part` of a loop, or the whole of it, is asked for can be asked piece by piece."""
     asked = [getattr(type(part), name) for name in METHODS if hasattr(type(part), name)]
     inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
@@ -122,7 +122,7 @@ CLOCK_UNITS = {name: meta["unit"] for name, meta in CLOCK.items()}
 LARGEST_RUN = 100_000_000  # samples
 
 
-def check_clock(clock):
+def check_clock(clock: Any) -> None:
     """Raise InputError unless the clock describes a run."""
     if not isinstance(clock, Clock):
         raise InputError(

@@ -5,6 +5,7 @@ import errno
 import os
 import stat
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
@@ -56,7 +57,7 @@ def write_together(folder, files):
         raise
 
 
-def write_folder(folder, files):
+def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[Path]:
     """Write {name: text or bytes} to `folder`, made if need be, all of them or none; return the
     paths. Raises InputError for a folder that cannot be written to.
     """

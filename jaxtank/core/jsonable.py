@@ -16,9 +16,11 @@ def clean(value: Any) -> Any:
     {'h': [1.0, None]}
     """
     if isinstance(value, dict):
-        return {k: clean(v) for k, v in value.items()}
+        table: dict[Any, Any] = value
+        return {k: clean(v) for k, v in table.items()}
     if isinstance(value, (list, tuple)):
-        return [clean(v) for v in value]
+        entries: Any = value
+        return [clean(v) for v in entries]
     if (
         isinstance(value, (np.ndarray, np.generic))
         or hasattr(value, "__jax_array__")

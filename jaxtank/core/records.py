@@ -10,7 +10,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 
 
-def check_key(key):
+def check_key(key: Any) -> None:
     """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the
     older one, a row of unsigned integers; traced ones and placeholders too.
     """
@@ -34,9 +34,9 @@ class Tick(NamedTuple):
     """
 
     t: Any  # time [s]
-    r: tuple  # setpoint r [cm]
-    dr: tuple  # its rate r' [cm/s]
-    ddr: tuple  # its second derivative r'' [cm/s^2]
+    r: tuple[Any, ...]  # setpoint r [cm]
+    dr: tuple[Any, ...]  # its rate r' [cm/s]
+    ddr: tuple[Any, ...]  # its second derivative r'' [cm/s^2]
     dt: Any = 0.0  # sampling period Ts [s]
     plan: Any = ()  # what the law prepared for this sample before the loop started
     own: Any = ()  # this sample of the signals that are the law's own (`Controller.inputs`)
@@ -45,25 +45,25 @@ class Tick(NamedTuple):
 class Estimate(NamedTuple):
     """What an observer hands to a law: tuples of scalars."""
 
-    x: Sequence  # level estimate, one per tank [cm]
+    x: Sequence[Any]  # level estimate, one per tank [cm]
     # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
-    d: Sequence = ()
+    d: Sequence[Any] = ()
 
 
 class Sample(NamedTuple):
     """The world at t_k, before it moves: tuples of scalars."""
 
     t: Any  # time [s]
-    x: Sequence  # levels, one per tank [cm]
-    y: Sequence  # measured levels, one per tank [cm]
-    x_hat: Sequence  # estimated levels, one per tank [cm]
+    x: Sequence[Any]  # levels, one per tank [cm]
+    y: Sequence[Any]  # measured levels, one per tank [cm]
+    x_hat: Sequence[Any]  # estimated levels, one per tank [cm]
     # estimated disturbances of the level rates, one per tank [cm/s]; 0 where none is estimated
-    d_hat: Sequence
-    r: tuple  # setpoint, one per output [cm]
-    e: tuple  # tracking error of the true output, x - r, one per output [cm]
-    command: Sequence  # what the law asked for, one per pump [V]
-    applied: Sequence  # the command within the pumps' limits, one per pump [V]
-    u: Sequence  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
-    spilled: Sequence  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
+    d_hat: Sequence[Any]
+    r: tuple[Any, ...]  # setpoint, one per output [cm]
+    e: tuple[Any, ...]  # tracking error of the true output, x - r, one per output [cm]
+    command: Sequence[Any]  # what the law asked for, one per pump [V]
+    applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
+    u: Sequence[Any]  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
+    spilled: Sequence[Any]  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
-    shortfall: Sequence = ()
+    shortfall: Sequence[Any] = ()

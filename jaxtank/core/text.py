@@ -3,6 +3,8 @@ characters that a terminal prints.
 """
 
 import html
+from collections.abc import Iterable
+from typing import Any
 
 MOST = 600
 """Characters of a line; what is longer is cut in its middle, for it begins with the name of the
@@ -29,7 +31,7 @@ def one_line(text, most=MOST):
     return line[:head] + gap + line[len(line) - (most - len(gap) - head) :]
 
 
-def html_table(rows, head=(), caption=""):
+def html_table(rows: Iterable[Iterable[Any]], head: Iterable[Any] = (), caption: str = "") -> str:
     """Return a small HTML table for a notebook, every text of it escaped.
 
     Parameters
@@ -54,7 +56,7 @@ def html_table(rows, head=(), caption=""):
     </table>
     """
 
-    def row(cells, tag):
+    def row(cells: Iterable[Any], tag: str) -> str:
         return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>\n"
 
     above = f"<caption>{html.escape(caption)}</caption>" if caption else ""

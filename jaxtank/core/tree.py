@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import numbers
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, cast, dataclass_transform
 
 import jax
@@ -281,7 +281,7 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     return ".".join([*parts[:-1], base]), index
 
 
-def check_leaves(tree, names=None, vacant=()):
+def check_leaves(tree: Any, names: Iterable[str] | None = None, vacant: Iterable[str] = ()) -> None:
     """Raise InputError if a concrete leaf is no real number, not finite or out of its range. Traced
     leaves are passed over, and so is None of an optional leaf and of the names in `vacant`, which a
     schedule fills.

@@ -36,7 +36,7 @@ def check_unit(where, text):
     return text
 
 
-def local(unit, units=DEFAULT):
+def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
     """`unit`, written with "cm" for the length, "V" for the pump input and "volt" for a sensor's
     volt, in the units of a rig.
 

@@ -110,7 +110,7 @@ class PumpBank:
             head=jnp.int32(0),
         )
 
-    def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
+    def limit(self, command: Sequence[Any], metric: Any = None) -> tuple[Any, ...]:
         """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for
         "boxqp", or None.
         """
@@ -126,7 +126,9 @@ class PumpBank:
         """
         return self.deliver(state, self.limit(command, metric), dt)
 
-    def deliver(self, state: ActuatorState, u: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
+    def deliver(
+        self, state: ActuatorState, u: tuple[Any, ...], dt: Any
+    ) -> tuple[tuple[Any, ...], ActuatorState]:
         """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead
         zone, lag, delay.
         """
@@ -167,7 +169,7 @@ class PumpBank:
             return u
         return tuple(at_least(v, self.dead_zone[i]) for i, v in enumerate(u))
 
-    def driving(self, u: tuple) -> tuple:
+    def driving(self, u: tuple[Any, ...]) -> tuple[Any, ...]:
         """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead
         zone, else u itself.
         """

@@ -1,6 +1,7 @@
 """What the computer sees of the levels."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +50,7 @@ class LevelSensor:
 
     def draw(
         self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
-    ) -> tuple | None:
+    ) -> tuple[Any, ...] | None:
         """(samples,) standard normal deviates per tank, drawn before the loop; None without a key.
         piece: the number of a long run's piece, whose samples they are; each has a key of its own,
         and the run's deviates are those of its pieces, end to end.
@@ -73,7 +74,7 @@ class LevelSensor:
             )
         return tuple(deviates[i] for i in range(tanks))
 
-    def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
+    def read(self, x: Sequence[Any], xi: Sequence[Any] | None) -> Sequence[Any]:
         """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or
         None.
         """

@@ -2,6 +2,8 @@
 
 May import the folders below `jaxtank.loop` only; the other modules of `loop` import this one.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
 import dataclasses
 import functools
@@ -136,11 +138,11 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     wanted, window = ms.refers_to(names), None
     if "window" in wanted:
         windows = getattr(loop.reference, "windows", None)
-        if windows is None:
+        window = None if windows is None else windows(times)
+        if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
             )
-        window = windows(times)
     pulses = getattr(loop.disturbance, "since", None)
     since = None if pulses is None else pulses(times)
     if since is None and "since" in wanted:

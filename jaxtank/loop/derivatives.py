@@ -2,10 +2,11 @@
 
 May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
-import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, key
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
 from jaxtank.xla.reachability import reached
 
 OUTER = 12
@@ -47,9 +49,8 @@ class Partition(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-@functools.partial(
-    jax.jit, static_argnames=("clock", "names", "order", "squares", "batched")
-)  # a dict would come back with its keys sorted
+# the values as a tuple: a dict would come back with its keys sorted
+@compiled("clock", "names", "order", "squares", "batched")
 def sensitivities_compiled(
     loop: ClosedLoop,
     clock: Clock,
@@ -123,7 +124,8 @@ def sensitivities_compiled(
 
 def _floats_of(tree: Any) -> Partition:
     """Partition of `tree` by type: only floats have derivatives."""
-    leaves, structure = jax.tree.flatten(tree)
+    leaves: list[Any] = jax.tree.leaves(tree)
+    structure = cast(Any, jax.tree.structure(tree))
     return Partition(structure, tuple(bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves))
 
 
@@ -150,13 +152,13 @@ def _pushed_stored(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any
     """`_pushed`, where what the tangents are multiplied by is computed once and stored. For many
     runs side by side: of one alone, fetching costs more.
     """
-    linearize: Any = jax.linearize
+    linearize = cast(Any, jax.linearize)
     value, linear, rest = linearize(f, *point, has_aux=True)
-    linear, slopes = jax.closure_convert(linear, *point)
-    slopes: Any = materialised(slopes)
+    converted = cast(Any, jax.closure_convert(linear, *point))
+    function, slopes = converted[0], materialised(converted[1])
 
     def push(*t: Any) -> Any:
-        return linear(*t, *slopes)
+        return function(*t, *slopes)
 
     return value, jax.vmap(push, in_axes=-1, out_axes=-1)(*tangents), rest
 

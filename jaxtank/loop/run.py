@@ -4,11 +4,12 @@ Row k of a run is the state at t_k: y_k is measured, u_k is computed, and held o
 All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument. May import the
 other modules of `loop` and the folders below.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
-import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,7 @@ from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import COLUMNS, Trajectory
 from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
 
 
 def simulate(
@@ -223,7 +225,7 @@ def _names(measures: str | Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]
     return names
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "checkpoint"))
+@compiled("clock", "names", "checkpoint")
 def evaluate_compiled(
     loop: ClosedLoop, clock: Clock, names: tuple[str, ...], key: jax.Array | None, checkpoint: bool
 ) -> tuple[dict[str, jax.Array], jax.Array]:
@@ -268,12 +270,12 @@ def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, leng
 
     inner = math.isqrt(length)
     outer = length // inner
-    recomputed: Any = jax.checkpoint(chunk)
-    carry = scan(recomputed, carry, jax.tree.map(first, xs), length=outer)[0]
+    checkpoint = cast(Any, jax.checkpoint)
+    carry = scan(checkpoint(chunk), carry, jax.tree.map(first, xs), length=outer)[0]
     return scan(body, carry, jax.tree.map(last, xs), length=length - outer * inner)[0]
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "save_every"))
+@compiled("clock", "save_every")
 def simulate_compiled(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int
 ) -> tuple[Trajectory, jax.Array]:
@@ -308,8 +310,8 @@ def simulate_compiled(
     (state, _), saved = scan(row, start, xs, length=rows)
     columns: dict[str, Any] = {}
     for name in COLUMNS:
-        value = getattr(saved, name)
-        columns[name] = jnp.stack(value, axis=-1) if isinstance(value, tuple) else value
+        value: Any = getattr(saved, name)
+        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
     return Trajectory(**columns, units=loop.units), is_broken(state)
 
 

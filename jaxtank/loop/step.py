@@ -3,9 +3,11 @@
 Simulation, derivatives, export and Gymnasium call it. May import `loop.closed_loop` and the folders
 below `jaxtank.loop`.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +26,7 @@ class Decision(NamedTuple):
 
     estimate: Estimate
     command: Sequence[Any]  # (m) inputs before their limits [V]
-    applied: Sequence[Any]  # (m) inputs within them [V]
+    applied: Group  # (m) inputs within them [V]
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample
 
@@ -87,8 +89,8 @@ def decide(
 
 
 def move(
-    loop: ClosedLoop, clock: Clock, state: State, applied: Sequence[Any], now: Inputs
-) -> tuple[State, Sequence[Any], Group, Group]:
+    loop: ClosedLoop, clock: Clock, state: State, applied: Group, now: Inputs
+) -> tuple[State, Group, Group, Group]:
     """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim
     [cm^3], (n) volume that a negative inflow could not take [cm^3]) for inputs `applied` (m) [V]
     within the limits: pumps, faults and plant. Observer and controller of the state stay as they
@@ -136,7 +138,7 @@ def commanded(
 def _check_command(command: Any, pumps: int, name: str) -> None:
     """Raise InputError unless `command`, of the controller `name`, is one real number per pump."""
     several = isinstance(command, tuple | list)
-    entries: list[Any] = list(command) if several else []
+    entries: list[Any] = list(cast(Any, command)) if several else []
     count = (len(entries),) if several else np.shape(command)[:1]
     if count != (pumps,):
         found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
@@ -117,8 +118,8 @@ class Trajectory:
         )
 
     def __str__(self) -> str:
-        if np.ndim(self.t) != 1 or isinstance(self.t, jax.core.Tracer):
-            return f"Trajectory of several runs, or of a traced one: t {np.shape(self.t)}"
+        if np.ndim(self.t) != 1 or isinstance(self.t, Tracer):
+            return "Trajectory of several runs, or of a traced one"
         ends = f"run from {float(self.t[0]):g} to {float(self.t[-1]):g} s"
         sizes = [_count(len(self.t), "row")]
         sizes += [_count(np.shape(self.x)[1], "tank"), _count(np.shape(self.u)[1], "pump")]

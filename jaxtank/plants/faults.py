@@ -26,7 +26,7 @@ class Faults:
         "-", "(faults,) what each entry is multiplied by while its fault lasts", low=0.0
     )
     extra: np.ndarray = leaf("-", "(faults,) what is added to it, in its own unit")
-    windows: tuple = static(
+    windows: tuple[Any, ...] = static(
         doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault'
     )
 

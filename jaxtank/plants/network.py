@@ -243,7 +243,7 @@ SURPLUS = 1e-6
 """By how much the shares `caught` of one tank may be above 1 in sum: the rounding of single floats."""
 
 
-def check_caught(plant, name="plant"):
+def check_caught(plant: Any, name: str = "plant") -> None:
     """Raise InputError where the spills of one tank catch more than passes its rim: volume would
     come from nowhere. `plant` is called `name`; one whose shares are traced or of a batch, or that
     has none, is passed over.

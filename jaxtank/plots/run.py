@@ -4,6 +4,8 @@ May import the other modules of `plots` and what they import.
 """
 
 import io
+from collections.abc import Mapping
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -13,7 +15,7 @@ from jaxtank.plots.layout import place
 from jaxtank.plots.schematic import schematic
 
 
-def figures(run):
+def figures(run: Any) -> dict[str, Any]:
     """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
     time.
     """
@@ -37,12 +39,12 @@ def figures(run):
                 )
             ax.set(title=title, ylabel=f"[{unit}]")
             if values.shape[1] <= responses.SHOWN:
-                ax.legend(ncols=4)
+                ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))  # beside the lines
         axes[-1].set_xlabel("time [s]")
     return {"run": figure}
 
 
-def rig(plant, run=None, title=""):
+def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
     """Return {"rig": figure}, the schematic of a plant, filled as at the end of a Trajectory; {}
     for one that is no network of tanks.
     """
@@ -53,13 +55,15 @@ def rig(plant, run=None, title=""):
     with responses.styled():
         figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
-        filled = run is not None and np.all(np.isfinite(run.x[-1]))
-        schematic(ax, plant, *((run.x[-1], run.r[-1]) if filled else (None, None)))
+        if run is not None and np.all(np.isfinite(run.x[-1])):
+            schematic(ax, plant, run.x[-1], run.r[-1])
+        else:
+            schematic(ax, plant)
         ax.set_title(responses.plain(title))
     return {"rig": figure}
 
 
-def png(figure):
+def png(figure: Any) -> bytes:
     """Return a figure as PNG bytes, and close it."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata={"Software": None})
@@ -67,6 +71,6 @@ def png(figure):
     return out.getvalue()
 
 
-def pngs(drawn):
+def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
     """Return {file name: PNG bytes} of {name: figure}; the figures are closed."""
     return {f"{name}.png": png(figure) for name, figure in drawn.items()}

@@ -19,7 +19,7 @@ class Signal(abc.ABC):
         """Number of channels [-]."""
 
     @abc.abstractmethod
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for
         a Clock. A signal whose every sample follows from `sample_times(clock)` alone may be marked
         `pieces.pointwise`: a long run then asks for it piece by piece.

@@ -9,11 +9,15 @@ call that must not be inlined is a wall that fusion does not cross; it computes 
 nothing, for its result lies where its operand lay.
 """
 
+from typing import TypeVar
+
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 
+T = TypeVar("T")
 
-def materialised(tree):
+
+def materialised(tree: T) -> T:
     """`tree`, the same values, each computed once. Transparent to jit, vmap and both modes of
     differentiation. No effect off the CPU.
     """

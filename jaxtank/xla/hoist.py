@@ -7,12 +7,15 @@ run). Here the body is traced once, and what depends on constants alone is compu
 coefficients (each Runge-Kutta stage makes its own) become one, so that XLA can see they are.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
 
-def scan(body, carry, xs, length):
+def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
     """jax.lax.scan(body, carry, xs, length), less what need not be in the loop. Values and
     derivatives are the same.
     """

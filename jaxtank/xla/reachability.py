@@ -3,7 +3,8 @@ computed.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 from jax.extend.core import Literal
@@ -32,7 +33,7 @@ def use_of(function, watched, *others):
     return _follow(jaxpr, set(jaxpr.invars[: len(jax.tree.leaves(watched))]))[0]
 
 
-def reached(function, watched):
+def reached(function: Callable[[Any], Any], watched: Any) -> list[bool]:
     """[whether each leaf of the result of function(watched) depends on `watched`], a pytree of
     arrays.
     """

@@ -38,7 +38,7 @@ def open_case(args):
     if case.clock != clock and not args.quiet:
         for sentence in rig.clock_doubts(case.clock):
             print(f"jaxtank: note: {sentence}", file=sys.stderr)
-    for sentence in () if args.quiet else step_size.doubts(case.loop, case.clock):
+    for sentence in () if args.quiet else step_size.step_warnings(case.loop, case.clock):
         print(f"jaxtank: note: {sentence}", file=sys.stderr)
     return case
 

@@ -100,7 +100,7 @@ def simulate(args):
     from tuning.search import baseline, provenance
 
     key = jax.random.key(seed) if noisy(case) else None
-    if step_size.doubts(case.loop, case.clock):
+    if step_size.step_warnings(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = {m: v for m, v in baseline.run_measures(case.loop, case.clock, key).items()}
     payload = {
