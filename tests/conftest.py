@@ -1,8 +1,4 @@
-"""Everything here runs in float64; a test of float32 says so and runs in a process of its own. What
-slow.txt lists is marked slow.
-"""
-
-from pathlib import Path
+"""Everything here runs in float64; a test of float32 says so and runs in a process of its own."""
 
 import jax
 import pytest
@@ -12,19 +8,19 @@ import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 jax.config.update("jax_enable_x64", True)
 
 
-SLOW = {
-    line
-    for line in (Path(__file__).parent / "slow.txt").read_text().splitlines()
-    if line and not line.startswith("#")
-}
-
-
-@pytest.hookimpl(tryfirst=True)  # before the marker is looked for
-def pytest_collection_modifyitems(items):
-    """Mark the tests of slow.txt: one set of parameters, or all where none is named."""
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
+def pytest_collection_modifyitems(config, items):
+    """Mark as slow the parameter sets that `@pytest.mark.slow_for(*ids)` names."""
+    missing = {}
     for item in items:
-        if SLOW & {f"{item.path.name}::{item.name}", f"{item.path.name}::{item.originalname}"}:
-            item.add_marker(pytest.mark.slow)
+        for mark in item.iter_markers("slow_for"):
+            missing.setdefault((item.path, item.originalname), set(mark.args))
+            missing[item.path, item.originalname].discard(item.callspec.id)
+            if item.callspec.id in mark.args:
+                item.add_marker(pytest.mark.slow)
+    missing = [f"{path.name}::{test}{sorted(ids)}" for (path, test), ids in missing.items() if ids]
+    if missing and not any("::" in str(word) for word in config.args):
+        raise pytest.UsageError(f"slow_for names parameter sets that are not there: {missing}")
 
 
 @pytest.fixture(scope="session")

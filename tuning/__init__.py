@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from tuning.uncertainty.distributions import LogUniform as LogUniform
     from tuning.uncertainty.distributions import Normal as Normal
     from tuning.uncertainty.distributions import Uniform as Uniform
+    from tuning.uncertainty.result import Ensemble as Ensemble
     from tuning.uncertainty.sensitivity_study import sensitivity as sensitivity
-    from tuning.uncertainty.study import Ensemble as Ensemble
     from tuning.uncertainty.study import ensemble as ensemble
 
 _NAMES = {
@@ -58,7 +58,7 @@ _NAMES = {
     "Certificate": "tuning.search.robust",
     "Correlated": "tuning.uncertainty.distributions",
     "Discrete": "tuning.uncertainty.distributions",
-    "Ensemble": "tuning.uncertainty.study",
+    "Ensemble": "tuning.uncertainty.result",
     "Estimation": "tuning.identification.problem",
     "Identification": "tuning.identification.fit",
     "Log": "tuning.identification.experiment",

@@ -8,7 +8,7 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.numerics import root
+from jaxtank.core.numerics import smooth_sqrt
 
 
 def _balance(plant, xp=jnp):
@@ -76,7 +76,7 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
     the balance is solved once per output and not per sample. No check: where no steady state
     exists, an input or the flow behind a level is negative.
     """
-    roots = [root(v, plant.knee) for v in r]
+    roots = [smooth_sqrt(v, plant.knee) for v in r]
     parts = [
         _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * one) for one in np.eye(len(r))
     ]

@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxtank.core.clock import Clock, pointwise
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.base import Actuator
 from jaxtank.signals.base import Signal
 
 
@@ -68,7 +68,7 @@ class Controller(abc.ABC):
         """True if the inputs depend on the coefficients of the law's own model."""
         return True
 
-    def check_pumps(self, actuator: PumpBank) -> None:  # noqa: B027
+    def check_pumps(self, actuator: Actuator) -> None:  # noqa: B027
         """Raise InputError for pumps whose limits, or whose input before t = 0, the law cannot work
         with.
         """

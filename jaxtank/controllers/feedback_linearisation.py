@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import floored_root
+from jaxtank.core.numerics import clipped_sqrt
 from jaxtank.plants.rigs import STATE_COUPLED_FEEDS, STATE_COUPLED_LINKS
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
@@ -94,7 +94,7 @@ def floored_roots(levels, floor):
     levels, so with a dry tank its command is zero and stays so: a floor of about 1 cm lets it
     restart (gouta2015 notes H3).
     """
-    return tuple(floored_root(h, floor) for h in levels)
+    return tuple(clipped_sqrt(h, floor) for h in levels)
 
 
 def decouple(c, s3, s4, v1, v2, scale=1.0):

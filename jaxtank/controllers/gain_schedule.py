@@ -10,20 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.controllers.base import Controller
+from jaxtank.core.checks import check_value
 from jaxtank.core.clock import Clock, pointwise
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.numerics import portion
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import (
-    check_value,
-    component,
-    describe,
-    get_value,
-    leaf,
-    parameters,
-    static,
-    with_values,
-)
+from jaxtank.core.tree import component, describe, get_value, leaf, parameters, static, with_values
 from jaxtank.signals.base import Signal
 from jaxtank.xla.reachability import use_of
 

@@ -18,7 +18,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.base import Actuator
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
@@ -172,7 +172,7 @@ class LinearPredictive(Controller):
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
 
-    def check_pumps(self, actuator: PumpBank) -> None:
+    def check_pumps(self, actuator: Actuator) -> None:
         """A quadratic programme that begins outside its range may have no answer."""
         if self.mode != "constrained":
             return

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
-from jaxtank.core.numerics import clip, signed_root, signed_root_slope
+from jaxtank.core.numerics import clip, smooth_signed_sqrt, smooth_signed_sqrt_slope
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.plants.base import Plant
@@ -41,12 +41,12 @@ def lower_tanks(model, x):
     """`LowerTanks` of a quadruple tank at levels x (4) [cm].
 
     phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
-    less the direct flow. The root is the smooth one (numerics.signed_root): its slope, which the
+    less the direct flow. The root is the smooth one (numerics.smooth_signed_sqrt): its slope, which the
     law needs, has no kink at an empty tank. It moves the rest at 12 cm by 6e-5 V.
     """
     w, area = jnp.sqrt(2.0 * model.gravity), [model.area[i] for i in range(4)]
-    q = [w * signed_root(h, model.knee) for h in x]
-    dq = [w * signed_root_slope(h, model.knee) for h in x]
+    q = [w * smooth_signed_sqrt(h, model.knee) for h in x]
+    dq = [w * smooth_signed_sqrt_slope(h, model.knee) for h in x]
     drain, link = [model.drain[i] for i in range(4)], [model.orifice[k] for k in range(2)]
     gain, split = model.pump_gain, model.split
     return LowerTanks(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import floored_root
+from jaxtank.core.numerics import clipped_sqrt
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
 from jaxtank.plants.network import TankNetwork
@@ -73,7 +73,7 @@ class TwoTankBackstepping(Controller):
         a1, a, b = self.coefficients()
         h1, h3 = estimate.x
         e = h3 - tick.plan[0]
-        s, Z = floored_root(h3, self.level_floor), floored_root(h1 - h3, self.difference_floor)
+        s, Z = clipped_sqrt(h3, self.level_floor), clipped_sqrt(h1 - h3, self.difference_floor)
         Y = Z - (b * s - self.K_phi * e) / a
         inner = ((b / (2.0 * s) - self.K_phi) / a) * (a * Z - b * s) - a * e - self.K_y * Y
         flow = self.model.area[0] * (2.0 * Z * (0.5 * (a1 + a) + inner) - b * s)

@@ -10,12 +10,12 @@ import functools
 import jax
 import jax.numpy as jnp
 
-ROOT_KNEE = 0.01
-"""Level below which `root` leaves the exact square root, in the rig's length unit [cm]."""
+LAMINAR_THRESHOLD = 0.01
+"""Level below which `smooth_sqrt` leaves the exact square root, in the rig's length unit [cm]."""
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
-def root(h, knee=ROOT_KNEE):
+def smooth_sqrt(h, knee=LAMINAR_THRESHOLD):
     r"""Square root of a level, C1 through zero and below.
 
     h: level (...) [cm]; returns (...) [cm^0.5].
@@ -37,15 +37,15 @@ def root(h, knee=ROOT_KNEE):
     return jnp.where(h >= knee, jnp.sqrt(h), film)
 
 
-@root.defjvp
-def _root_jvp(knee, primals, tangents):
+@smooth_sqrt.defjvp
+def _smooth_sqrt_jvp(knee, primals, tangents):
     (h,), (dh,) = primals, tangents
-    q = root(h, knee)
+    q = smooth_sqrt(h, knee)
     deep, film = h >= knee, 1.5 * knee**-0.5 - knee**-1.5 * jnp.where(h > 0.0, h, 0.0)
     return q, jnp.where(deep, 0.5 / jnp.where(deep, q, 1.0), film) * dh
 
 
-def signed_root(x, knee=ROOT_KNEE):
+def smooth_signed_sqrt(x, knee=LAMINAR_THRESHOLD):
     r"""Signed square root of a difference of levels, smooth through zero: what drives the flow in a
     pipe between two tanks.
 
@@ -60,23 +60,23 @@ def signed_root(x, knee=ROOT_KNEE):
     return x / jnp.sqrt(jnp.sqrt(x * x + knee * knee))
 
 
-def signed_root_slope(x, knee=ROOT_KNEE):
-    """Slope of `signed_root` (...) [cm^-0.5], smooth: (1 - x^2 / (2 (x^2 + knee^2))) / (x^2 +
+def smooth_signed_sqrt_slope(x, knee=LAMINAR_THRESHOLD):
+    """Slope of `smooth_signed_sqrt` (...) [cm^-0.5], smooth: (1 - x^2 / (2 (x^2 + knee^2))) / (x^2 +
     knee^2)^(1/4), knee^-1/2 at 0.
     """
     square = x * x + knee * knee
     return (1.0 - 0.5 * x * x / square) / jnp.sqrt(jnp.sqrt(square))
 
 
-def limited_root(h, knee, supply):
-    r"""Return the smaller of `root(h, knee)` and supply h; 0 below an empty tank.
+def limited_sqrt(h, knee, supply):
+    r"""Return the smaller of `smooth_sqrt(h, knee)` and supply h; 0 below an empty tank.
 
-    h : (...) level [cm].  knee : as in `root` [cm].  supply : largest ratio of root to level
-    [cm^-0.5], at most 1.5 knee^-0.5 (the slope of `root` at 0, which then holds nowhere).
+    h : (...) level [cm].  knee : as in `smooth_sqrt` [cm].  supply : largest ratio of root to level
+    [cm^-0.5], at most 1.5 knee^-0.5 (the slope of `smooth_sqrt` at 0, which then holds nowhere).
     Slope `supply` at h = 0, the one from above: a level comes no lower.
     """
-    held = at_least(h, 0.0)
-    q, most = root(held, knee), supply * held
+    held = lower_clip(h, 0.0)
+    q, most = smooth_sqrt(held, knee), supply * held
     return jnp.where(most <= q, most, q)
 
 
@@ -98,17 +98,17 @@ def _limited_flow_jvp(primals, tangents):
 
 
 @jax.custom_jvp
-def floored_root(h, floor):
+def clipped_sqrt(h, floor):
     """sqrt(max(h, floor)), floor > 0: the root a law takes of a level it multiplies or divides by.
     Slope 0 below the floor.
     """
     return jnp.where(h >= floor, jnp.sqrt(h), jnp.sqrt(floor))
 
 
-@floored_root.defjvp
-def _floored_root_jvp(primals, tangents):
+@clipped_sqrt.defjvp
+def _floored_smooth_sqrt_jvp(primals, tangents):
     (h, floor), (dh, dfloor) = primals, tangents
-    q = floored_root(h, floor)
+    q = clipped_sqrt(h, floor)
     return q, 0.5 / q * jnp.where(h >= floor, dh, dfloor)
 
 
@@ -133,7 +133,7 @@ def _magnitude_jvp(primals, tangents):
     return magnitude(x), jnp.sign(x) * dx
 
 
-def at_least(x, floor):
+def lower_clip(x, floor):
     """The larger of `x` and `floor`. Slope 1 in `x` at and above the floor, 0 below (jnp.maximum
     halves it at a tie).
     """

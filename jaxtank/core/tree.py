@@ -1,197 +1,73 @@
-"""Components, leaves and dotted names.
+"""Components, and the dotted names by which every leaf is reached: "controller.k1".
 
 A component is a frozen keyword-only dataclass that JAX sees as a pytree. Each field is a leaf (a
 number or an array that may be differentiated, with a unit and an allowed range), a static value
-(hashable: sizes, switching times, topologies), or another
-component. Dotted names reach every leaf: "controller.k1", "plant.drain[0]".
+(hashable: sizes, switching times, topologies), or another component.
 
 A constructor converts leaves given as lists and numbers. JAX rebuilds components without it, with
-whatever a transformation carries (tracers, batches, axes, placeholders). Checks: `check_leaves`.
+whatever a transformation carries (tracers, batches, axes, placeholders). Checks of values:
+`jaxtank.core.checks`. Imports core only; may be imported by every folder.
 """
 
 import dataclasses
-import functools
-import numbers
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, TypeVar, cast, dataclass_transform
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.fields import Meta, component, is_component, is_real, leaf, number, static
+from jaxtank.core.text import shortened
 from jaxtank.core.units import DEFAULT, local
 
-_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
+__all__ = [
+    "component",
+    "describe",
+    "get_value",
+    "is_component",
+    "is_real",
+    "leaf",
+    "number",
+    "parameters",
+    "split_index",
+    "static",
+    "walk",
+    "with_values",
+]
 
+_STEP = re.compile(r"([A-Za-z_]\w*)((?:\[\d+(?:,\d+)*\])?)")
 
 T = TypeVar("T")
 
 
-def leaf(
-    unit: str = "-",
-    doc: str = "",
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    strict: bool = False,
-    like: str | None = None,
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """A differentiable field: its unit, what it is, and the range in which it means something.
-
-    low, high: allowed range, or None; strict: the value `low` itself is excluded. `like` names a
-    sibling field: such a leaf may be absent (None), which costs the loop nothing, and takes the
-    shape of the sibling when it is set; type checkers see that it may be left out where
-    `default=None` is written beside it. default: function of {field: value} of the fields given,
-    whose result a leaf has that is left out.
-    """
-    meta = {
-        "kind": "leaf",
-        "unit": unit,
-        "doc": doc,
-        "low": low,
-        "high": high,
-        "strict": strict,
-        "like": like,
-    }
-    if callable(default):
-        meta["default"] = default
-    needed = like is None and default is dataclasses.MISSING
-    return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
-
-
-def static(
-    unit: str = "-",
-    doc: str = "",
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    strict: bool = False,
-    choices: tuple | None = None,
-    default: Any = dataclasses.MISSING,
-) -> Any:
-    """A field that is part of the compiled program: hashable, never an array. Ranges and choices as
-    in `leaf`.
-    """
-    meta = {
-        "kind": "static",
-        "unit": unit,
-        "doc": doc,
-        "low": low,
-        "high": high,
-        "strict": strict,
-        "choices": choices,
-    }
-    return dataclasses.field(metadata=meta, default=default)
-
-
-@dataclass_transform(
-    kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(leaf, static)
-)
-def component(cls: type[T]) -> type[T]:
-    """Make `cls` a frozen keyword-only dataclass and register it with JAX: static fields are its
-    metadata, the rest its data.
-
-    The constructor converts leaves given as numbers or lists and tuples of numbers to arrays
-    (`number`), and gives those that are left out their default.
-
-    >>> from jaxtank.instruments.actuators import PumpBank
-    >>> PumpBank(low=[0.0], high=[12.0]).pulse
-    array([12.])
-    """
-    cls = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
-    fields = dataclasses.fields(cast(Any, cls))
-    leaves = {f.name: f.metadata.get("default") for f in fields if f.metadata.get("kind") == "leaf"}
-    needed = {f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING}
-    construct = cast(Any, cls).__init__
-
-    @functools.wraps(construct)
-    def __init__(self, *args, **values):
-        for name in leaves.keys() & values.keys():
-            values[name] = _converted(values[name])
-        if needed <= values.keys():  # else dataclasses name what is missing
-            for name, default in leaves.items():
-                if default is not None and name not in values:
-                    values[name] = _converted(default(values))
-        construct(self, *args, **values)
-
-    cast(Any, cls).__init__ = __init__
-    _register(
-        cls,
-        tuple(f.name for f in fields if f.metadata.get("kind") != "static"),
-        tuple(f.name for f in fields if f.metadata.get("kind") == "static"),
-    )
-    return cls
-
-
-def _register(cls, data, meta):
-    """`jax.tree_util.register_dataclass`, which calls the constructor: its conversion must not see
-    what a transformation carries, such as the axes 0 and 1 of a vmap."""
-    keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
-
-    def flatten(tree):
-        values = vars(tree)
-        return tuple(values[name] for name in data), tuple(values[name] for name in meta)
-
-    def flatten_with_keys(tree):
-        children, static = flatten(tree)
-        return tuple(zip(keys, children)), static
-
-    def unflatten(static, children):
-        tree = object.__new__(cls)
-        vars(tree).update(zip(data, children), **dict(zip(meta, static)))
-        return tree
-
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
-
-
-def _converted(value):
-    """`number(value)` of a Python number and of a list or tuple of numbers; any other as it is."""
-    if type(value) in (int, float, list, tuple) and is_real(value):
-        try:
-            return number(value)
-        except (TypeError, ValueError, OverflowError):  # traced entries, rows of several lengths
-            return value
-    return value
-
-
-def is_component(value: Any) -> bool:
-    """True for an instance of a class made by `component`."""
-    return dataclasses.is_dataclass(value) and not isinstance(value, type)
-
-
-def number(value: Any) -> Any:
-    """`value` as a host array of the default float: the form in which constructors store leaves."""
-    return np.asarray(value, dtype=np.float64)
-
-
-def is_real(value: Any) -> bool:
-    """Whether a value, or every entry of a list or array, is a real number: no text, truth value,
-    complex number, random key or None.
-    """
-    if isinstance(value, list | tuple):
-        return all(is_real(v) for v in value)
-    kind = getattr(value, "dtype", None)
-    if kind is None:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if kind == np.dtype(object):  # whole numbers of 2^64 and more, or anything
-        return all(is_real(v) for v in np.ravel(value).tolist())
-    # jnp: its own short floats too
-    return jnp.issubdtype(kind, np.integer) or jnp.issubdtype(kind, np.floating)
-
-
 def walk(
     tree: Any, prefix: str = "", kind: str = "leaf", units: tuple[str, str] = DEFAULT
-) -> Iterator[tuple[str, Any, dict[str, Any]]]:
-    """Yield (dotted name, value, metadata) of every field of `kind` ("leaf" or "static") below
-    `tree`, units as the rig counts.
+) -> Iterator[tuple[str, Any, Meta]]:
+    """Yield every field of one kind below a component, in the order of its fields.
 
-    A component whose fields mean what another one's do (the gains in `controllers.Scheduled`) has a
-    method `metadata_of(field)` that returns what to change of the class's metadata; "rows" in it is
-    the metadata of each row of an array.
+    A component whose fields mean what those of another do (the gains in `controllers.Scheduled`)
+    has a method `metadata_of(field)` that returns what to change of the metadata of its class;
+    "rows" in it is the metadata of each row of an array.
+
+    Parameters
+    ----------
+    tree : component
+    prefix : what the names begin with
+    kind : "leaf" or "static"
+    units : (length, pump input) in which units are written, unless `tree` has its own
+
+    Yields
+    ------
+    (dotted name, value, metadata: unit, doc, low, high, strict and more)
+
+    Examples
+    --------
+    >>> from jaxtank.signals import ramps
+    >>> [name for name, *_ in walk(ramps([3.0], []), "reference.")]
+    ['reference.initial', 'reference.targets']
     """
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
@@ -199,20 +75,51 @@ def walk(
         if is_component(value):
             yield from walk(value, f"{name}.", kind, units)
         elif field.metadata.get("kind") == kind:
-            own = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
+            own: Meta = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
             yield name, value, _localised({**field.metadata, **own}, units)
 
 
 def parameters(tree: Any) -> dict[str, Any]:
-    """{dotted name: value} of every leaf of a component (a loop, a plant, a law). Absent optional
-    leaves are left out.
+    """Return every leaf of a component by its dotted name, absent optional ones left out.
+
+    Parameters
+    ----------
+    tree : component: a loop, a plant, a controller
+
+    Returns
+    -------
+    {dotted name: value}
+
+    Examples
+    --------
+    >>> from jaxtank.signals import ramps
+    >>> parameters(ramps([3.0], []))
+    {'initial': array([3.]), 'targets': array([], dtype=float64)}
     """
     return {name: value for name, value, _ in walk(tree) if value is not None}
 
 
-def describe(tree: Any, name: str) -> dict[str, Any]:
-    """The metadata (unit, doc, low, high, strict) of the leaf or static field `name`; InputError if
-    there is none.
+def describe(tree: Any, name: str) -> Meta:
+    """Return the metadata of a leaf or static field.
+
+    Parameters
+    ----------
+    tree : component
+    name : dotted name, with or without an index
+
+    Returns
+    -------
+    {"unit", "doc", "low", "high", "strict", ...}
+
+    Raises
+    ------
+    InputError where there is none, naming the closest ones.
+
+    Examples
+    --------
+    >>> from jaxtank.instruments import LevelSensor
+    >>> describe(LevelSensor(noise=[0.1]), "noise")["unit"]
+    'cm'
     """
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
@@ -224,8 +131,22 @@ def describe(tree: Any, name: str) -> dict[str, Any]:
 
 
 def get_value(tree: Any, name: str) -> Any:
-    """The value of the leaf `name`, an entry of it for "name[i]" or "name[i,j]"; InputError if
-    there is none.
+    """Return the value of a leaf, or one entry of it.
+
+    Parameters
+    ----------
+    tree : component
+    name : dotted name; "name[i]" or "name[i,j]" for an entry
+
+    Raises
+    ------
+    InputError for an unknown name, an entry that does not exist, and a leaf that is not in use.
+
+    Examples
+    --------
+    >>> from jaxtank.instruments import LevelSensor
+    >>> float(get_value(LevelSensor(noise=[0.1, 0.2]), "noise[1]"))
+    0.2
     """
     base, index = split_index(name)
     values = parameters(tree)
@@ -239,13 +160,29 @@ def get_value(tree: Any, name: str) -> Any:
 
 
 def with_values(tree: T, values: Mapping[str, Any]) -> T:
-    """A copy of `tree` with the leaves named in `values` replaced.
+    """Return a copy of a component with some leaves replaced.
 
-    values: {dotted name: number or array}; "name[i]" sets one entry, a number for an array leaf
-        fills it.
-    Works under jit, vmap and grad: the values may be traced. Raises InputError for an unknown name
-    (with the three closest), for a value that is no real number (a text, a truth value, a complex
-    number, None) and for one of the wrong shape.
+    Works under jit, vmap and grad: the values may be traced.
+
+    Parameters
+    ----------
+    tree : component
+    values : {dotted name: number or array}; "name[i]" sets one entry, a number fills an array
+
+    Returns
+    -------
+    A component of the same class
+
+    Raises
+    ------
+    InputError for an unknown name (with the three closest), for a value that is no real number (a
+    text, a truth value, a complex number, None) and for one of the wrong shape.
+
+    Examples
+    --------
+    >>> from jaxtank.instruments import LevelSensor
+    >>> with_values(LevelSensor(noise=[0.1, 0.2]), {"noise[0]": 0.3}).noise
+    array([0.3, 0.2])
     """
     for name, value in values.items():
         base, index = split_index(name)
@@ -263,8 +200,16 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
 
 
 def split_index(name: str) -> tuple[str, tuple[int, ...]]:
-    """("plant.drain", (0,)) of "plant.drain[0]"; ("plant.drain", ()) without an index. InputError
-    for a malformed name.
+    """Return a dotted name without its index, and the index.
+
+    Raises
+    ------
+    InputError for a malformed name.
+
+    Examples
+    --------
+    >>> split_index("plant.drain[0]"), split_index("plant.drain")
+    (('plant.drain', (0,)), ('plant.drain', ()))
     """
     parts = name.split(".")
     last = _STEP.fullmatch(parts[-1])
@@ -281,75 +226,17 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
     return ".".join([*parts[:-1], base]), index
 
 
-def check_leaves(tree: Any, names: Iterable[str] | None = None, vacant: Iterable[str] = ()) -> None:
-    """Raise InputError if a concrete leaf is no real number, not finite or out of its range. Traced
-    leaves are passed over, and so is None of an optional leaf and of the names in `vacant`, which a
-    schedule fills.
-    """
-    for name, value, meta in walk(tree):
-        if names is not None and name not in names:
-            continue
-        if isinstance(value, Tracer) or (
-            value is None and (meta.get("like") is not None or name in vacant)
-        ):
-            continue
-        check_value(name, value, meta)
-
-
-def check_value(name, value, meta):
-    """Raise InputError unless every entry of `value` is finite and within the range in `meta`."""
-    if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
-        raise InputError(
-            f"{name} = {shortened(value)}: must be a number or an array, np.array(...)"
-        )
-    if not is_real(value):
-        raise InputError(
-            f"{name} = {shortened(value)}: must be a real number or an array of real numbers"
-        )
-    array, low, high = np.asarray(value), meta["low"], meta["high"]
-    # whole numbers of 2^64 and more are no numbers to numpy
-    array = number(value) if array.dtype == object else array
-    good = np.isfinite(array)
-    if low is not None:
-        good = good & ((array > low) if meta["strict"] else (array >= low))
-    if high is not None:
-        good = good & (array <= high)
-    if np.all(good):
-        return
-    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-    index = tuple(int(i) for i in np.argwhere(~good)[0])
-    entry, label = array[index], name + (f"[{','.join(map(str, index))}]" if index else "")
-    if not np.isfinite(entry):
-        raise InputError(f"{label} = {entry}{unit}: must be a finite number")
-    if high is not None and entry > high:
-        raise InputError(f"{label} = {entry:g}{unit}: must be at most {high:g}{unit}")
-    raise InputError(
-        f"{label} = {entry:g}{unit}: must be {'above' if meta['strict'] else 'at least'}"
-        f" {low:g}{unit}"
-    )
-
-
-def shortened(value):
-    """`value` for a message, cut where it would fill the screen."""
-    try:
-        text = repr(value)
-    # an int of thousands of digits, or a list in a list in a list ...
-    except (ValueError, RecursionError):
-        return f"a {type(value).__name__} too large to print"
-    text = text.replace("\n", " ")  # of an array
-    return text if len(text) <= 80 else f"{text[:77]}..."
-
-
-def _localised(meta, units):
+def _localised(meta: Meta, units: tuple[str, str]) -> Meta:
+    """`meta` with its unit, and those of its rows, in the units of a rig."""
     rows = {"rows": tuple(_localised(row, units) for row in meta["rows"])} if "rows" in meta else {}
     return {**meta, "unit": local(meta["unit"], units), **rows}
 
 
-def _all_names(tree):
+def _all_names(tree: Any) -> list[str]:
     return [name for kind in ("leaf", "static") for name, _, _ in walk(tree, kind=kind)]
 
 
-def _entry(value, index, name):
+def _entry(value: Any, index: tuple[int, ...], name: str) -> Any:
     if not index:
         return value
     if len(index) != np.ndim(value) or any(i >= n for i, n in zip(index, np.shape(value))):
@@ -359,34 +246,31 @@ def _entry(value, index, name):
     return value[index]
 
 
-def _replace(tree, path, index, value, name):
-    head, rest = path[0], path[1:]
-    fields = {f.name: f for f in dataclasses.fields(tree)}
+def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name: str) -> T:
+    """`tree` with the leaf at the end of `path` replaced; LookupError where there is none."""
+    head, further = path[0], path[1:]
+    fields = {f.name: f for f in dataclasses.fields(cast(Any, tree))}
     if head not in fields:
         raise LookupError(name)
     child = getattr(tree, head)
-    if rest:
+    if further:
         if not is_component(child):
             raise LookupError(name)
-        return dataclasses.replace(tree, **{head: _replace(child, rest, index, value, name)})
-    if is_component(child) or fields[head].metadata.get("kind") != "leaf":
-        raise LookupError(name)
-    like = fields[head].metadata.get("like")
-    if child is None and like is not None:
-        child = np.zeros(np.shape(getattr(tree, like)))
-    return dataclasses.replace(tree, **{head: _fitted(child, index, value, name)})
+        new = _replace(child, further, index, value, name)
+    else:
+        if is_component(child) or fields[head].metadata.get("kind") != "leaf":
+            raise LookupError(name)
+        like = fields[head].metadata.get("like")
+        if child is None and like is not None:
+            child = np.zeros(np.shape(getattr(tree, like)))
+        new = _fitted(child, index, value, name)
+    return cast(T, dataclasses.replace(cast(Any, tree), **{head: new}))
 
 
-def _fitted(old, index, value, name):
+def _fitted(old: Any, index: tuple[int, ...], value: Any, name: str) -> Any:
     """`value` in the shape and type of the leaf `old`; a number fills, an index sets one entry."""
     on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
-    wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
-    if not is_real(value):  # numpy would make 1 of True, 3 of "3", and drop what is imaginary
-        raise InputError(f"{name} = {shortened(value)}: {wanted}")
-    try:
-        value = jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} = {shortened(value)}: {wanted}") from None
+    value = _real(old, value, name, on_device)
     shape = np.shape(old)
     if index:
         _entry(old, index, name)
@@ -407,3 +291,14 @@ def _fitted(old, index, value, name):
         else "must be one number, its decimals after a point"
     )
     raise InputError(f"{name} has shape {np.shape(value)}: {wanted}")
+
+
+def _real(old: Any, value: Any, name: str, on_device: bool) -> Any:
+    """`value` as an array of floats; InputError for what is no real number."""
+    try:
+        if is_real(value):  # numpy would make 1 of True, 3 of "3", and drop what is imaginary
+            return jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")
+    raise InputError(f"{name} = {shortened(value)}: {wanted}")

@@ -1,201 +1,216 @@
-"""A controller and its observer as statements, and what the printers of all languages share."""
+"""How statements are printed: templates that a language fills in, and the header of a file.
 
-import functools
+Imported by the languages of this folder and by languages from outside.
+"""
+
 import re
+from collections.abc import Mapping
 
-import jax
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Tick
-from jaxtank.export import lowering as cg
-from jaxtank.loop.closed_loop import initial
-from jaxtank.loop.step import decide
+from jaxtank.core.tree import walk
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Array, Define, Loop, Matrix, Ref, Until
+
+WIDTH = 126
+"""Length of a line of an array, without its indentation."""
+
+OPERATIONS = {
+    "add": "{0} + {1}",
+    "sub": "{0} - {1}",
+    "mul": "{0} * {1}",
+    "div": "{0} / {1}",
+    "neg": "-{0}",
+    "square": "{0} * {0}",
+    "lt": "{0} < {1}",
+    "le": "{0} <= {1}",
+    "gt": "{0} > {1}",
+    "ge": "{0} >= {1}",
+    "eq": "{0} == {1}",
+    "truth": "{0} != 0",
+}
+"""Operations that most languages write in the same way, as formats of their arguments."""
+
+_FUNCTIONS = """
+sqrt exp log tanh sin cos floor erf erfc log1p expm1 tan asin acos atan sinh cosh asinh acosh atanh
+ceil
+"""
+FUNCTIONS = _FUNCTIONS.split()
+"""Functions of one number that most languages have by the same name; atan2 is one of two."""
 
 
-def law_of(case):
-    """(step, begin): functions of one sample, of arrays.
+class Printer:
+    """The statements of a language: templates, of which a derived class sets its own.
 
-    step(state, t, y, r, dr, ddr) -> (u, state): t [s]; y: (tanks,) readings; r, dr, ddr: (outputs,)
-    setpoints with their first and second derivatives by time; u: (pumps,) inputs within the pumps'
-    limits. begin(y, u) -> state, for readings and inputs before the first sample. The order is that
-    of `jaxtank.loop.step.decide`, which is called.
+    The right side of a statement is a format of its arguments, which are variables and numbers; a
+    language without a counterpart for an operation leaves it out, and its use is an InputError.
+
+    Examples
+    --------
+    >>> statement = Define(REAL, "v1", "mul", (Ref("y", 0), 2.0))
+    >>> Printer().lines([statement])
+    ['    v1 = y[0] * 2.0;']
     """
-    loop, dt = case.loop, case.clock.dt
 
-    def one(array):
-        return tuple(array[i] for i in range(array.shape[0]))
+    operations: Mapping[str, str] = OPERATIONS
+    kinds: Mapping[str, str] = {REAL: "", WHOLE: "", TRUTH: ""}
+    rename: Mapping[str, str] = {}
+    """{argument of the program (s, t, y, r, dr, ddr, u): what it is called}."""
+    first = 0
+    """Index of the first entry of an array."""
+    entry = "{0}[{1}]"
+    real = "{0}"
+    truths = ("false", "true")
+    nan, infinity = "NAN", "INFINITY"
+    assign = constant = variable = "{name} = {value};"
+    open_array, close_array, line_break = "{name} = [", "];", ""
+    matrix_call = ""
+    """A Matrix statement, of name, op, size and arguments; "": the language has none."""
+    counted, endless, end = "for i = 1:{0}", "while true", "end"
+    until = "if not ({0}) break"
 
-    def begin(y, u):
-        return loop.observer.init(one(y)), loop.controller.init(one(y), one(u))
+    def value(self, e):
+        """Return a number or a Ref as text."""
+        if isinstance(e, Ref):
+            name = self.rename.get(e.name, e.name)
+            return name if e.index is None else self.entry.format(name, e.index + self.first)
+        if isinstance(e, bool):
+            return self.truths[e]
+        if np.isnan(e):
+            return self.nan
+        if np.isinf(e):
+            return self.infinity if e > 0 else f"(-{self.infinity})"
+        text = f"({e!r})" if str(e).startswith("-") else repr(e)
+        return text if isinstance(e, int) else self.real.format(text)
 
-    def step(state, t, y, r, dr, ddr):
-        observer, controller = state
-        r, dr, ddr = map(one, (r, dr, ddr))
-        samples = [tuple(v[None] for v in signal) for signal in (r, dr, ddr)]
-        plan = jax.tree.map(lambda a: a[0], loop.controller.prepare(*samples))
-        tick = Tick(t=t, r=r, dr=dr, ddr=ddr, dt=dt, plan=plan, own=())
-        made = decide(loop, observer, controller, tick, one(y))
-        return jax.numpy.stack(list(made.applied)), (made.observer, made.controller)
+    def right(self, op, args):
+        """Return op(args) as an expression."""
+        if op not in self.operations:
+            raise InputError(f"--lang: this language has no counterpart of the operation {op}")
+        return self.operations[op].format(*map(self.value, args))
 
-    return step, begin
+    def lines(self, statements, indent="    "):
+        """Return the lines of a list of statements."""
+        methods = {
+            Define: self._define,
+            Array: self._array,
+            Matrix: self._matrix,
+            Until: self._until,
+            Loop: self._loop,
+        }
+        return [indent + line for s in statements for line in methods[type(s)](s)]
+
+    def _set(self, template, kind, name, value):
+        return template.format(kind=self.kinds[kind], name=name, value=value)
+
+    def _define(self, s):
+        return [self._set(self.constant, s.kind, s.name, self.right(s.op, s.args))]
+
+    def _array(self, s):
+        rows, line = [], self.open_array.format(name=s.name, size=len(s.entries))
+        for item in map(self.value, s.entries):
+            if len(line) + len(item) > WIDTH:
+                rows.append(line.rstrip() + self.line_break)
+                line = "    "
+            line += f"{item}, "
+        return [*rows, line.rstrip(", ") + self.close_array]
+
+    def _matrix(self, s):
+        if not self.matrix_call:
+            raise InputError(f"--lang: this language has no counterpart of the operation {s.op}")
+        rows = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}
+        size = rows.get(s.op, lambda n, k: n * k)(*s.sizes)
+        arguments = ", ".join([*map(str, s.sizes), *s.operands])
+        call = self.matrix_call.format(name=s.name, op=s.op, size=size, arguments=arguments)
+        return call.split("\n")
+
+    def _until(self, s):
+        return [self.until.format(self.value(s.test))]
+
+    def _loop(self, s):
+        lines = [self._set(self.variable, k, n, self.value(start)) for k, n, start in s.carried]
+        lines.append(self.endless if s.count is None else self.counted.format(s.count))
+        lines += self.lines(s.body)
+        for (kind, name, _), new in zip(s.carried, s.new):
+            lines.append("    " + self._set(self.constant, kind, f"n{name}", self.value(new)))
+        for kind, name, _ in s.carried:
+            lines.append("    " + self._set(self.assign, kind, name, f"n{name}"))
+        return [*lines, self.end] if self.end else lines
 
 
 def function_name(case):
-    """The name of a Case with what no language allows in a name as _."""
+    """Return the name of a case with each character that no language allows replaced by _.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> function_name(presets.find("gouta2022/pi-ff"))
+    'gouta2022_pi_ff'
+    """
     return re.sub(r"[^A-Za-z0-9]+", "_", case.name).strip("_")
 
 
 def comment(text):
-    """`text` as what may stand in a comment of C and of MATLAB, on one line that ends nothing and
-    goes on nowhere.
+    """Return a text as one line that may stand in a comment of any language and does not end it.
 
-    Characters that do not print, line breaks of every script among them, are spaces; a backslash is
-    a slash; the ends of comments and the trigraphs of C are taken apart.
+    Characters that do not print, line breaks of every script among them, are replaced by spaces,
+    backslashes by slashes; the ends of comments and the trigraphs of C are taken apart.
+
+    Examples
+    --------
+    >>> comment("a */ int b;")
+    'a * / int b;'
     """
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
     return re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
 
 
-class Code:
-    """Statements of begin and step, and the sizes of what goes in and out."""
+def header(program, mark, call, begin):
+    """Return the comment at the top of a file: the case, the arguments with units, the gains.
 
-    def __init__(self, case):
-        loop = case.loop
-        step, begin = law_of(case)
-        self.tanks, self.outputs, self.pumps = (
-            loop.plant.tanks,
-            len(loop.plant.outputs),
-            loop.plant.pumps,
-        )
-        real = functools.partial(jax.ShapeDtypeStruct, dtype=jax.numpy.result_type(float))
-        y, r, u = real((self.tanks,)), real((self.outputs,)), real((self.pumps,))
-        # what a state begins with need not have the type it goes on with: a number from the law, an
-        # array from the run
-        ran = initial(loop, case.clock)
-        state = jax.tree.map(
-            lambda a: jax.ShapeDtypeStruct(np.shape(a), jax.numpy.result_type(a)),
-            (ran.observer, ran.controller),
-        )
-        self.state = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(state))
-        self.begin, _, first = cg.function(begin, y, u)
-        self.step, _, after = cg.function(step, state, real(()), y, r, r, r)
-        self.begun = [e for leaf in first for e in np.ravel(leaf)]
-        self.u, self.after = (
-            list(after[0].ravel()),
-            [e for leaf in after[1:] for e in np.ravel(leaf)],
-        )
-        if not len(self.begun) == len(self.after) == self.state:
-            raise InputError(
-                f"{case.name}: its law begins with a state of another size than it goes on with"
-            )
+    Parameters
+    ----------
+    program : Program
+    mark : what a line of the comment begins with
+    call : name of the function to call in each period
+    begin : sentence on the first period
 
+    Returns
+    -------
+    list of lines
 
-SAME_NAME = (
-    "erf",
-    "erfc",
-    "log1p",
-    "expm1",
-    "tan",
-    "asin",
-    "acos",
-    "atan",
-    "atan2",
-    "sinh",
-    "cosh",
-    "asinh",
-    "acosh",
-    "atanh",
-    "ceil",
-)
-"""Functions that C and MATLAB have by the same name."""
-
-
-def wrapped(head, items, indent, tail, width=130, more=""):
-    rows, line = [], head
-    for item in items:
-        if len(line) + len(item) > width:
-            rows.append(line.rstrip() + more)
-            line = indent + "    "
-        line += f"{item}, "
-    return [*rows, line.rstrip(", ") + tail]
-
-
-MATHS = (
-    "sqrt",
-    "fabs",
-    "exp",
-    "log",
-    "tanh",
-    "sin",
-    "cos",
-    "floor",
-    "pow",
-    "rint",
-    "fmod",
-    "cbrt",
-    "exp2",
-    *SAME_NAME,
-)
-
-
-def header(law, case, mark, name, begin):
-    """What the file says of itself."""
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> from jaxtank.export.program import program
+    >>> lines = header(program(presets.find("cascaded/pi")), "#", "step", "")
+    >>> lines[0]
+    '# cascaded/pi: two tanks in cascade, PI'
+    """
+    case = program.case
     length, drive = case.loop.units
-    gains = [(n, v) for n, v in sorted(_shown(case).items())]
+    outputs, pumps = (s * (n > 1) for s, n in (("s", program.outputs), ("s", program.pumps)))
     lines = [
         f"{case.name}: {case.title}",
-        (
-            "Made by `jaxtank export` from the law and observer that jaxtank simulates; not to be"
-            " edited."
-        ),
+        "Generated by `jaxtank export` from the controller and the observer that jaxtank"
+        " simulates. Do not edit.",
         "",
-        (
-            f"Sampling period {case.clock.dt:g} s: call {name}{'_step' if mark != '%' else ''} once"
-            " each period."
-        ),
-        (
-            f"t: time [s]; y: {law.tanks} measured levels [{length}], of every tank in the order of"
-            " the rig;"
-        ),
-        (
-            f"r, dr, ddr: {law.outputs} setpoint{'s' if law.outputs > 1 else ''} [{length}], with"
-            f" first [{length}/s] and second [{length}/s^2] derivative;"
-        ),
-        (
-            f"u: {law.pumps} pump input{'s' if law.pumps > 1 else ''} [{drive}], within the limits"
-            f" of the pumps. {begin}"
-        ),
+        f"Sampling period {case.clock.dt:g} s: call {call} once each period.",
+        f"t: time [s]; y: {program.tanks} measured levels [{length}], of every tank in the order of"
+        " the rig;",
+        f"r, dr, ddr: {program.outputs} setpoint{outputs} [{length}], with first [{length}/s] and"
+        f" second [{length}/s^2] derivative;",
+        f"u: {program.pumps} pump input{pumps} [{drive}], within the limits of the pumps. {begin}",
         "",
-        *(f"{n} = {v}" for n, v in gains),
+        *sorted(_gains(case)),
     ]
     return [f"{mark} {comment(line)}".rstrip() for line in lines]
 
 
-def _shown(case):
-    from jaxtank.core.tree import walk
-
-    found = {}
+def _gains(case):
+    """A line for each parameter of the controller: name, value and unit."""
     for name, value, meta in walk(case.loop.controller, "controller.", units=case.loop.units):
         if value is not None and ".model." not in name:
             unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-            found[name] = (
-                f"{np.array2string(np.asarray(value), separator=', ', precision=10, threshold=64).replace(chr(10), '')}{unit}"
-            )
-    return found
-
-
-def as_real(printer, e):
-    text = printer.value(e)
-    return f"(real)({text})" if not isinstance(e, float) else text
-
-
-def every(statements):
-    for s in statements:
-        yield s
-        if isinstance(s, cg.Loop):
-            yield from every(s.body)
-
-
-def has(statements, kind):
-    return any(isinstance(s, kind) for s in every(statements))
+            text = np.array2string(np.asarray(value), separator=", ", precision=10, threshold=64)
+            yield f"{name} = {text.replace(chr(10), '')}{unit}"

@@ -1,60 +1,141 @@
-"""A law and its observer as one file without dependencies: C99, or a MATLAB function, made from the
-same step function that is simulated.
+"""A controller and its observer as one source file without dependencies: `export` and `register`.
+
+The file is made from the step function that is simulated. Imported by users and the command line.
 """
 
 import re
+from collections.abc import Callable, Collection
+from typing import NamedTuple
 
+from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
-from jaxtank.export.c import C_CALLS, print_c
-from jaxtank.export.matlab import TAKEN_M, print_matlab
-from jaxtank.export.printer import SAME_NAME, Code, function_name
+from jaxtank.export.c import print_c
+from jaxtank.export.matlab import RESERVED, print_matlab
+from jaxtank.export.printer import function_name
+from jaxtank.export.program import Program, program
 
-LANGUAGES = ("c", "m")
 PRECISIONS = ("double", "float")
 
 
-def export(case, language="c", precision="double", name=None):
-    """The law of a Case as source code.
+class Language(NamedTuple):
+    """A language to export to.
 
-    language: "c" (C99) or "m" (MATLAB); precision: "double" or "float" (of C); name: of the
-    functions, made from the case's where None. Returns the text of one file. Raises InputError for
-    a law that plays a signal back, and one that uses an operation without a counterpart.
+    write : function (program, name, precision) -> text of one file, where program is a
+        `jaxtank.export.program.Program`
+    precisions : those of "double" and "float" that it has
+    reserved : names that the function may not have
+
+    Examples
+    --------
+    >>> LANGUAGES["m"].precisions
+    ('double',)
+    """
+
+    write: Callable[[Program, str, str], str]
+    precisions: tuple = ("double",)
+    reserved: Collection[str] = ()
+
+
+LANGUAGES = {"c": Language(print_c, PRECISIONS), "m": Language(print_matlab, reserved=RESERVED)}
+"""{name, which is also the suffix of the file: Language}."""
+
+
+def register(name: str, language: Language) -> Language:
+    """Add a language to those of `export` and of `jaxtank export --lang`.
+
+    Parameters
+    ----------
+    name : letters and digits; it is also the suffix of the file
+    language : Language
+
+    Returns
+    -------
+    The language.
+
+    Raises
+    ------
+    InputError
+        For a name that is taken by another language, or is not letters and digits.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> _ = register("txt", Language(lambda program, name, precision: f"{name}: {program.state}"))
+    >>> export(presets.find("cascaded/pi"), "txt", name="tanks")
+    'tanks: 2'
+    """
+    if not (isinstance(name, str) and re.fullmatch("[A-Za-z0-9]+", name)):
+        raise InputError(f"language {name!r}: must be a text of letters and digits, as 'c'")
+    if LANGUAGES.get(name, language) != language:
+        raise InputError(f"language {name!r} is taken: choose another name")
+    LANGUAGES[name] = language
+    return language
+
+
+def export(
+    case: Case, language: str = "c", precision: str = "double", name: str | None = None
+) -> str:
+    """Return the controller and observer of a case as source code.
+
+    Parameters
+    ----------
+    case : Case
+    language : "c" (C99), "m" (MATLAB), or one that was added by `register`
+    precision : "double" or, in C, "float"
+    name : of the functions; None: made from the case's
+
+    Returns
+    -------
+    The text of one file.
+
+    Raises
+    ------
+    InputError
+        For an option that is not offered, a controller that plays a signal back, and one that uses
+        an operation without a counterpart in the language.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> text = export(presets.find("cascaded/pi"), "m", name="tanks")
+    >>> text.split("(")[0]
+    'function [u, s] = tanks'
     """
     if language not in LANGUAGES:
         raise InputError(f"--lang {language!r}: must be one of {', '.join(LANGUAGES)}")
     if precision not in PRECISIONS:
         raise InputError(f"--precision {precision!r}: must be one of {', '.join(PRECISIONS)}")
-    if language == "m" and precision == "float":
-        raise InputError("--precision float: is for C; MATLAB computes in double")
-    if isinstance(case.loop.controller, OpenLoop):
+    target = LANGUAGES[language]
+    if precision not in target.precisions:
         raise InputError(
-            f"{case.name}: its law plays a signal back and feeds nothing back: there is nothing to"
-            " export"
+            f"--precision {precision}: --lang {language} has {' and '.join(target.precisions)} only"
         )
-    if case.loop.controller.inputs(case.clock) != ():
+    controller = case.loop.controller
+    if isinstance(controller, OpenLoop) or controller.inputs(case.clock) != ():
         raise InputError(
-            f"{case.name}: its law plays a signal of its own back, which code without a run cannot"
-            " have"
+            f"{case.name}: its controller plays a signal back, and exported code holds no signals"
         )
-    given, name = name, name or function_name(case)
+    name = _checked_name(case, name, target.reserved)
+    return target.write(program(case), name, precision)
+
+
+def _checked_name(case, given, reserved):
+    """The name of the functions. Raises InputError for one that the language does not allow."""
+    name = given or function_name(case)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,50}", name):
-        whose = (
+        source = (
             f"--name {given!r}"
             if given
             else f"{case.name!r} gives no name for the function; --name NAME"
         )
         raise InputError(
-            f"{whose}: must be a name in the language: letters, digits and _, beginning with a"
-            " letter, at most 51"
+            f"{source}: must be letters, digits and _, begin with a letter and have at most 51"
+            " characters"
         )
-    if language == "m" and name in TAKEN_M.split():
+    if name in reserved:
         raise InputError(
-            f"--name {name!r}: MATLAB, or the file itself, has this name already; give another"
+            f"--name {name!r}: the language, or the file itself, has this name already; choose"
+            " another"
         )
-    law = Code(case)
-    return (print_c if language == "c" else print_matlab)(law, case, name, precision)
-
-
-C_CALLS |= {name: name.upper() for name in (*SAME_NAME, "cbrt", "exp2")}
-C_CALLS |= {"max": "MAX", "min": "MIN", "round": "RINT", "rem": "FMOD", "is_finite": "isfinite"}
+    return name

@@ -9,9 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
-from jaxtank.core.numerics import at_least, clip
+from jaxtank.core.numerics import clip, lower_clip
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.instruments.base import Actuator
 
 SATURATIONS = ("clip", "boxqp")
 DEAD_ZONES = ("plain", "offset", "hysteresis", "pulse")
@@ -34,7 +36,7 @@ def _largest(high):
 
 
 @component
-class PumpBank:
+class PumpBank(Actuator):
     """m pumps: what reaches the plant for a command u. `PumpBank(low=[0.0], high=[12.0])` suffices.
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the
@@ -89,95 +91,85 @@ class PumpBank:
     )
 
     @property
-    def pumps(self) -> int:
-        """Number of pumps m [-]."""
-        return np.shape(self.low)[-1]
+    def allocates(self) -> bool:
+        return self.saturation == "boxqp"
+
+    @property
+    def offset(self) -> Any:
+        return self.dead_zone if self._has_dead_zone("offset") else 0.0
+
+    def check(self) -> None:
+        check_order("actuator", self, "low", "high")
+        if self._has_dead_zone("hysteresis"):
+            check_order("actuator", self, "stop", "dead_zone", equal=True)
+        if self._has_dead_zone("pulse"):
+            check_order("actuator", self, "dead_zone", "pulse")
+            check_order("actuator", self, "pulse", "high", equal=True)
+
+    def _has_dead_zone(self, *kinds):
+        """Whether there is a dead zone of one of these kinds."""
+        return self.dead_zone is not None and self.dead_zone_kind in kinds
 
     def init(self, clock: Clock) -> ActuatorState:
-        """State before the first sample: pumps turning steadily at `initial`."""
-        pumps, delay = range(self.pumps), round(self.delay / clock.dt)
-        start = tuple(self.initial[i] for i in pumps)
+        """Return the state before the first sample: pumps turning steadily at `initial`."""
+        start = tuple(self.initial[i] for i in range(self.pumps))
         zero = tuple(0.0 * s for s in start)
+        delay = round(self.delay / clock.dt)
         return ActuatorState(
-            running=(
-                tuple(z + 1.0 for z in zero)
-                if self.dead_zone is not None and self.dead_zone_kind == "hysteresis"
-                else ()
-            ),
-            owed=zero if self.dead_zone is not None and self.dead_zone_kind == "pulse" else (),
+            running=tuple(z + 1.0 for z in zero) if self._has_dead_zone("hysteresis") else (),
+            owed=zero if self._has_dead_zone("pulse") else (),
             lagged=self._turning(start) if self.lag is not None else (),
             line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
             head=jnp.int32(0),
         )
 
-    def limit(self, command: Sequence[Any], metric: Any = None) -> tuple[Any, ...]:
-        """(m) voltages within the limits [V] for a command (m) [V]; metric: (g11, g12, g22) for
-        "boxqp", or None.
-        """
-        if self.saturation == "boxqp":
+    def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
+        if self.allocates:
             return allocate(command, metric, self.low, self.high)
-        return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+        return super().limit(command, metric)
 
-    def step(
-        self, state: ActuatorState, command: Sequence, metric: tuple | None, dt: Any
-    ) -> tuple[tuple, ActuatorState]:
-        """((m) voltages at the plant [V], new state) for a command (m) [V]: `limit`, then
-        `deliver`.
-        """
-        return self.deliver(state, self.limit(command, metric), dt)
-
-    def deliver(
-        self, state: ActuatorState, u: tuple[Any, ...], dt: Any
-    ) -> tuple[tuple[Any, ...], ActuatorState]:
-        """((m) voltages at the plant [V], new state) for voltages u (m) within the limits [V]: dead
-        zone, lag, delay.
-        """
-        if self.dead_zone is not None and self.dead_zone_kind != "offset":
+    def step(self, state: ActuatorState, applied: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
+        u = applied
+        if self._has_dead_zone("plain", "hysteresis", "pulse"):
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
-            u = self._turning(u)
-            # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
-            slow = [self.lag[i] > 0 for i in range(self.pumps)]
-            keep = [
-                jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0)
-                for i, s in enumerate(slow)
-            ]
-            # v at the start of the sample, from where it is drawn to
-            short = [v - u[i] for i, v in enumerate(state.lagged)]
-            state = state._replace(lagged=tuple(u[i] + keep[i] * s for i, s in enumerate(short)))
-            u = tuple(u[i] + self.lag[i] / dt * (1.0 - keep[i]) * s for i, s in enumerate(short))
-        if state.line:
-            head = state.head
-            out = tuple(
-                jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line
-            )
-            line = tuple(
-                jax.lax.dynamic_update_index_in_dim(line, v, head, 0)
-                for line, v in zip(state.line, u)
-            )
-            state = state._replace(
-                line=line, head=jnp.where(head + 1 == line[0].shape[0], 0, head + 1)
-            )
-            u = out
-        return u, state
+            u, state = self._lagged(state, self._turning(u), dt)
+        return _delayed(state, u) if state.line else (u, state)
+
+    def driving(self, u: tuple) -> tuple:
+        """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: u less an
+        "offset" dead zone, else u itself.
+        """
+        if not self._has_dead_zone("offset"):
+            return u
+        return tuple(lower_clip(v - self.dead_zone[i], 0.0) for i, v in enumerate(u))
 
     def _turning(self, u):
-        """What a lag sees: with an "offset" dead zone nothing below it, so that noise is rectified
+        """Input of the lag: with an "offset" dead zone nothing below it, so that noise is rectified
         before the lag and not after.
         """
-        if self.dead_zone is None or self.dead_zone_kind != "offset":
+        if not self._has_dead_zone("offset"):
             return u
-        return tuple(at_least(v, self.dead_zone[i]) for i, v in enumerate(u))
+        return tuple(lower_clip(v, self.dead_zone[i]) for i, v in enumerate(u))
 
-    def driving(self, u: tuple[Any, ...]) -> tuple[Any, ...]:
-        """(m) the part of the pumps' voltages u (m) [V] that moves liquid: u less an "offset" dead
-        zone, else u itself.
-        """
-        if self.dead_zone is None or self.dead_zone_kind != "offset":
-            return u
-        return tuple(at_least(v - self.dead_zone[i], 0.0) for i, v in enumerate(u))
+    def _lagged(self, state, u, dt):
+        """(means of the lagged inputs over a sample, new state) for inputs u held over it."""
+        # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
+        slow = [self.lag[i] > 0 for i in range(self.pumps)]
+        keep = [
+            jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0)
+            for i, s in enumerate(slow)
+        ]
+        # distance of the lagged input from its target at the start of the sample
+        short = [v - u[i] for i, v in enumerate(state.lagged)]
+        state = state._replace(lagged=tuple(u[i] + keep[i] * s for i, s in enumerate(short)))
+        return (
+            tuple(u[i] + self.lag[i] / dt * (1.0 - keep[i]) * s for i, s in enumerate(short)),
+            state,
+        )
 
     def _dead_zone(self, state, u, dt):
+        """(inputs behind a "plain", "hysteresis" or "pulse" dead zone, new state)."""
         if self.dead_zone_kind == "hysteresis":
             running = tuple(
                 jnp.where(jnp.where(r > 0.5, v >= self.stop[i], v > self.dead_zone[i]), 1.0, 0.0)
@@ -198,6 +190,17 @@ class PumpBank:
                 paid.append(v + jax.lax.stop_gradient(pay - v))
             return tuple(paid), state._replace(owed=tuple(owed))
         return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
+
+
+def _delayed(state, u):
+    """(inputs that entered the ring buffers a delay ago, new state)."""
+    head = state.head
+    out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)
+    line = tuple(
+        jax.lax.dynamic_update_index_in_dim(line, v, head, 0) for line, v in zip(state.line, u)
+    )
+    head = jnp.where(head + 1 == line[0].shape[0], 0, head + 1)
+    return out, state._replace(line=line, head=head)
 
 
 def allocate(command, metric, low, high):

@@ -3,15 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from jaxtank.core.clock import PIECE
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, quantise
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.instruments.base import Sensor
 
 
 def _without_adc(own, value):
@@ -22,7 +19,7 @@ def _without_adc(own, value):
 
 
 @component
-class LevelSensor:
+class LevelSensor(Sensor):
     """One level sensor per tank: noise, then an ADC where `bits` is not 0.
     `LevelSensor(noise=[0.1])` suffices where there is no ADC.
 
@@ -48,33 +45,10 @@ class LevelSensor:
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
-    def draw(
-        self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
-    ) -> tuple[Any, ...] | None:
-        """(samples,) standard normal deviates per tank, drawn before the loop; None without a key.
-        piece: the number of a long run's piece, whose samples they are; each has a key of its own,
-        and the run's deviates are those of its pieces, end to end.
-        """
-        if key is None:
-            return None
-        tanks = np.shape(self.noise)[-1]
-        drawn = lambda key, count: jax.random.normal(
-            key, (tanks, count), dtype=jnp.result_type(float)
-        )
-        if piece is not None:
-            deviates = drawn(jax.random.fold_in(key, piece), samples)
-        elif samples <= PIECE:
-            deviates = drawn(key, samples)
-        else:
-            whole, rest = divmod(samples, PIECE)
-            pieces = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), PIECE))(jnp.arange(whole))
-            last = drawn(jax.random.fold_in(key, whole), rest)
-            deviates = jnp.concatenate(
-                [jnp.moveaxis(pieces, 1, 0).reshape(tanks, -1), last], axis=1
-            )
-        return tuple(deviates[i] for i in range(tanks))
+    def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
+        return self.read(x, xi), state
 
-    def read(self, x: Sequence[Any], xi: Sequence[Any] | None) -> Sequence[Any]:
+    def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
         """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or
         None.
         """

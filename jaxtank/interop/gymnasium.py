@@ -68,7 +68,8 @@ class TankEnv(gymnasium.Env):
             for part in (self.inputs.r, self.inputs.dr)
         )
         self.k, self.x = 0, _array(self.state.x)
-        self.y = _array(_readings(loop, self.inputs, self.state))
+        y, self.state = _readings(loop, self.clock, self.inputs, self.state)
+        self.y = _array(y)
         self.u = np.asarray(loop.actuator.initial, dtype=float)
         self.spilled = np.zeros(len(self.x))
         return self._seen(), self._told()
@@ -111,10 +112,11 @@ def _begin(loop, clock, key):
     return inputs(loop, clock, (), key), initial(loop, clock)
 
 
-@jax.jit
-def _readings(loop, every, state):
-    """(tanks,) readings of a state; of the last sample also after it."""
-    return loop.sensor.read(state.x, _now(every, state).xi)
+@functools.partial(jax.jit, static_argnums=1)
+def _readings(loop, clock, every, state):
+    """((tanks,) readings of a state, the state after them); of the last sample also after it."""
+    y, sensor = loop.sensor.step(state.sensor, state.x, _now(every, state).xi, clock.dt)
+    return y, state._replace(sensor=sensor)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -122,7 +124,8 @@ def _advance(loop, clock, every, state, asked):
     """(state, readings, inputs at the plant, volumes lost) a sample later."""
     applied = tuple(jnp.asarray(v, dtype=state.x[0].dtype) for v in asked)
     state, u, spilled, _ = move(loop, clock, state, applied, _now(every, state))
-    return state, _readings(loop, every, state), u, spilled
+    y, state = _readings(loop, clock, every, state)
+    return state, y, u, spilled
 
 
 def _now(every, state):

@@ -20,8 +20,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import PIECE, Clock, Piece
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
@@ -39,11 +38,11 @@ class ClosedLoop:
     ----------
     plant : Plant
         What moves.
-    sensor : LevelSensor
+    sensor : Sensor
     observer : Observer
     controller : Controller
         With a model of its own, which may differ from the plant.
-    actuator : PumpBank
+    actuator : Actuator
     reference : Signal
         Setpoints, one channel per output [cm].
     disturbance : Signal, optional
@@ -62,10 +61,10 @@ class ClosedLoop:
     """
 
     plant: Plant
-    sensor: LevelSensor
+    sensor: Sensor
     observer: Observer
     controller: Controller
-    actuator: PumpBank
+    actuator: Actuator
     reference: Signal
     disturbance: Signal | None = None
     faults: Faults | None = None
@@ -85,6 +84,7 @@ class State(NamedTuple):
     observer: Any
     controller: Any
     actuator: Any
+    sensor: Any = ()
     excess: Group = ()  # in float32, what rounding has added to each level too much [cm]
 
 
@@ -137,14 +137,12 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     """What the measures `names` refer to besides the sample, for setpoints `r`."""
     wanted, window = ms.refers_to(names), None
     if "window" in wanted:
-        windows = getattr(loop.reference, "windows", None)
-        window = None if windows is None else windows(times)
+        window = loop.reference.windows(times)
         if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
             )
-    pulses = getattr(loop.disturbance, "since", None)
-    since = None if pulses is None else pulses(times)
+    since = None if loop.disturbance is None else loop.disturbance.since(times)
     if since is None and "since" in wanted:
         raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
     if since is not None and window is not None:
@@ -177,6 +175,7 @@ def initial(loop: ClosedLoop, clock: Clock) -> State:
         observer=jax.tree.map(same_type, loop.observer.init(x0)),
         controller=jax.tree.map(same_type, loop.controller.init(x0, u0)),
         actuator=jax.tree.map(same_type, loop.actuator.init(clock)),
+        sensor=jax.tree.map(same_type, loop.sensor.init(x0)),
         excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
     )
 

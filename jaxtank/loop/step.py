@@ -35,7 +35,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     """Return (state after a sample, Sample of it). now: this sample's slice of Inputs."""
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
-    y = loop.sensor.read(state.x, now.xi)
+    y, sensor = loop.sensor.step(state.sensor, state.x, now.xi, clock.dt)
     made = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = made.estimate, made.command, made.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
@@ -54,7 +54,8 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         spilled=spilled,
         shortfall=shortfall,
     )
-    return moved._replace(observer=made.observer, controller=made.controller), sample
+    moved = moved._replace(observer=made.observer, controller=made.controller, sensor=sensor)
+    return moved, sample
 
 
 def decide(
@@ -81,7 +82,7 @@ def decide(
     """
     estimate, observer = loop.observer.step(observer, tick, y)
     command, controller = commanded(loop, controller, tick, estimate)
-    metric = loop.controller.input_metric(estimate) if loop.actuator.saturation == "boxqp" else None
+    metric = loop.controller.input_metric(estimate) if loop.actuator.allocates else None
     applied = loop.actuator.limit(command, metric)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
@@ -97,7 +98,7 @@ def move(
     are.
     """
     t = time_of(state, clock)
-    u, actuator = loop.actuator.deliver(state.actuator, applied, clock.dt)
+    u, actuator = loop.actuator.step(state.actuator, applied, clock.dt)
     plant = loop.plant
     if loop.faults is not None and now.fault is not None:
         plant = loop.faults.apply(plant, now.fault)

@@ -14,11 +14,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from jaxtank.core.checks import check_leaves
 from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
-from jaxtank.core.tree import check_leaves, is_component
-from jaxtank.instruments.actuators import PumpBank
+from jaxtank.core.tree import is_component
+from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
@@ -75,7 +76,7 @@ def check(
         check_caught(own, name)
     if not _traced(loop.plant):
         check_step(loop, clock)
-    _check_orders(loop.actuator)
+    loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
         if not _traced(loop.actuator):
@@ -106,7 +107,7 @@ def _check_sizes(loop: ClosedLoop) -> None:
 
 
 def _check_saturation(loop: ClosedLoop) -> None:
-    if loop.actuator.saturation == "boxqp" and (
+    if loop.actuator.allocates and (
         loop.plant.pumps != 2 or not loop.controller.allocates
     ):
         raise InputError(
@@ -115,37 +116,13 @@ def _check_saturation(loop: ClosedLoop) -> None:
         )
 
 
-def _check_delay(actuator: PumpBank, clock: Clock) -> None:
+def _check_delay(actuator: Actuator, clock: Clock) -> None:
     samples = actuator.delay / clock.dt
     if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
         raise InputError(
             f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of"
             f" {clock.dt:g} s, at most {clock.duration:g} s"
         )
-
-
-def _check_orders(actuator: PumpBank) -> None:
-    """Raise InputError for limits and ends of a dead zone that are not in order."""
-    _check_order(actuator, "low", "high")
-    if actuator.dead_zone is not None and actuator.dead_zone_kind == "hysteresis":
-        _check_order(actuator, "stop", "dead_zone", equal=True)
-    if actuator.dead_zone is not None and actuator.dead_zone_kind == "pulse":
-        _check_order(actuator, "dead_zone", "pulse")
-        _check_order(actuator, "pulse", "high", equal=True)
-
-
-def _check_order(actuator: PumpBank, lower: str, upper: str, equal: bool = False) -> None:
-    """Raise InputError unless each pump's `lower` is below its `upper` (or equal to it)."""
-    ends: list[Any] = [getattr(actuator, lower), getattr(actuator, upper)]
-    if _traced(ends):
-        return
-    for i, (low, high) in enumerate(zip(*(np.ravel(v).tolist() for v in ends))):
-        if not (low <= high if equal else low < high):
-            most = "at most" if equal else "below"
-            raise InputError(
-                f"actuator.{lower}[{i}] = {low:g} V: must be {most} actuator.{upper}[{i}] ="
-                f" {high:g} V"
-            )
 
 
 def _check_noise(loop: ClosedLoop) -> None:

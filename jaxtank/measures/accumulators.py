@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import nothing, plus
-from jaxtank.core.numerics import at_least, magnitude
+from jaxtank.core.numerics import lower_clip, magnitude
 from jaxtank.core.records import Sample
 
 BAND = 0.05
@@ -222,14 +222,14 @@ def _past(run, sample, context):
     step.
     """
     return tuple(
-        at_least(jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0)
+        lower_clip(jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0)
         for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
     )
 
 
 def _over_rim(run, sample, context):
     """Rise past the rim [cm], one per tank."""
-    return tuple(at_least(x - h, 0.0) for x, h in zip(sample.x, run.rim))
+    return tuple(lower_clip(x - h, 0.0) for x, h in zip(sample.x, run.rim))
 
 
 def _estimation_error(run, sample):

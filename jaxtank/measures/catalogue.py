@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.core.numerics import at_least, root_of_mean
+from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.measures.accumulators import Run, settled
 
 NO_CHANGES = "the reference has no changes that end"
@@ -110,7 +110,7 @@ def _recovery(run, acc):
 
 
 def _overshoot_percent(run, acc):
-    return 100.0 * at_least(_extremes("overshoot")(run, acc), 0.0)
+    return 100.0 * lower_clip(_extremes("overshoot")(run, acc), 0.0)
 
 
 MEASURES: dict[str, Measure] = {

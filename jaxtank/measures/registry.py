@@ -201,9 +201,7 @@ def of_loop(loop: Any) -> tuple[str, ...]:
     """Return the names of the reported measures whose setpoint changes and inflow pulses `loop`
     has: those that a file of it may name. `serves` asks for more.
     """
-    absent = {"window": loop.reference, "since": loop.disturbance}
-    methods = {"window": "windows", "since": "since"}
-    missing = {c for c, signal in absent.items() if not hasattr(signal, methods[c])}
+    missing = _missing(loop)
     return tuple(m for m in reported() if not missing & refers_to([m]))
 
 
@@ -219,6 +217,13 @@ def serves(name: str, loop: Any) -> bool:
         return False
     if "shortfall" in MEASURES[name].needs and not plant.bottom:
         return False
-    return ("window" not in wanted or hasattr(loop.reference, "windows")) and (
-        "since" not in wanted or hasattr(loop.disturbance, "since")
-    )
+    return not wanted & _missing(loop)
+
+
+def _missing(loop: Any) -> frozenset[str]:
+    """Fields of `Context` that a run of `loop` cannot have: setpoint changes, inflow pulses."""
+    has = {
+        "window": loop.reference.changes is not None,
+        "since": loop.disturbance is not None and loop.disturbance.onset is not None,
+    }
+    return frozenset(field for field in has if not has[field])

@@ -7,7 +7,7 @@ import math
 import jax.numpy as jnp
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import ROOT_KNEE, root
+from jaxtank.core.numerics import LAMINAR_THRESHOLD, smooth_sqrt
 
 GRAVITY = 981.0
 """Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
@@ -31,7 +31,7 @@ def in_unit(centimetres, length):
     return centimetres * PER_CENTIMETRE.get(length, 1.0)
 
 
-def usual_gravity(length):
+def default_gravity(length):
     """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`: 981 cm/s^2.
 
     Raises InputError where `length` is no unit of length, as the volts of a sensor.
@@ -44,11 +44,11 @@ def usual_gravity(length):
     return in_unit(GRAVITY, length)
 
 
-def usual_knee(length):
+def default_threshold(length):
     """Level below which flow turns laminar unless a rig says otherwise: 0.01 cm, in the unit
     `length` of the rig.
     """
-    return in_unit(ROOT_KNEE, length)
+    return in_unit(LAMINAR_THRESHOLD, length)
 
 
 def disc(diameter):
@@ -58,6 +58,6 @@ def disc(diameter):
 
 def efflux(level, gravity, knee):
     """Torricelli's speed of efflux v = sqrt(2 g h) [cm/s] under `level` h [cm]; C1 through zero
-    (see numerics.root).
+    (see numerics.smooth_sqrt).
     """
-    return jnp.sqrt(2.0 * gravity) * root(level, knee)
+    return jnp.sqrt(2.0 * gravity) * smooth_sqrt(level, knee)

@@ -11,12 +11,20 @@ import numpy as np
 from jax.core import Tracer
 from numpy.typing import ArrayLike
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import at_least, clip, limited_flow, limited_root, root, signed_root
-from jaxtank.core.tree import check_value, component, leaf, number, static
+from jaxtank.core.numerics import (
+    clip,
+    limited_flow,
+    limited_sqrt,
+    lower_clip,
+    smooth_signed_sqrt,
+    smooth_sqrt,
+)
+from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.core.units import DEFAULT, check_unit
 from jaxtank.plants.base import Plant
-from jaxtank.plants.hydraulics import efflux, usual_gravity, usual_knee
+from jaxtank.plants.hydraulics import default_gravity, default_threshold, efflux
 
 
 @component
@@ -130,7 +138,7 @@ class TankNetwork(Plant):
         return functools.partial(self._flows, step=step)
 
     def _supply(self, step):
-        """(n) largest ratio of root to level in a step [cm^-0.5]: at most that of `numerics.root`."""
+        """(n) largest ratio of root to level in a step [cm^-0.5]: at most that of `numerics.smooth_sqrt`."""
         areas = [self.drain[i] for i in range(self.tanks)]
         for k, (source, _) in enumerate(self.links):
             areas[source] = areas[source] + self.orifice[k]
@@ -140,7 +148,7 @@ class TankNetwork(Plant):
         # of the inverse, which is 0 and not infinite for a tank without outlets
         turnover = step * jnp.sqrt(2.0 * self.gravity)
         return [
-            1.0 / at_least(turnover * s / self.area[i], self.knee**0.5 / 1.5)
+            1.0 / lower_clip(turnover * s / self.area[i], self.knee**0.5 / 1.5)
             for i, s in enumerate(areas)
         ]
 
@@ -157,14 +165,14 @@ class TankNetwork(Plant):
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
         supply = () if step is None else self._supply(step)
         q = [
-            root(h, self.knee) if step is None else limited_root(h, self.knee, supply[i])
+            smooth_sqrt(h, self.knee) if step is None else limited_sqrt(h, self.knee, supply[i])
             for i, h in enumerate(x)
         ]
-        held = x if step is None else [at_least(h, 0.0) for h in x]
+        held = x if step is None else [lower_clip(h, 0.0) for h in x]
         for k, (source, sink) in enumerate(self.links):
             rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
         for k, (one, other) in enumerate(self.pipes):
-            s = signed_root(held[one] - held[other], self.knee)
+            s = smooth_signed_sqrt(held[one] - held[other], self.knee)
             if step is not None:
                 s = limited_flow(s, supply[one] * held[one], supply[other] * held[other])
             rate[one] = rate[one] - (self.pipe[k] * w / self.area[one]) * s
@@ -182,10 +190,10 @@ class TankNetwork(Plant):
         )
         ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
         (source, sink), (one, other) = ends(self.links), ends(self.pipes)
-        q = root(x, self.knee)
+        q = smooth_sqrt(x, self.knee)
         poured, piped = (
             orifice * w * q[source],
-            pipe * w * signed_root(x[one] - x[other], self.knee),
+            pipe * w * smooth_signed_sqrt(x[one] - x[other], self.knee),
         )
         flow = -jnp.asarray(self.drain) * w * q
         flow = (
@@ -215,12 +223,12 @@ class TankNetwork(Plant):
     def shortfall(self, x: Sequence) -> tuple:
         if not self.bottom:
             return super().shortfall(x)
-        return tuple(self.area[i] * (at_least(h, 0.0) - h) for i, h in enumerate(x))
+        return tuple(self.area[i] * (lower_clip(h, 0.0) - h) for i, h in enumerate(x))
 
     def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
         lost = [0.0] * self.tanks
         if self.bottom:
-            x = tuple(at_least(h, 0.0) for h in x)
+            x = tuple(lower_clip(h, 0.0) for h in x)
         if not self.overflow:
             return x, tuple(lost)
         x = list(x)
@@ -308,8 +316,8 @@ def network(
     """
     for unit in units:
         check_unit("plant.units: entry", unit)
-    gravity = usual_gravity(units[0]) if gravity is None else gravity
-    knee = usual_knee(units[0]) if knee is None else knee
+    gravity = default_gravity(units[0]) if gravity is None else gravity
+    knee = default_threshold(units[0]) if knee is None else knee
     feeds = tuple((int(a), None if b is None else int(b)) for a, b in feeds)
     links, pipes, spills = (
         tuple((int(a), int(b)) for a, b in pairs) for pairs in (links, pipes, spills)

@@ -1,4 +1,6 @@
-"""[law] and [observer] of a rig file: a component by its kind, and its fields by their names."""
+"""[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
+by their names.
+"""
 
 import dataclasses
 import inspect
@@ -10,8 +12,10 @@ import numpy as np
 from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.core.units import local
+from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.schema import is_numeric, static_value
@@ -38,25 +42,30 @@ OBSERVERS = {
     "kalman": Kalman,
     "extended-kalman": ExtendedKalman,
 }
+SENSORS = {"level": LevelSensor}
+ACTUATORS = {"pumps": PumpBank}
 REGISTERED = set()
 """Kinds that were added by `register`."""
+
+INSTRUMENTS = {"sensor": ("noise",), "actuator": ("low", "high", "initial")}
+"""Tables of instruments: what is the case's own where a file leaves it out."""
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
 
 
 def register(kind, cls):
-    """Give a controller or an observer of one's own a name in rig files.
+    """Give a controller, observer, sensor or actuator of one's own a name in rig files.
 
-    `kind = "..."` of [law] (a controller) or [observer] (an observer) then makes a component of
-    the class. Its leaves and static fields are keys of the table; a field `model` is the plant of
+    `kind = "..."` of [law] (a controller), [observer], [sensor] or [actuator] then makes a
+    component of the class. Its leaves and static fields are keys of the table; a field `model` is the plant of
     the rig. A static field of type tuple holds tanks, which a file counts from 1. `rig.dump`,
     `rig.complete` and `result.save` write such a case.
 
     Parameters
     ----------
     kind : text of letters, digits, "-", "_" and "."; a name that no other class has
-    cls : class made by `jaxtank.component`, of Controller or Observer
+    cls : class made by `jaxtank.component`, of Controller, Observer, Sensor or Actuator
 
     Returns
     -------
@@ -94,13 +103,16 @@ def register(kind, cls):
     name = getattr(cls, "__name__", shortened(cls))
     known = _table_of(cls)
     if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
-        wanted = "a class of Controller or Observer with its own step, made by jaxtank.component"
+        wanted = (
+            "a class of Controller, Observer, Sensor or Actuator with its own step, made by"
+            " jaxtank.component"
+        )
         raise InputError(f"{name} is no component: it must be {wanted}")
     for field in dataclasses.fields(cls):
         why = _unwritable(field)
         if why:
             raise InputError(f"{name}.{field.name}: {why}")
-    taken = LAWS.get(kind) or OBSERVERS.get(kind)
+    taken = next((table[kind] for _, table in _roles() if kind in table), None)
     if taken not in (None, cls):
         raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
     other = next((k for k, c in known.items() if c is cls and k != kind), None)
@@ -112,13 +124,21 @@ def register(kind, cls):
     return cls
 
 
+def _roles():
+    """(abstract class, {kind: class}) of every role that a rig file can fill."""
+    return (
+        (controllers.Controller, LAWS),
+        (Observer, OBSERVERS),
+        (Sensor, SENSORS),
+        (Actuator, ACTUATORS),
+    )
+
+
 def _table_of(cls):
-    """LAWS or OBSERVERS, where `cls` belongs; None of what belongs to neither."""
+    """The registry of the role of `cls`; None of what has no role."""
     if not isinstance(cls, type):
         return None
-    if issubclass(cls, controllers.Controller):
-        return LAWS
-    return OBSERVERS if issubclass(cls, Observer) else None
+    return next((table for role, table in _roles() if issubclass(cls, role)), None)
 
 
 def _unwritable(field):
@@ -159,8 +179,17 @@ def observer_of(table, plant, levels, initial):
     return component("observer", table, OBSERVERS, plant, offered)
 
 
+def instrument_of(word, table, loop):
+    """The sensor or actuator (`word`) of a [sensor] or [actuator] table in `loop`; noise and limits
+    that are left out are those of the loop's own.
+    """
+    known = {"sensor": SENSORS, "actuator": ACTUATORS}[word]
+    offered = {name: getattr(getattr(loop, word), name) for name in INSTRUMENTS[word]}
+    return component(word, table, known, loop.plant, offered)
+
+
 def component(kind, table, known, plant, offered):
-    """The law or observer of a table: kind, then the fields of the component by their names."""
+    """The component of a table: kind, then the fields of the component by their names."""
     if not isinstance(table, dict):
         raise InputError(f"[{kind}]: must be a table")
     if "kind" not in table:
@@ -179,7 +208,7 @@ def component(kind, table, known, plant, offered):
         meta = field.metadata
         if name in table:
             value = table[name]
-        elif name in offered and not own:
+        elif name in offered and (not own or kind in INSTRUMENTS):
             value = offered[name]
         elif name in USUAL and not own:
             value = USUAL[name]
@@ -263,6 +292,19 @@ def _resting(plant, levels, initial):
 def kind_of(part, known):
     """The name of a law or observer in a rig file, None where it has none."""
     return next((name for name, cls in known.items() if cls is type(part)), None)
+
+
+def is_written(word, part):
+    """Whether a table `word` of a rig file can describe `part`."""
+    known = {"law": LAWS, "observer": OBSERVERS, "sensor": SENSORS, "actuator": ACTUATORS}[word]
+    return has_table(word, part) and kind_of(part, known) is not None
+
+
+def has_table(word, part):
+    """Whether a file has a table `word` for a part that is not the preset's: [values] set the fields
+    of LevelSensor and PumpBank.
+    """
+    return word not in INSTRUMENTS or type(part) not in (LevelSensor, PumpBank)
 
 
 def keys_of(part, known):

@@ -5,7 +5,8 @@ parameters were identified.
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import describe, get_value, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value
 
 
 def check_log(plant, table):

@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 
 from jaxtank.case import Case
+from jaxtank.core.checks import check_value
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import check_value, number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT, check_unit, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -352,7 +354,7 @@ def entries_of(loop, names):
         "drain": plant.drain,
         "level": loop.x0,
         "inflow": steady,
-        "noise": loop.sensor.noise,
+        "noise": np.broadcast_to(loop.sensor.noise, plant.tanks),
     }
     for i in range(plant.tanks):
         own = {"name": (names["tank"][i] if "tank" in names else "", i + 1)}

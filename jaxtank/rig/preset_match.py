@@ -9,10 +9,17 @@ from jaxtank import presets
 from jaxtank.core.tree import is_component, walk
 from jaxtank.rig import components, schedule, signals
 
+# table of a rig file, field of the loop
+PARTS = (
+    ("law", "controller"),
+    ("observer", "observer"),
+    ("sensor", "sensor"),
+    ("actuator", "actuator"),
+)
+
 
 def origin_of(case):
-    """(Case of a preset with the same rig, which of "law" and "observer" are of the same kind as
-    its own), or (None, ()): of a rig whose tanks have names too, which only a file that describes
+    """(Case of a preset with the same rig, which of PARTS are of the same kind as its own), or (None, ()): of a rig whose tanks have names too, which only a file that describes
     it tank by tank can say.
 
     Of several, the one with the same law and observer, then of the same name, then with the most
@@ -26,21 +33,19 @@ def origin_of(case):
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
             theirs = structures(other.loop)
-            if mine["rest"] != theirs["rest"] or not _optional(
-                other.loop, ("plant", "sensor", "actuator")
-            ) <= _optional(loop):
+            if mine["rest"] != theirs["rest"] or not _optional(other.loop, ("plant",)) <= _optional(
+                loop
+            ):
                 continue
             same = tuple(
                 word
-                for word, field in (("law", "controller"), ("observer", "observer"))
+                for word, field in PARTS
                 if mine[field] == theirs[field]
                 and _optional(other.loop, (field,)) <= _optional(loop)
             )
-            if (
-                "law" not in same and components.kind_of(loop.controller, components.LAWS) is None
-            ) or (
-                "observer" not in same
-                and components.kind_of(loop.observer, components.OBSERVERS) is None
+            if any(
+                word not in same and not components.is_written(word, getattr(loop, field))
+                for word, field in PARTS
             ):
                 continue
             common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
@@ -85,9 +90,9 @@ def structures(loop):
     if signals.disturbance_tables(loop.disturbance) is not None:
         told["disturbance"] = None
     plain = settle(dataclasses.replace(loop, **told))
-    rest = dataclasses.replace(plain, controller=None, observer=None)
+    fields = [field for _, field in PARTS]
+    rest = dataclasses.replace(plain, **dict.fromkeys(fields))
     return {
         "rest": jax.tree.structure(rest),
-        "controller": jax.tree.structure(plain.controller),
-        "observer": jax.tree.structure(plain.observer),
+        **{field: jax.tree.structure(getattr(plain, field)) for field in fields},
     }

@@ -13,7 +13,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
-from jaxtank.core.tree import shortened
+from jaxtank.core.text import shortened
 from jaxtank.rig import components, experiment_tables, network, signals, validate
 from jaxtank.rig.schema import name_of
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
@@ -67,6 +67,8 @@ TABLES = (
     *network.TABLES,
     "law",
     "observer",
+    "sensor",
+    "actuator",
     "schedule",
     "values",
     "reference",
@@ -190,6 +192,9 @@ def start_of(table):
         _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     )
     loop, changed = case.loop, {}
+    for word in components.INSTRUMENTS:
+        if word in table:
+            changed[word] = components.instrument_of(word, table[word], loop)
     if "reference" in table:
         changed["reference"] = signals.reference_of(table["reference"], loop.reference)
     if "disturbance" in table or "pour" in table:

@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import check_value, shortened
+from jaxtank.core.text import shortened
 from jaxtank.core.units import local
 
 BARE = {"unit": "-", "doc": ""}

@@ -109,8 +109,10 @@ def _building(case, origin, same):
     for kind, known, part in (
         ("law", components.LAWS, loop.controller),
         ("observer", components.OBSERVERS, loop.observer),
+        ("sensor", components.SENSORS, loop.sensor),
+        ("actuator", components.ACTUATORS, loop.actuator),
     ):
-        if kind not in same:
+        if kind not in same and components.has_table(kind, part):
             keys = keys_of(((n, m, v) for n, m, v in components.keys_of(part, known)), units)
             found.append(Section(f"[{kind}]", [k for k in keys if k.value is not None]))
     found += _reference(loop, start)
@@ -220,6 +222,8 @@ def _values(case, base, tankwise, same):
         built = {
             "controller": "law" not in same,
             "observer": "observer" not in same,
+            "sensor": components.has_table("sensor", loop.sensor),
+            "actuator": components.has_table("actuator", loop.actuator),
             "plant": tankwise,
         }.get(part, False)
         built = built or (tankwise and name in TANKWISE)

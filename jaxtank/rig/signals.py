@@ -6,8 +6,10 @@ import dataclasses
 
 import numpy as np
 
+from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import check_value, number, shortened
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
 from jaxtank.plants.faults import Faults, faults
 from jaxtank.rig.schema import is_finite, plain, static_value
 from jaxtank.signals.base import Constant, Sum

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, number, parameters, walk
-from jaxtank.measures import MEASURES, of_loop
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures.catalogue import MEASURES, TIMES
+from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.rig import components, signals
 from jaxtank.rig import schedule as scheduling
 from jaxtank.rig.schema import Key, Section, keys_of
@@ -66,7 +66,16 @@ def _each(name):
 
 def _measures(case, but):
     """Names of the measures that a run of the case has, without those in `but`."""
-    return [m for m in of_loop(case.loop) if m not in but]
+    known = {m: spec for m, spec in MEASURES.items() if m not in but and m not in TIMES.values()}
+    poured, stepped = (
+        case.loop.disturbance is not None and case.loop.disturbance.onset is not None,
+        case.loop.reference.changes is not None,
+    )
+    return [
+        m
+        for m, spec in known.items()
+        if (poured or not spec.pours) and (stepped or not spec.windows)
+    ]
 
 
 def limits(case):

@@ -11,17 +11,11 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
+from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import (
-    check_value,
-    describe,
-    get_value,
-    is_component,
-    shortened,
-    split_index,
-    walk,
-)
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value, is_component, split_index, walk
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import check_names, entries

@@ -9,17 +9,11 @@ import numpy as np
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case
+from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import (
-    check_value,
-    describe,
-    get_value,
-    shortened,
-    split_index,
-    walk,
-    with_values,
-)
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value, split_index, walk, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import schedule
 from jaxtank.rig.schema import is_numeric, plain, static_value, unit

@@ -1,8 +1,10 @@
 """The interface of a signal, and signals that hold for any purpose: constant, table, sum."""
 
 import abc
+import math
 from typing import Any, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,7 +13,18 @@ from jaxtank.core.tree import component, leaf, static
 
 
 class Signal(abc.ABC):
-    """A signal of one or more channels."""
+    """A signal of one or more channels: a reference, a disturbance or an input.
+
+    A signal of one's own is a `component` with its own `channels` and `sample`. One whose setpoints
+    change also gives `changes`, `windows` and `plateaus`; one that disturbs from time to time gives
+    `onset` and `since`. All of them are None where a signal has no such thing.
+    """
+
+    changes: Any = None
+    """((time [s], channel), ...) of its setpoint changes in order of time, or None."""
+
+    onset: Any = None
+    """(time [s], ...) at which a disturbance begins, in order of time, or None."""
 
     @property
     @abc.abstractmethod
@@ -19,11 +32,40 @@ class Signal(abc.ABC):
         """Number of channels [-]."""
 
     @abc.abstractmethod
-    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-        """(value, rate, second derivative): each a tuple of arrays (samples,), one per channel, for
-        a Clock. A signal whose every sample follows from `sample_times(clock)` alone may be marked
-        `pieces.pointwise`: a long run then asks for it piece by piece.
+    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+        """Return the samples of a run, evaluated before the time loop.
+
+        A method whose every sample follows from `sample_times(clock)` alone may be marked
+        `core.clock.pointwise`: a long run then calls it chunk by chunk.
+
+        Parameters
+        ----------
+        clock : Clock, or a Piece of one
+
+        Returns
+        -------
+        (value, rate [1/s], second derivative [1/s^2]): tuples of arrays (samples,), one per channel
         """
+
+    @pointwise
+    def windows(self, clock: Clock) -> tuple | None:
+        """Return what overshoot and settling refer to, or None without `changes`.
+
+        Returns
+        -------
+        Per channel (target [cm], step [cm], time since the change ended [s], settling band [cm]),
+        arrays (samples,) each
+        """
+        return None
+
+    @pointwise
+    def since(self, clock: Clock) -> jax.Array | None:
+        """Return (samples,) time since the last `onset` [s], -1 where there was none; or None."""
+        return None
+
+    def plateaus(self, until: float = math.inf) -> np.ndarray | None:
+        """Return (plateaus, channels) values held between `changes` before `until` [s], or None."""
+        return None
 
 
 @component
@@ -91,6 +133,10 @@ class Sum(Signal):
     def channels(self) -> int:
         return self.first.channels
 
+    @property
+    def changes(self) -> Any:
+        return self.first.changes
+
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         value, rate, second = (
@@ -100,13 +146,15 @@ class Sum(Signal):
         return value, rate, second
 
     @pointwise
-    def windows(self, clock: Clock) -> tuple:
+    def windows(self, clock: Clock) -> tuple | None:
         """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step
         from its start on.
         """
         t = sample_times(clock)
-        steps, sine = cast(Any, self.first), cast(Any, self.second)  # a Ramps, with a Sine on it
-        found = list(steps.windows(clock))
+        sine, windows = cast(Any, self.second), self.first.windows(clock)
+        if windows is None:
+            return None
+        found = list(windows)
         still = t < sine.start - 1e-7 * clock.dt
         found[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in found[sine.channel])
         return tuple(found)

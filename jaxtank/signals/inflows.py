@@ -36,6 +36,10 @@ class Pours(Signal):
     def channels(self) -> int:
         return self.width
 
+    @property
+    def onset(self) -> tuple:
+        return tuple(sorted(start for start, *_ in self.events))
+
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         t = sample_times(clock)
@@ -53,7 +57,7 @@ class Pours(Signal):
         """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
         t = sample_times(clock)
         since = -jnp.ones_like(t)
-        for start, _, _ in sorted(self.events):
+        for start in self.onset:
             after = t - start
             since = jnp.where(
                 after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since

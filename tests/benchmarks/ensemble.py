@@ -25,7 +25,7 @@ import numpy as np
 import tuning
 from jaxtank import presets, rig
 from tuning.bench import bench
-from tuning.uncertainty.distributions import Draws
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
 SOURCE = Path(__file__).with_name("floor_lanes.c")

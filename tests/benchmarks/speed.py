@@ -6,7 +6,7 @@ first use waits for.
 Within a block every line is measured in turn, round by round, in one process on one core: medians
 of core time, and of the ratio to its rival in the same round, with the range. Compilation is apart.
 "at most" is what we set out to reach. Nothing is asserted of time: machines differ. The structural
-causes are pinned in tests/test_compiled_loop.py.
+causes are pinned in tests/unit/loop/test_compiled_loop.py.
 """
 
 import dataclasses

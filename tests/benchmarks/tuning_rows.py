@@ -3,7 +3,7 @@ measures.
 
 A target is the number of our re-derivation of the paper (S10 of its
 notes), which the tuned objective must reach to 1 % or half a unit of its last digit;
-tests/test_tuning_rows.py asks for it.
+tests/papers/test_tuning_rows.py asks for it.
 """
 
 from typing import Any, NamedTuple

@@ -1,11 +1,12 @@
 """Shell completion, generated from the parser: `jaxtank completion bash|zsh|fish` prints a script.
 
-The words that only a started jax knows (cases, parameters, measures) are kept in names.txt beside
-this file; `refresh()` writes it anew and a test holds it to what the library has. Nothing here
-imports jax.
+Imported by the command line only; jax is not started. The words that only a started jax knows
+(cases, parameters, measures) are in names.txt beside this file: `refresh()` writes it anew, and a
+test compares it with the library.
 """
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,9 +48,7 @@ FEW = {
 
 
 class Option(NamedTuple):
-    """An option of a command: its spellings, what its value is ("" for a flag, "text" for what is
-    not completed), a line of help.
-    """
+    """An option of a command: spellings, kind of value ("" for a flag, "text" for any), help."""
 
     flags: tuple
     value: str
@@ -57,7 +56,7 @@ class Option(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A command: a line of help, its options, what its arguments are ("" for none)."""
+    """A command: a line of help, its options, kind of its arguments ("" for none)."""
 
     help: str
     options: list
@@ -65,16 +64,36 @@ class Command(NamedTuple):
 
 
 def script(shell, parser):
-    """The completion script of a shell, of SHELLS, for a parser with subcommands. Raises InputError
-    for another shell.
+    """Return the completion script of a shell.
+
+    Parameters
+    ----------
+    shell : str
+        One of SHELLS.
+    parser : argparse.ArgumentParser
+        With subcommands.
+
+    Raises
+    ------
+    InputError
+        Another shell.
+
+    Examples
+    --------
+    >>> from tuning.cli.parser import parser
+    >>> "-a tune -d" in script("fish", parser())
+    True
     """
     if shell not in SHELLS:
         raise unknown("shell", shell, SHELLS)
-    return {"bash": bash, "zsh": zsh, "fish": fish}[shell](commands_of(parser), words())
+    commands = commands_of(parser)
+    if shell == "fish":
+        return fish(commands, words())
+    return _function({"bash": BASH, "zsh": ZSH}[shell], commands, words())
 
 
 def commands_of(parser):
-    """{name: Command} of a parser, with what stands before a command under ""."""
+    """Return {name: Command} of a parser, the options before any command under ""."""
     sub = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     lines = {a.dest: a.help or "" for a in sub._choices_actions}
     found = {"": Command("", _options("", parser), "commands")}
@@ -85,25 +104,28 @@ def commands_of(parser):
 
 
 def _options(command, parser):
-    found = []
-    for a in parser._actions:
-        if not a.option_strings:
-            continue
-        few = next(
-            (" ".join(FEW[command, o]) for o in a.option_strings if (command, o) in FEW), None
-        )
-        measured = command and "--measure" in a.option_strings and command != "identify"
-        kind = (
-            ""
-            if a.nargs == 0
-            else few or ("measures" if measured else KINDS.get(a.metavar, "text"))
-        )
-        found.append(Option(tuple(a.option_strings), kind, (a.help or "").replace("%%", "%")))
-    return found
+    """The Options of a command."""
+    return [
+        Option(tuple(a.option_strings), _kind(command, a), (a.help or "").replace("%%", "%"))
+        for a in parser._actions
+        if a.option_strings
+    ]
+
+
+def _kind(command, action):
+    """What the value of an option is: a kind of `words`, a path, or the words that it can be."""
+    if action.nargs == 0:
+        return ""
+    for spelling in action.option_strings:
+        if (command, spelling) in FEW:
+            return " ".join(FEW[command, spelling])
+    if "--measure" in action.option_strings and command != "identify":
+        return "measures"
+    return KINDS.get(action.metavar, "text")
 
 
 def words():
-    """{"cases", "papers", "parameters", "limits", "measures", "shells"}: the words of each kind."""
+    """Return the words of each kind: cases, papers, parameters, limits, measures, shells."""
     found = {"cases": [], "parameters": [], "measures": []}
     for line in NAMES.read_text(encoding="utf-8").splitlines():
         kind, _, word = line.partition(" ")
@@ -117,7 +139,7 @@ def words():
 
 
 def gather():
-    """The text of names.txt as the library has it. Starts jax."""
+    """Return the text of names.txt as the library has it. Starts jax."""
     from jaxtank import presets
     from jaxtank.core.clock import CLOCK
     from jaxtank.core.tree import walk
@@ -140,39 +162,39 @@ def refresh():
     NAMES.write_text(gather(), encoding="utf-8")
 
 
-def bash(commands, words):
-    """A function that bash calls with the words of the line, and its registration."""
-    lines = [
-        '# jaxtank completion for bash: eval "$(jaxtank completion bash)", or a file in'
-        " ~/.local/share/bash-completion/completions/jaxtank"
-    ]
-    lines += [f"_jaxtank_{kind}='{' '.join(own)}'" for kind, own in words.items()]
-    lines += BASH_HEAD.splitlines()
+class Dialect(NamedTuple):
+    """How a shell with a `case` statement writes a completion function."""
+
+    head: str  # before the lists of words
+    array: str  # a list of words, of a kind
+    start: str  # of the function, up to the commands
+    extra: tuple  # lines of every command
+    complete: str  # the given words
+    value: Callable  # code that completes a kind of value
+    end: str
+
+
+def _function(shell, commands, words):
+    """A completion function of a Dialect, and its registration."""
+    lines = [shell.head, *(shell.array.format(kind, " ".join(own)) for kind, own in words.items())]
+    lines.append(shell.start)
     for name, command in commands.items():
         if not name:
             continue
-        lines.append(f"    {name})")
-        lines.append('        case "$prev" in')
+        lines += [f"    {name})", '        case "$prev" in']
         for option in command.options:
             if option.value:
-                lines.append(
-                    f"        {'|'.join(option.flags)}) {_bash_value(option.value)}; return ;;"
-                )
-        lines += ["        =) return ;;", "        esac"]
-        flags = " ".join(f for o in command.options for f in o.flags)
-        lines.append(
-            f'        if [[ $cur == -* ]]; then _jaxtank_words "{flags}"; else'
-            f" {_bash_value(command.argument or 'text')}; fi ;;"
-        )
-    starts = " ".join(
-        [*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)]
-    )
-    lines += [
-        f"    '') _jaxtank_words '{starts}' ;;",
-        "    esac",
-        "}",
-        "complete -F _jaxtank jaxtank",
-    ]
+                code = shell.value(option.value)
+                lines.append(f"        {'|'.join(option.flags)}) {code}; return ;;")
+        flags = shell.complete.format(" ".join(f for o in command.options for f in o.flags))
+        argument = shell.value(command.argument or "text")
+        lines += [
+            *shell.extra,
+            "        esac",
+            f"        if [[ $cur == -* ]]; then {flags}; else {argument}; fi ;;",
+        ]
+    first = [*filter(None, commands), *(f for o in commands[""].options for f in o.flags)]
+    lines += [f"    '') {shell.complete.format(' '.join(first))} ;;", "    esac", "}", shell.end]
     return "\n".join(lines) + "\n"
 
 
@@ -184,62 +206,10 @@ def _bash_value(kind):
     if kind in ("papers", "measures", "shells"):
         return f'_jaxtank_words "$_jaxtank_{kind}"'
     if kind in ("folders", "files"):
-        return (
-            f'COMPREPLY=( $(compgen -{"d" if kind == "folders" else "f"} -- "$cur") ); compopt -o'
-            " filenames 2>/dev/null"
-        )
-    return ":" if kind == "text" else f"_jaxtank_words '{kind}'"
-
-
-BASH_HEAD = """_jaxtank_words() { COMPREPLY+=( $(compgen -W "$1" -- "$cur") ); }
-_jaxtank_files() {
-    COMPREPLY+=( $(compgen -f -X '!*.toml' -- "$cur") )
-    [[ -n $cur ]] && COMPREPLY+=( $(compgen -d -S / -- "$cur") )
-    [[ ${COMPREPLY[0]} == */ && ${#COMPREPLY[@]} == 1 ]] && compopt -o nospace 2>/dev/null
-    return 0
-}
-_jaxtank() {
-    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" command='' i
-    COMPREPLY=()
-    for (( i = 1; i < COMP_CWORD; i++ )); do
-        if [[ ${COMP_WORDS[i]} != -* ]]; then command="${COMP_WORDS[i]}"; break; fi
-    done
-    case "$command" in"""
-
-
-def zsh(commands, words):
-    """A function for zsh's own completion system, and its registration."""
-    lines = [
-        "#compdef jaxtank",
-        (
-            '# jaxtank completion for zsh: eval "$(jaxtank completion zsh)" after compinit, or a'
-            " file _jaxtank in $fpath"
-        ),
-    ]
-    lines += [f"_jaxtank_{kind}=({' '.join(own)})" for kind, own in words.items()]
-    lines += ZSH_HEAD.splitlines()
-    for name, command in commands.items():
-        if not name:
-            continue
-        lines += [f"    {name})", '        case "$prev" in']
-        for option in command.options:
-            if option.value:
-                lines.append(
-                    f"        {'|'.join(option.flags)}) {_zsh_value(option.value)}; return ;;"
-                )
-        flags = " ".join(f for o in command.options for f in o.flags)
-        lines += [
-            "        esac",
-            (
-                f"        if [[ $cur == -* ]]; then compadd -- {flags}; else"
-                f" {_zsh_value(command.argument or 'text')}; fi ;;"
-            ),
-        ]
-    starts = " ".join(
-        [*(n for n in commands if n), *(f for o in commands[""].options for f in o.flags)]
-    )
-    lines += [f"    '') compadd -- {starts} ;;", "    esac", "}", ZSH_TAIL]
-    return "\n".join(lines) + "\n"
+        flag = "-d" if kind == "folders" else "-f"
+        found = f'COMPREPLY=( $(compgen {flag} -- "$cur") )'
+        return f"{found}; compopt -o filenames 2>/dev/null"
+    return ":" if kind == "text" else f'_jaxtank_words "{kind}"'
 
 
 def _zsh_value(kind):
@@ -254,54 +224,76 @@ def _zsh_value(kind):
     return ":" if kind == "text" else f"compadd -- {kind}"
 
 
-ZSH_TAIL = (
-    'if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtank jaxtank; fi'
+BASH = Dialect(
+    head="""# jaxtank completion for bash: eval "$(jaxtank completion bash)", or a file in\
+ ~/.local/share/bash-completion/completions/jaxtank""",
+    array="_jaxtank_{}='{}'",
+    start="""_jaxtank_words() { COMPREPLY+=( $(compgen -W "$1" -- "$cur") ); }
+_jaxtank_files() {
+    COMPREPLY+=( $(compgen -f -X '!*.toml' -- "$cur") )
+    [[ -n $cur ]] && COMPREPLY+=( $(compgen -d -S / -- "$cur") )
+    [[ ${COMPREPLY[0]} == */ && ${#COMPREPLY[@]} == 1 ]] && compopt -o nospace 2>/dev/null
+    return 0
+}
+_jaxtank() {
+    local cur="${COMP_WORDS[COMP_CWORD]}" prev="${COMP_WORDS[COMP_CWORD-1]}" command='' i
+    COMPREPLY=()
+    for (( i = 1; i < COMP_CWORD; i++ )); do
+        if [[ ${COMP_WORDS[i]} != -* ]]; then command="${COMP_WORDS[i]}"; break; fi
+    done
+    case "$command" in""",
+    extra=("        =) return ;;",),
+    complete='_jaxtank_words "{}"',
+    value=_bash_value,
+    end="complete -F _jaxtank jaxtank",
 )
-
-ZSH_HEAD = """_jaxtank() {
+ZSH = Dialect(
+    head="""#compdef jaxtank
+# jaxtank completion for zsh: eval "$(jaxtank completion zsh)" after compinit, or a file _jaxtank\
+ in $fpath""",
+    array="_jaxtank_{}=({})",
+    start="""_jaxtank() {
     local cur="${words[CURRENT]}" prev="${words[CURRENT-1]}" command='' word
     for word in "${(@)words[2,CURRENT-1]}"; do
         if [[ $word != -* ]]; then command="$word"; break; fi
     done
-    case "$command" in"""
+    case "$command" in""",
+    extra=(),
+    complete="compadd -- {}",
+    value=_zsh_value,
+    end=(
+        'if [[ "${funcstack[1]}" == _jaxtank ]]; then _jaxtank "$@"; else compdef _jaxtank'
+        " jaxtank; fi"
+    ),
+)
 
 
 def fish(commands, words):
-    """Lines `complete -c jaxtank ...`, one per command and option."""
+    """Return lines `complete -c jaxtank ...`, one per command and option."""
     lines = [
-        (
-            "# jaxtank completion for fish: jaxtank completion fish >"
-            " ~/.config/fish/completions/jaxtank.fish"
-        ),
+        "# jaxtank completion for fish: jaxtank completion fish >"
+        " ~/.config/fish/completions/jaxtank.fish",
         "complete -c jaxtank -f",
     ]
-    quote = lambda text: "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
     for name, command in commands.items():
-        here = f"'__fish_seen_subcommand_from {name}'" if name else "'__fish_use_subcommand'"
+        start = "complete -c jaxtank -n"
+        here = f"{start} '__fish_seen_subcommand_from {name}'"
         if name:
-            lines.append(
-                f"complete -c jaxtank -n '__fish_use_subcommand' -a {name} -d {quote(command.help)}"
-            )
+            line = f"{start} '__fish_use_subcommand' -a {name} -d {_fish_quoted(command.help)}"
             values = _fish_value(command.argument, words)
-            lines += [f"complete -c jaxtank -n {here} {values}"] if values else []
+            lines += [line, *([f"{here} {values}"] if values else [])]
+        else:
+            here = f"{start} '__fish_use_subcommand'"
         for option in command.options:
-            spelled = " ".join(
-                f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in option.flags
-            )
+            flags = [f"-l {f[2:]}" if f.startswith("--") else f"-s {f[1:]}" for f in option.flags]
             value = f"-r {_fish_value(option.value, words)}".rstrip() if option.value else ""
-            lines.append(
-                " ".join(
-                    filter(
-                        None,
-                        [
-                            f"complete -c jaxtank -n {here} {spelled}",
-                            value,
-                            f"-d {quote(option.help)}",
-                        ],
-                    )
-                )
-            )
+            parts = [here, *flags, value, "-d", _fish_quoted(option.help)]
+            lines.append(" ".join(filter(None, parts)))
     return "\n".join(lines) + "\n"
+
+
+def _fish_quoted(text):
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def _fish_value(kind, words):

@@ -6,122 +6,124 @@ so far of a search is written and printed), 143 terminated. Nothing heavy is imp
 arguments are read.
 """
 
-import importlib
 import os
 import sys
 
 from tuning.cli import interrupts, terminal
 
-COMMANDS = {
-    "list": "case.list_cases",
-    "show": "case.show",
-    "simulate": "case.simulate",
-    "tune": "tuning.tune",
-    "sensitivity": "studies.sensitivity",
-    "identify": "identification.run_interruptibly",
-    "init": "case.init",
-    "export": "case.export_law",
-    "uncertainty": "studies.uncertainty",
-    "merge": "studies.merge",
-    "compare": "case.compare",
-    "completion": "case.completion",
-    "bench": "case.bench",
-}
-"""{command: module and function that runs it}."""
-
 
 def main(argv=None):
-    """Run the command; returns the exit code. argv None: a program of its own, by sys.argv."""
+    """Run the command and return its exit code.
+
+    Parameters
+    ----------
+    argv : list of str or None
+        Words after `jaxtank`; None: a program of its own, which reads sys.argv and answers
+        SIGINT and SIGTERM.
+
+    Returns
+    -------
+    int
+
+    Examples
+    --------
+    >>> main(["completion", "elvish"])
+    2
+    """
     if argv is None:
         terminal.guard()
         interrupts.listen()  # before anything that takes time is imported
-    return _run(argv)
+        import warnings
 
-
-def _run(argv):
-    import shlex
-    import warnings
-
-    from jaxtank.core.errors import DataError, InputError, NonFiniteError, nearest
-    from jaxtank.core.text import one_line
-    from tuning.cli.parser import parser
-    from tuning.cli.values import folder_of
-    from tuning.storage.folder_lock import hold
-
-    if argv is None:
         # the note is printed once, where the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
     try:
-        top = parser()
-        try:
-            args, rest = top.parse_known_args(argv)
-        except SystemExit:  # --help, which may wait in a buffer
-            sys.stdout.flush()
-            raise
-        if rest:
-            kind = "option" if rest[0].startswith("-") else "argument"
-            raise InputError(
-                f"unknown {kind} {rest[0]!r}"
-                + (
-                    nearest(rest[0].split("=")[0], top.options(args.command))
-                    if kind == "option"
-                    else ""
-                )
-            )
-        if args.version:
-            import jaxtank
-
-            print(jaxtank.__version__)
-            return 0
-        if args.command is None:
-            raise InputError("no command: try jaxtank --help")
-        args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
-        folder = folder_of(args)
-        if getattr(args, "resume", None) and not os.path.isdir(folder):
-            raise InputError(
-                f"--resume: {folder!r} cannot be read as a run to go on with: there is no such"
-                " folder"
-            )
-        with hold(
-            folder,
-            shared=getattr(args, "shard", None) is not None,
-            leaving=interrupts.before_leaving,
-        ):
-            module, name = COMMANDS[args.command].split(".")
-            code = getattr(importlib.import_module(f"tuning.cli.commands.{module}"), name)(args)
+        code = _command(argv)
         sys.stdout.flush()
         return code
-    except (InputError, NonFiniteError) as error:
-        print(f"jaxtank: {one_line(error)}", file=sys.stderr)
-        return 5 if isinstance(error, DataError) else 2
     except KeyboardInterrupt:
         print("jaxtank: interrupted", file=sys.stderr, flush=True)
         return 130
-    except BrokenPipeError:  # the reader of our output has gone; nothing more to say
+    except Exception as error:
+        return _failed(error)
+
+
+def _command(argv):
+    """Read the arguments and run their command; returns its exit code."""
+    from jaxtank.core.errors import InputError
+    from tuning.cli.values import folder_of
+    from tuning.storage.folder_lock import hold
+
+    args = _arguments(argv)
+    if args.version:
+        import jaxtank
+
+        print(jaxtank.__version__)
+        return 0
+    if args.command is None:
+        raise InputError("no command: try jaxtank --help")
+    folder = folder_of(args)
+    if getattr(args, "resume", None) and not os.path.isdir(folder):
+        raise InputError(
+            f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder"
+        )
+    shared = getattr(args, "shard", None) is not None
+    with hold(folder, shared=shared, leaving=interrupts.before_leaving):
+        return args.run(args)
+
+
+def _arguments(argv):
+    """Parse the words of the command line; `line` keeps the line itself, `top` its parser."""
+    import shlex
+
+    from jaxtank.core.errors import InputError, nearest
+    from tuning.cli.parser import parser
+
+    top = parser()
+    try:
+        args, rest = top.parse_known_args(argv)
+    except SystemExit:  # --help, which may wait in a buffer
+        sys.stdout.flush()
+        raise
+    if rest and not rest[0].startswith("-"):
+        raise InputError(f"unknown argument {rest[0]!r}")
+    if rest:
+        close = nearest(rest[0].split("=")[0], top.options(args.command))
+        raise InputError(f"unknown option {rest[0]!r}{close}")
+    args.line = shlex.join(["jaxtank", *(sys.argv[1:] if argv is None else argv)])
+    args.top = top
+    return args
+
+
+def _failed(error):
+    """Print an exception in one line; returns the exit code."""
+    from jaxtank.core.errors import DataError, InputError, NonFiniteError
+    from jaxtank.core.text import one_line
+
+    if isinstance(error, (InputError, NonFiniteError)):
+        words, code = one_line(error), 5 if isinstance(error, DataError) else 2
+    elif isinstance(error, BrokenPipeError):  # the reader of our output has closed it
         _drop_output()
         return 0
-    except OSError as error:
-        print(
-            f"jaxtank: {one_line(error.filename or 'output')}: {error.strerror or one_line(error)}",
-            file=sys.stderr,
+    elif isinstance(error, OSError):
+        where = one_line(error.filename or "output")
+        words, code = f"{where}: {error.strerror or one_line(error)}", 2
+    elif os.environ.get("JAXTANK_TRACEBACK"):
+        raise error
+    else:
+        words = (
+            f"internal error: {type(error).__name__}: {one_line(error)}"
+            " (JAXTANK_TRACEBACK=1 shows where)"
         )
+        code = 1
+    print(f"jaxtank: {words}", file=sys.stderr)
+    if isinstance(error, OSError) and code == 2:
         _drop_output()
-        return 2
-    except Exception as error:
-        if os.environ.get("JAXTANK_TRACEBACK"):
-            raise
-        print(
-            f"jaxtank: internal error: {type(error).__name__}: {one_line(error)}"
-            " (JAXTANK_TRACEBACK=1 shows where)",
-            file=sys.stderr,
-        )
-        return 1
+    return code
 
 
 def _drop_output():
-    """Let go of what stdout cannot take (a reader that has left, a full disk), so that the end of
-    the program does not try again.
-    """
+    """Discard what stdout cannot take (a closed pipe, a full disk) so that the end is quiet."""
     try:
         sys.stdout.flush()
     except OSError:

@@ -123,7 +123,8 @@ def distributions_of(args, case):
 
 def _pair_of(text, case):
     """(name, distribution) of one --vary, if every draw of it is a value that the case may have."""
-    from tuning.uncertainty.distributions import Draws, parse
+    from tuning.uncertainty.distributions import parse
+    from tuning.uncertainty.draws import Draws
 
     name, value = pair("--vary", text, str)
     try:
@@ -144,7 +145,7 @@ def devices_of(args):
     return devices
 
 
-def tell_written(paths, args):
+def report_written(paths, args):
     if paths and not args.quiet:
         print(
             f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths),
@@ -152,7 +153,7 @@ def tell_written(paths, args):
         )
 
 
-def tell_unreachable(case, paths, args):
+def report_unreachable(case, paths, args):
     """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false`
     and the case itself did not.
     """

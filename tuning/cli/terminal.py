@@ -1,5 +1,7 @@
-"""The three standard streams of a program: there when the shell has closed them, and none of its
-end when nobody takes what stderr says.
+"""The standard streams of the program, and the line of progress on stderr.
+
+A stream that the shell has closed exists all the same, and a closed stderr does not end the
+program. Imported by the command line only.
 """
 
 import io
@@ -8,27 +10,25 @@ import sys
 
 
 class Forgiving(io.RawIOBase):
-    """A file descriptor to write progress and errors to. What it does not take, a full disk or a
-    reader that has gone, is let go.
-    """
+    """A file descriptor for progress and errors; what it cannot take is discarded."""
 
     def __init__(self, descriptor):
         self.descriptor = descriptor
 
     def writable(self):
-        """True."""
+        """Return True."""
         return True
 
     def fileno(self):
-        """The descriptor."""
+        """Return the descriptor."""
         return self.descriptor
 
     def isatty(self):
-        """Whether it is a terminal."""
+        """Return whether it is a terminal."""
         return os.isatty(self.descriptor)
 
     def write(self, data):
-        """Number of bytes done with: all of them where the descriptor takes none."""
+        """Write `data`; return the number of bytes taken, all of them where none can be written."""
         try:
             return os.write(self.descriptor, data)
         except OSError:
@@ -36,12 +36,10 @@ class Forgiving(io.RawIOBase):
 
 
 def guard():
-    """Make the process's streams ones that the command can use: for a program of its own, never for
-    a caller's process.
+    """Replace closed standard streams: for a program of its own, never in a caller's process.
 
-    Descriptors that were closed (`>&-`) are taken first, or the next file that is opened would get
-    what is meant for them. A stdout that was closed is one that nothing can be written to: an
-    OSError once something is. stderr is a `Forgiving` one.
+    Descriptors that were closed (`>&-`) are taken first: the next file to be opened would get their
+    number. A stdout that was closed raises OSError once it is written to. stderr is `Forgiving`.
     """
     for descriptor, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
@@ -62,3 +60,44 @@ def guard():
         line_buffering=True,
         write_through=True,
     )
+
+
+class Line:
+    """Progress on stderr: one line that is overwritten on a terminal, few lines elsewhere.
+
+    Parameters
+    ----------
+    quiet : bool
+        Print nothing.
+    """
+
+    def __init__(self, quiet):
+        self.quiet, self.terminal = quiet, sys.stderr.isatty()
+        self.begun, self.last = False, 0
+
+    def show(self, words):
+        """Print `words`; on a terminal in place of the line before."""
+        if self.quiet:
+            return
+        start, end = ("\r", "") if self.terminal else ("", "\n")
+        print(
+            f"{start}{words:<70}" if self.terminal else words, end=end, file=sys.stderr, flush=True
+        )
+        self.begun = self.terminal
+
+    def compiling(self, what, seconds):
+        """Print, on a terminal only, that `what` is compiled before anything else is to be seen."""
+        if self.terminal:
+            self.show(f"compiling {what}, about {seconds} s")
+
+    def runs(self, done, total):
+        """Print the number of runs done; where it is no terminal, at each tenth of them only."""
+        if self.terminal or done >= total or done - self.last >= total / 10:
+            self.last = done
+            self.show(f"run {done}/{total}")
+
+    def end(self):
+        """End the line on a terminal."""
+        if self.begun:
+            print(file=sys.stderr)
+            self.begun = False

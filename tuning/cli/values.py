@@ -1,4 +1,7 @@
-"""What the words of a command line mean: numbers, ranges, NAME=VALUE, the case they describe."""
+"""Values of a command line: numbers, ranges, NAME=VALUE, and the case that they describe.
+
+Imported by the commands; imports nothing heavy before a case is opened.
+"""
 
 import os
 import re
@@ -7,44 +10,62 @@ from typing import Any
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
+from tuning.problem.wording import count
 
 
 def open_case(args):
-    """The checked case of the command line, in float64; what of a rig file can hardly be meant is
-    told on stderr.
+    """Return the checked case of the command line, in float64; warnings go to stderr.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Of a command with the options of `arguments.changes`.
+
+    Raises
+    ------
+    InputError
+        An unknown case, a file that is no rig, a value out of its range.
     """
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig
-    from jaxtank.loop import step_size
 
-    case, notes = rig.open_case(args.case), []
-    # as the file is: what --set changes is meant
-    if args.case.endswith(".toml") and not args.quiet:
-        notes = rig.doubts(case)
-        for sentence in notes:
-            print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
+    opened = rig.open_case(args.case)
+    # of the file as it is: what --set changes is meant
+    of_file = rig.doubts(opened) if args.case.endswith(".toml") and not args.quiet else []
+    for sentence in of_file:
+        print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values = settings(args)
-    clock, case = case.clock, rig.check(rig.set_and_schedule(case, values, schedule(args.schedule)))
+    case = rig.check(rig.set_and_schedule(opened, values, schedule(args.schedule)))
     case, replaced = rig.overridden(case, values)
-    if args.command == "tune" and not args.scenario and not args.quiet:
-        for name, scenarios in replaced.items():
-            words = f"--set {name} takes the place of the value of {_counted(scenarios)}"
-            print(f"jaxtank: note: {words}", file=sys.stderr)
-    for sentence in () if args.quiet else rig.model_doubts(case):
-        if sentence not in notes:
-            print(f"jaxtank: note: {sentence}", file=sys.stderr)
-    if case.clock != clock and not args.quiet:
-        for sentence in rig.clock_doubts(case.clock):
-            print(f"jaxtank: note: {sentence}", file=sys.stderr)
-    for sentence in () if args.quiet else step_size.step_warnings(case.loop, case.clock):
-        print(f"jaxtank: note: {sentence}", file=sys.stderr)
+    if not args.quiet:
+        for sentence in _warnings(args, opened, case, replaced):
+            if sentence not in of_file:
+                print(f"jaxtank: note: {sentence}", file=sys.stderr)
     return case
 
 
+def _warnings(args, opened, case, replaced):
+    """Sentences on a case as --set has changed it.
+
+    opened: the case before; replaced: {name: scenarios whose own value --set replaces}.
+    """
+    from jaxtank import rig
+    from jaxtank.loop import step_size
+
+    found = []
+    if args.command == "tune" and not args.scenario:
+        for name, scenarios in replaced.items():
+            found.append(f"--set {name} also replaces the value of {name} in {_named(scenarios)}")
+    found += rig.model_doubts(case)
+    if case.clock != opened.clock:
+        found += rig.clock_doubts(case.clock)
+    return found + step_size.doubts(case.loop, case.clock)
+
+
 def settings(args):
-    """{name: value} of --set and --dt."""
+    """Return {name: value} of --set and --dt."""
     values = once("--set", [pair("--set", text) for text in args.values]) or {}
     if args.dt is not None:
         if "clock.dt" in values:
@@ -55,13 +76,14 @@ def settings(args):
     return values
 
 
-def _counted(scenarios):
-    named = [repr(printable(name)) for name in scenarios[:3]] + ["..."] * (len(scenarios) > 3)
-    return f"{len(scenarios)} scenario{'s' if len(scenarios) > 1 else ''} ({', '.join(named)})"
+def _named(scenarios):
+    """How many scenarios, and the names of the first ones."""
+    names = [repr(printable(name)) for name in scenarios[:3]] + ["..."] * (len(scenarios) > 3)
+    return f"{count(len(scenarios), 'scenario')} ({', '.join(names)})"
 
 
 def schedule(texts):
-    """The table of a rig file's [schedule] for the options --schedule."""
+    """Return the table [schedule] of a rig file for the options --schedule."""
     found = [pair("--schedule", text, lambda v: v) for text in texts]
     once("--schedule", found)
     if len({rule for _, rule in found}) > 1:
@@ -81,8 +103,21 @@ def schedule(texts):
 
 
 def pair(option, text, read=None) -> tuple[str, Any]:
-    """(name, value) of NAME=VALUE; read: makes the value of its text, `parse_value` where it is
-    None.
+    """Return (name, value) of NAME=VALUE.
+
+    Parameters
+    ----------
+    option : str
+        Its name, for the error.
+    text : str
+        NAME=VALUE.
+    read : callable or None
+        Makes the value of its text; `parse_value` where None.
+
+    Examples
+    --------
+    >>> pair("--set", "controller.k = 0.05")
+    ('controller.k', 0.05)
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
@@ -92,8 +127,9 @@ def pair(option, text, read=None) -> tuple[str, Any]:
 
 
 def once(option, pairs):
-    """{name: value} of (name, value) pairs, None where there is none; InputError for a name that is
-    given twice.
+    """Return {name: value} of (name, value) pairs, None where there is none.
+
+    Raises InputError for a name that is given twice.
     """
     names = [name for name, _ in pairs]
     for name in names:
@@ -109,46 +145,72 @@ DECIMAL_COMMA = re.compile(r"([+-]?)(\d+|[1-9]\d{0,2}(?:\.\d{3})+),(\d+(?:[eE][+
 def parse_value(text, where):
     """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself.
 
-    A list needs brackets where a decimal comma could be meant. where: option and name, for the
-    error. Raises InputError for such a text, for an empty entry and for an entry such as 05.
+    A list needs brackets where a decimal comma could be meant.
+
+    Parameters
+    ----------
+    text : str
+    where : str
+        Option and name, for the error.
+
+    Raises
+    ------
+    InputError
+        A decimal comma, an empty entry of a list, an entry such as 05.
+
+    Examples
+    --------
+    >>> [parse_value(text, "--set x") for text in ("3", "0.5", "true", "[1,2]", "clip")]
+    [3, 0.5, True, [1, 2], 'clip']
     """
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
-    inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+    bracketed = text.startswith("[") and text.endswith("]")
+    inner = text[1:-1] if bracketed else text
     parts = [p.strip() for p in inner.split(",")] if inner.strip() else []
     try:
         found = [plain_number(p) for p in parts if p]
     except ValueError:
         return text
+    _check_list(text, parts, found, f"{where}={text}")
+    if bracketed:
+        return found
+    return found if len(found) > 1 else found[0] if found else text
+
+
+def _check_list(text, parts, found, where):
+    """Raise InputError where a list of numbers may be meant otherwise.
+
+    parts: texts of the entries; found: their numbers.
+    """
     if len(found) < len(parts):
         raise InputError(
-            f"{where}={text}: an entry of the list is empty: leave out the comma, or give its"
-            " number"
+            f"{where}: an entry of the list is empty: leave out the comma, or give its number"
         )
     if comma := DECIMAL_COMMA.fullmatch(text):
-        sign, whole, digits = comma.groups()
-        point = f"{sign}{whole.replace('.', '')}.{digits}"
+        sign, whole_part, digits = comma.groups()
+        point = f"{sign}{whole_part.replace('.', '')}.{digits}"
         raise InputError(
-            f"{where}={text}: the comma may be a decimal one: write {point}, with a point, for a"
-            f" number, or [{', '.join(map(str, found))}] for a list"
+            f"{where}: the comma may be a decimal one: write {point}, with a point, for a number,"
+            f" or [{', '.join(map(str, found))}] for a list"
         )
-    if len(parts) > 1 and (odd := next((p for p in parts if re.match(r"[+-]?0\d", p)), None)):
+    odd = next((p for p in parts if re.match(r"[+-]?0\d", p)), None)
+    if len(parts) > 1 and odd:
         raise InputError(
-            f"{where}={text}: entry {odd} begins with a zero, as the digits after a decimal comma"
-            " do: write decimals with a point, as 0.05"
+            f"{where}: entry {odd} begins with a zero, as the digits after a decimal comma do:"
+            " write decimals with a point, as 0.05"
         )
-    return (
-        found[0]
-        if len(found) == 1 and inner is text
-        else found
-        if found or inner is not text
-        else text
-    )
 
 
 def plain_number(text):
-    """An int where it is written as one and a float can hold it, else a float; underscores are not
-    numbers.
+    """Return an int where `text` is written as one and a float can hold it, else a float.
+
+    Raises ValueError for a text that is no number; underscores are not numbers.
+
+    Examples
+    --------
+    >>> plain_number("12"), plain_number("1e3")
+    (12, 1000.0)
     """
     if "_" in text:
         raise ValueError(text)
@@ -161,6 +223,7 @@ def plain_number(text):
 
 
 def number(option, text):
+    """Return the number of an option; InputError where its text is none."""
     try:
         return float(plain_number(text))
     except ValueError:
@@ -168,6 +231,13 @@ def number(option, text):
 
 
 def whole(option, text, low, high):
+    """Return the whole number of an option, from `low` to `high`; InputError otherwise.
+
+    Examples
+    --------
+    >>> whole("--starts", "8", 1, 1000)
+    8
+    """
     try:
         value = int(text)
     except ValueError:
@@ -178,17 +248,19 @@ def whole(option, text, low, high):
 
 
 def seed(args):
+    """Return the number of --seed."""
     return whole("--seed", args.seed, 0, 2**31 - 1)
 
 
 def folder_of(args) -> Any:
-    """The folder that a command writes to, None where it writes to none. Raises InputError where it
-    cannot; nothing is made yet.
+    """Return the folder that a command writes to, None where it writes to none.
+
+    Raises InputError where it cannot be written to; nothing is made yet.
     """
     out, resume = getattr(args, "out", None), getattr(args, "resume", None)
-    for option, folder in (("--out", out), ("--resume", resume)):
+    for name, folder in (("--out", out), ("--resume", resume)):
         if folder is not None and not folder.strip():
-            raise InputError(f"{option} '': must name a folder")
+            raise InputError(f"{name} '': must name a folder")
     if resume and out and resume != out:
         raise InputError("--resume and --out name different folders: a run is continued in its own")
     if args.command == "merge" and not out:
@@ -202,6 +274,13 @@ def folder_of(args) -> Any:
 
 
 def span(text):
+    """Return (low, high, "log" or "linear") of a range LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear.
+
+    Examples
+    --------
+    >>> span("0.1:10"), span("0:10")
+    ((0.1, 10.0, 'log'), (0.0, 10.0, 'linear'))
+    """
     parts = text.split(":")
     try:
         low, high = (float(plain_number(p)) for p in parts[:2])

@@ -24,6 +24,7 @@ from tuning.identification.confidence import stopped
 from tuning.identification.identified_case import bare, proposed
 from tuning.identification.problem import Estimation, Fit, check_length
 from tuning.identification.proposal import check_law
+from tuning.problem.result import Result
 from tuning.problem.status import Status
 from tuning.storage.batch_store import digest
 from tuning.storage.evaluation_log import Log, Memo, folder_of
@@ -33,11 +34,13 @@ AGREE = 1.001
 """Two searches whose sums of squares differ by less than this factor have ended in the same place."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Identification:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Identification(Result):
     """What `identify` found. See `jaxtank identify --json` for the same as a table; `save(folder)`,
     `plot()`.
     """
+
+    REPORT = "tuning.report.identification"
 
     case: Any  # the case that was given
     estimation: Estimation
@@ -77,36 +80,7 @@ class Identification:
     @property
     def message(self) -> str:
         """In words: how it ended."""
-        from tuning.report import identification
-
-        return identification.message(self)
-
-    def __repr__(self):
-        from tuning.report import identification
-
-        return identification.text(self)
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON object of `jaxtank identify --json`."""
-        from tuning.report import identification
-
-        return identification.json_of(self)
-
-    def plot(self) -> dict[str, Any]:
-        """{name: matplotlib Figure}."""
-        from tuning.report import identification
-
-        return identification.figures(self)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write rig.toml (where every parameter is identified), result.json, fit.csv, pictures and
-        report.html; returns the paths.
-
-        command: the line that made it, for the report, where there is one.
-        """
-        from tuning.report import identification
-
-        return identification.save(self, folder, command)
+        return self._report().message(self)
 
 
 def identify(

@@ -4,16 +4,17 @@ says.
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.tree import component, leaf, with_values
-from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
 from jaxtank.plants.runge_kutta import advance
@@ -29,7 +30,7 @@ class Rig:
 
     plant: Plant
     sensor: LevelSensor
-    actuator: PumpBank
+    actuator: Actuator
     disturbance: Constant | None = None
     x0: np.ndarray = leaf("cm", "(n,) levels at the first sample", low=0.0)
 
@@ -44,7 +45,14 @@ def rig_of(loop):
     another run and does not. A transport delay is taken up by `shifted`.
     """
     disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
-    actuator = dataclasses.replace(loop.actuator, delay=0.0)
+    if not isinstance(loop.sensor, LevelSensor):
+        raise InputError(
+            f"the sensor of this loop is a {type(loop.sensor).__name__}: experiment data are"
+            " compared with the readings of a LevelSensor"
+        )
+    actuator = loop.actuator
+    if actuator.delay:
+        actuator = dataclasses.replace(cast(Any, actuator), delay=0.0)
     return Rig(
         plant=loop.plant, sensor=loop.sensor, actuator=actuator, disturbance=disturbance, x0=loop.x0
     )
@@ -108,7 +116,7 @@ def readings(rig, dt, u, channels, substeps):
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
         )
         held = jnp.where(step > 0, step, 1.0)  # the padding at the end must not divide by nothing
-        driven, state = rig.actuator.deliver(state, inputs, held)
+        driven, state = rig.actuator.step(state, inputs, held)
         driven = rig.actuator.driving(driven)
         found = advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True)
         return (found.x, state), out

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.numerics import magnitude
-from jaxtank.core.tree import number
+from jaxtank.instruments import LevelSensor
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import initial, inputs, run_of
 from jaxtank.loop.step import step
@@ -56,11 +56,13 @@ def open_loop(loop, u, interval):
         loop,
         controller=OpenLoop(signal=Table(values=u, period=interval)),
         observer=Direct(),
-        sensor=dataclasses.replace(
-            loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise))), bits=0
-        ),
+        sensor=LevelSensor(noise=np.zeros(loop.plant.tanks)),
         # inputs within the limits need no allocation
-        actuator=dataclasses.replace(loop.actuator, saturation="clip"),
+        actuator=(
+            dataclasses.replace(loop.actuator, saturation="clip")
+            if loop.actuator.allocates
+            else loop.actuator
+        ),
     )
 
 

@@ -15,10 +15,11 @@ from jaxtank.core.errors import NonFiniteError
 from jaxtank.loop import run as lp
 from tuning.optimal_input.cost import open_loop
 from tuning.optimal_input.search import InputSearch
+from tuning.problem.result import Shown
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class InputBound:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class InputBound(Shown):
     """What `bound` found; costs and measures are exact, at the case's own step. `print(result)` for
     a table, `to_json()` for a dict.
 

@@ -90,12 +90,14 @@ class InputSearch:
         )
         # below an offset dead zone the pump stands still whatever the voltage: a search would not
         # find its way out
-        if (
-            loop.actuator.dead_zone is not None
-            and loop.actuator.dead_zone_kind == "offset"
-            and not needs & {"u2", "travel", "deviation2", "changes2", "past2"}
-        ):
-            self.low = np.minimum(np.maximum(self.low, loop.actuator.dead_zone), self.high)
+        if np.any(np.asarray(loop.actuator.offset) > 0) and not needs & {
+            "u2",
+            "travel",
+            "deviation2",
+            "changes2",
+            "past2",
+        }:
+            self.low = np.minimum(np.maximum(self.low, loop.actuator.offset), self.high)
         # no liquid over a rim is a level at most at the rim: the slope of a level that stops there
         # would say nothing
         spill = [
@@ -185,12 +187,7 @@ class InputSearch:
     def _own(self):
         """The law's own inputs, each the mean over its interval; None if they do not stay finite."""
         loop, clock = self.case.loop, self.case.clock
-        quiet = dataclasses.replace(
-            loop,
-            sensor=dataclasses.replace(
-                loop.sensor, noise=number(np.zeros(np.shape(loop.sensor.noise)))
-            ),
-        )
+        quiet = dataclasses.replace(loop, sensor=loop.sensor.without_noise())
         try:
             applied = np.asarray(lp.simulate(quiet, clock).applied).T
         except NonFiniteError:
@@ -219,11 +216,7 @@ class InputSearch:
         r = np.array(
             self.case.loop.reference.sample(dataclasses.replace(self.coarse, dt=self.interval))[0]
         )[:, : self.count]
-        offset = (
-            0.0
-            if actuator.dead_zone is None or actuator.dead_zone_kind != "offset"
-            else np.asarray(actuator.dead_zone)
-        )
+        offset = np.asarray(actuator.offset)
         known = np.unique(r, axis=1)
         known, held = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
         for setpoint in known:

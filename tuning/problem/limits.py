@@ -138,16 +138,14 @@ def undefined(measure, case):
     no step within the run, and recovery where nothing is poured.
     """
     wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
-    since = (
-        np.asarray(loop.disturbance.since(clock))
-        if hasattr(loop.disturbance, "since")
-        else np.full(1, -1.0)
-    )
-    if "since" in wanted and hasattr(loop.disturbance, "since"):
+    onset = None if loop.disturbance is None else loop.disturbance.since(clock)
+    since = np.full(1, -1.0) if onset is None else np.asarray(onset)
+    if "since" in wanted and onset is not None:
         why = f"nothing is poured within its {clock.duration:g} s; add a pour ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    if "window" in wanted and hasattr(loop.reference, "windows"):
-        steps = [np.asarray(step) for _, step, *_ in loop.reference.windows(clock)]
+    windows = loop.reference.windows(clock) if "window" in wanted else None
+    if windows is not None:
+        steps = [np.asarray(step) for _, step, *_ in windows]
         why = (
             f"no setpoint is stepped within its {clock.duration:g} s; add a step"
             " (reference.changes)"

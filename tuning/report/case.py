@@ -10,8 +10,9 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
-from jaxtank.measures import MEASURES, of_loop
-from jaxtank.measures import unit as measure_unit
+from jaxtank.instruments import LevelSensor, PumpBank
+from jaxtank.measures.catalogue import MEASURES, TIMES
+from jaxtank.measures.catalogue import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import Pours
@@ -46,6 +47,8 @@ def _list(values):
 def sensor(loop):
     """What is read of the levels."""
     own, length = loop.sensor, loop.units[0]
+    if not isinstance(own, LevelSensor):
+        return [f"Sensors: {type(own).__name__}."]
     noise = (
         f"noise of {_list(own.noise)} {length} (standard deviation)"
         if np.any(np.asarray(own.noise) > 0)
@@ -59,6 +62,9 @@ def sensor(loop):
 def actuator(loop):
     """What the pumps make of a command, in the order in which they do."""
     bank, drive = loop.actuator, loop.units[1]
+    if not isinstance(bank, PumpBank):
+        limits = f"from {_list(bank.low)} to {_list(bank.high)} {drive}"
+        return [f"Pumps: {bank.pumps}, {limits}, a {type(bank).__name__}."]
     words = {"clip": "each clipped", "boxqp": "allocated by the law's own cost"}[bank.saturation]
     found = [f"Pumps: {bank.pumps}, from {_list(bank.low)} to {_list(bank.high)} {drive} ({words})"]
     found += (
@@ -403,7 +409,15 @@ def _every(page):
 
 def _measures(case):
     """The measures that a run of the case has."""
-    known = {m: MEASURES[m] for m in of_loop(case.loop)}
+    poured, stepped = (
+        case.loop.disturbance is not None and case.loop.disturbance.onset is not None,
+        case.loop.reference.changes is not None,
+    )
+    known = {
+        m: s
+        for m, s in MEASURES.items()
+        if m not in TIMES.values() and (poured or not s.pours) and (stepped or not s.windows)
+    }
     return [
         [m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc]
         for m, s in known.items()

@@ -1,6 +1,7 @@
 """What an identification says: tables, JSON, pictures, the rig that goes on to `tune`."""
 
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -122,13 +123,8 @@ def _table(found):
     return tables.table(rows, ["parameter", "unit", "before", "estimate", "95 % interval", "sd"])
 
 
-def text(found):
-    """The result as a page of text."""
-    return "\n".join(parts_of(found))
-
-
-def parts_of(found):
-    """What `text` says: a list of lines and tables."""
+def lines(found):
+    """What is printed of an Identification: lines and tables."""
     est = found.estimation
     readings = int(est.mask.sum())
     steps = np.concatenate([np.diff(one.t) for one in est.logs])
@@ -137,7 +133,7 @@ def parts_of(found):
         f"every {np.median(steps):g} s" if even else f"{steps.min():g} to {steps.max():g} s apart"
     )
     missing = sum(one.y.size for one in est.logs) - readings
-    lines = [
+    parts = [
         f"{found.case.name}: {found.status.replace('_', ' ')}",
         f"{', '.join(one.name for one in est.logs)}: {sum(one.samples for one in est.logs)} samples"
         f" {pace}, {readings} readings"
@@ -152,12 +148,12 @@ def parts_of(found):
         tables.wrap(message(found)),
     ]
     if found.validation:
-        lines += ["", *_validation(found)]
+        parts += ["", *_validation(found)]
     if found.remedies:
         alone = all(len(d["parameters"]) == 1 for d in found.directions)
         whom = "it" if alone and len(found.directions) == 1 else "them" if alone else "them apart"
-        lines += ["", f"What would tell {whom}:"]
-        lines += [f"- {w}" for w in found.remedies]
+        parts += ["", f"What would tell {whom}:"]
+        parts += [f"- {w}" for w in found.remedies]
     if found.profile:
         p = found.profile
         unit = "" if p["unit"] == "-" else f" {p['unit']}"
@@ -165,9 +161,9 @@ def parts_of(found):
             f"{e:.5g}{unit}" if e is not None else f"beyond the {side} one tried"
             for e, side in zip(p["interval95"], ("lowest", "highest"))
         ]
-        lines += ["", f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"]
-    lines += ["", f"{found.wall_s:.1f} s, {sum(s['evaluations'] for s in found.starts)} passes"]
-    return lines
+        parts += ["", f"profile likelihood of {p['name']}: 95 % from {ends[0]} to {ends[1]}"]
+    parts += ["", f"{found.wall_s:.1f} s, {sum(s['evaluations'] for s in found.starts)} passes"]
+    return parts
 
 
 def _levels(found):
@@ -408,22 +404,20 @@ def page_of(found, drawn, command=None):
         )
     captions = {n: CAPTIONS[n.split("_")[0]] for n in drawn}
     said = message(found)
+    refused = found.status == "not_identifiable"
+    rig, why = (None, None) if refused else artifacts.rig_text(found.identified)
     return html.document(
         f"{found.case.name}: identified",
         ", ".join(one.name for one in found.estimation.logs),
         found.status.replace("_", " "),
         found.status == "converged",
         facts,
-        said.split("; "),
+        [*said.split("; "), *([why] if why else [])],
         html.drawings(drawn, captions),
-        [part for part in parts_of(found)[1:] if part != tables.wrap(said)],
+        [part for part in lines(found)[1:] if part != tables.wrap(said)],
         command,
         provenance.provenance(found.case, found.seed),
-        (
-            {}
-            if found.status == "not_identifiable"
-            else {"The identified rig as a file (rig.toml)": rigs.dump(found.identified)}
-        ),
+        {"The identified rig as a file (rig.toml)": rig} if rig else None,
     )
 
 
@@ -434,9 +428,14 @@ def save(found, folder, command=None):
     command: the line that made it, for the report, where there is one.
     """
     check_folder(folder)
-    files = {"result.json": tables.dumps(json_of(found)), "fit.csv": fit_csv(found)}
-    if identifiable(found):
-        files["rig.toml"] = rigs.dump(found.identified)
+    rig, why = artifacts.rig_text(found.identified) if identifiable(found) else (None, None)
+    payload = json_of(found)
+    if why:
+        warnings.warn(why, stacklevel=3)  # the line that called found.save
+        payload["message"] += f"; {why}"
+    files = {"result.json": tables.dumps(payload), "fit.csv": fit_csv(found)}
+    if rig:
+        files["rig.toml"] = rig
     stale = [*_left_over(Path(folder), files), *artifacts.earlier(folder, ["residuals", "rig"])]
 
     def draw():

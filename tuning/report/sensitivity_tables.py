@@ -103,12 +103,12 @@ def notes_of(result):
         if short:
             found.append(f"too few finite steps for some parameters: {', '.join(short)}")
     if result.method == "sobol":
-        fewest = min((c.felt["kept"] for c in result.columns), default=result.samples)
+        fewest = min((c.effects["kept"] for c in result.columns), default=result.samples)
         if fewest < result.samples:
             found.append(f"base points used: {fewest} of {result.samples} where fewest")
         widest = max(
             (
-                np.ptp(c.felt["total_interval95"], axis=1).max()
+                np.ptp(c.effects["total_interval95"], axis=1).max()
                 for c in result.columns
                 if not c.empty
             ),
@@ -172,20 +172,20 @@ def _column_json(result, c):
     extra = {}
     if result.method == "sobol":
         extra = {
-            "sd": tables.clean(float(c.felt["sd"])),
-            "sum_of_first": tables.clean(float(np.sum(c.felt["first"]))),
-            "base_points_used": int(c.felt["kept"]),
+            "sd": tables.clean(float(c.effects["sd"])),
+            "sum_of_first": tables.clean(float(np.sum(c.effects["first"]))),
+            "base_points_used": int(c.effects["kept"]),
         }
     rows = {}
     for i in result.order(c):
-        rows[result.parameters[i]] = {q: tables.clean(c.felt[q][i]) for q in HEADS[result.method]}
+        rows[result.parameters[i]] = {q: tables.clean(c.effects[q][i]) for q in HEADS[result.method]}
         if result.method == "local":
             rows[result.parameters[i]]["derivative_unit"] = derivative_unit(
                 result, c, result.parameters[i]
             )
         if result.method == "morris":
-            rows[result.parameters[i]]["mu_interval95"] = tables.clean(c.felt["mu_interval95"][i])
-            rows[result.parameters[i]]["effects_used"] = int(c.felt["kept"][i])
+            rows[result.parameters[i]]["mu_interval95"] = tables.clean(c.effects["mu_interval95"][i])
+            rows[result.parameters[i]]["effects_used"] = int(c.effects["kept"][i])
     return {
         "measure": c.measure,
         "unit": c.unit,
@@ -197,13 +197,13 @@ def _column_json(result, c):
     }
 
 
-def text(result):
-    """The result as a page of text."""
-    return "\n".join([*parts_of(result), *(f"- {note}" for note in notes_of(result))])
+def lines(result):
+    """What is printed of a SensitivityResult: lines and tables."""
+    return [*parts_of(result), *(f"- {note}" for note in notes_of(result))]
 
 
 def parts_of(result):
-    """What `text` says but for the notes: a list of lines and tables."""
+    """What `lines` has but for the notes."""
     asked = (
         ""
         if result.samples is None
@@ -231,7 +231,7 @@ def parts_of(result):
         tail = [f"and {more} more parameters, each below these"] if more > 0 else []
         if result.method == "sobol":
             tail.append(
-                f"first-order shares sum to {np.sum(c.felt['first']):.3f}; to 1 where nothing"
+                f"first-order shares sum to {np.sum(c.effects['first']):.3f}; to 1 where nothing"
                 " interacts"
             )
         parts += [
@@ -259,8 +259,8 @@ def _cells(result, c, i):
     """What a table says of parameter `i`; a derivative with its unit, which differs from row to
     row.
     """
-    cells = {q: _cell(c.felt[q][i]) for q in HEADS[result.method]}
-    if "derivative" in cells and np.isfinite(c.felt["derivative"][i]):
+    cells = {q: _cell(c.effects[q][i]) for q in HEADS[result.method]}
+    if "derivative" in cells and np.isfinite(c.effects["derivative"][i]):
         cells["derivative"] += f" {derivative_unit(result, c, result.parameters[i])}"
     return cells.values()
 
@@ -295,7 +295,7 @@ def table_csv(result):
             numbers = [
                 f"{v:.10g}" if np.isfinite(v) else ""
                 for q in quantities
-                for v in np.ravel(c.felt[q][i])
+                for v in np.ravel(c.effects[q][i])
             ]
             writer.writerow(
                 [
@@ -322,7 +322,7 @@ def figures(result):
     for c in shown:
         order = result.order(c)
         names = [result.parameters[i] for i in order]
-        felt = {q: np.asarray(c.felt[q])[order] for q in HEADS[result.method]}
+        felt = {q: np.asarray(c.effects[q])[order] for q in HEADS[result.method]}
         title = f"{c.label} ({tables.number(c.nominal, 4)} {c.unit})"
         draws.append(
             lambda ax, n=names, f=felt, u=c.unit, t=title: _panel(

@@ -82,6 +82,16 @@ def table(rows, head=None):
     return found
 
 
+def measure_table(values, rig_units=DEFAULT):
+    """Return the Table of {measure: value}: unit, entries and what the measure is."""
+    rows = [
+        [m, ms.unit(m, rig_units), numbers(values[m]), spec.doc]
+        for m, spec in ms.MEASURES.items()
+        if m in values and m not in ms.TIMES.values()
+    ]
+    return table(rows, ["measure", "unit", "value", ""])
+
+
 def wrap(message):
     return "\n".join(f"- {part}" for part in message.split("; "))
 

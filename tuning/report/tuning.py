@@ -1,20 +1,25 @@
-"""What a tuning result says in words, tables and JSON."""
+"""The report of a tuning result: text, JSON, page and folder."""
+
+import warnings
+from pathlib import Path
 
 import numpy as np
 
-from jaxtank import measures as ms
-from tuning.problem.problem import TAIL
+from jaxtank.core.files import check_folder
+from tuning.report import html
+from tuning.report.artifacts import earlier, rig_text, run_for_people, trajectory_csv, write_result
 from tuning.report.tables import (
     clean,
+    dumps,
     measures_json,
     number,
-    numbers,
     objective_unit,
     reasons,
-    table,
     units,
     wrap,
 )
+from tuning.report.tuning_figures import CAPTIONS, figures, result_key
+from tuning.report.tuning_tables import parts_of, scenario_rows
 
 
 def json_of(result):
@@ -51,272 +56,89 @@ def json_of(result):
     }
 
 
-def text(result):
-    """The result as a page of text."""
-    return "\n".join([*parts_of(result), wrap(result.message)])
+def lines(result):
+    """Return what is printed of a TuningResult: lines and Tables."""
+    return [*parts_of(result), wrap(result.message)]
 
 
-def parts_of(result):
-    """What `text` says but for the message: a list of lines and Tables."""
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
-    head = [
-        (
-            f"{result.tuned.name}: {result.status} ({result.method},"
-            f" {result.evaluations['simulations']} simulations, {result.evaluations['gradients']}"
-            f" of them with gradients, {result.wall_s:.1f} s)"
-        ),
-        "",
-    ]
-    rows = [
-        [
-            n,
-            p["unit"],
-            number(p["before"]),
-            number(p["after"]),
-            f"{number(p['lower'])} : {number(p['upper'])}",
-            "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
-            (
-                "not exercised, kept"
-                if not p["exercised"]
-                else f"at {p['at_bound']} bound"
-                if p["at_bound"]
-                else ""
-            ),
-        ]
-        for n, p in result.parameters.items()
-    ]
-    parts = [
-        table(
-            rows,
-            [
-                "parameter",
-                "unit",
-                "before",
-                "after",
-                "range",
-                "10 % of it moves the objective by",
-                "",
-            ],
-        ),
-        "",
-    ]
-    rows = [
-        ["objective", unit, number(result.objective["before"]), number(result.objective["after"])]
-    ]
-    for m in ms.placed("shown"):
-        if m in result.measures["after"] and not (
-            m == "rms_error_total" and set(result.objective["terms"]) == {m}
-        ):
-            rows.append(
-                [
-                    m,
-                    ms.unit(m, result.tuned.loop.units),
-                    numbers(result.measures["before"][m], 4),
-                    numbers(result.measures["after"][m], 5 if "level" in m else 4),
-                ]
-            )
-    parts += [
-        table(rows, ["measure", "unit", "before", "after"]),
-        *_whose(result, len(rows) > 1),
-        "",
-    ]
-    if result.constraints:
-        shown = worst_of_scenarios(result.constraints)
-        rows = [
-            [
-                c["name"],
-                c["unit"],
-                (">= " if ms.MEASURES[c["measure"]].sense < 0 else "<= ") + number(c["limit"], 7),
-                number(c["value"], 7),
-                number(c["margin"], 3) if c["reason"] is None else "undefined",
-                f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
-            ]
-            for c in shown
-        ]
-        parts += [table(rows, ["limit", "unit", "limit", "value", "margin", "reached at"]), ""]
-    parts += (
-        _scenario_table(result)
-        + _validation_table(result)
-        + _choice_table(result)
-        + _tradeoff_table(result)
-    )
-    if result.bound is not None:
-        parts += [result.bound.text(), ""]
-    if result.tuned.loop.plant.overflow:
-        rims = "rims are physics: liquid past them is lost"
-    elif any(limit.measure == "max_level" for limit in result.problem.limits):
-        rims = "rims are limits: a level may rise past one"
-    else:
-        rims = (
-            "rims are neither physics nor limits here: a level may rise past one, and nothing"
-            " holds it"
-        )
-    return [*head, *parts, f"{rims}; checked at dt = {result.tuned.clock.dt:g} s"]
-
-
-def _whose(result, others):
-    """Whose the rows of the table of measures are, where the objective is of other runs than the
-    rest; others: whether there is a rest.
+def page_of(result, drawn, command=None):
+    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the
+    line that made it.
     """
-    problem = result.problem
-    if not problem.scenarios:
-        return []
-    what = "plants" if result.certificate is not None else "scenarios"
-    weighted = len({lane.weight for lane in problem.lanes}) > 1
-    of = {
-        "mean": "the weighted mean" if weighted else "the mean",
-        "cvar": f"the mean of the worst {100 * TAIL:g} %",
-        "worst": "the worst",
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
+    before, after = result.objective["before"], result.objective["after"]
+    broken, (rig, _) = [c for c in result.constraints if c["margin"] < 0], rig_of(result)
+    limits = (
+        f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold"
+        if result.constraints
+        else "none"
+    )
+    facts = [
+        ("objective before", f"{number(before)} {unit}".strip()),
+        ("objective after", f"{number(after)} {unit}".strip()),
+        ("limits", limits),
+        ("gains tuned", str(sum(p["exercised"] for p in result.parameters.values()))),
+        ("simulations", str(result.evaluations["simulations"])),
+        ("time", f"{result.wall_s:.1f} s"),
+    ]
+    if np.isfinite(before) and before and not broken:
+        facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
+    return html.document(
+        f"{result.tuned.name}: tuned",
+        result.case.title,
+        result.status.replace("_", " ")
+        + ("; every limit holds" if result.constraints and not broken else ""),
+        result.success,
+        facts,
+        result.message.split("; "),
+        html.drawings(drawn, CAPTIONS),
+        parts_of(result)[1:],
+        command,
+        result.provenance,
+        {"The tuned rig as a file (rig.toml)": rig} if rig else None,
+    )
+
+
+def rig_of(result):
+    """Return (text of rig.toml, None), or (None, why there is none and what to set in Python)."""
+    text, why = rig_text(result.tuned)
+    if why is None:
+        return text, None
+    gains = ", ".join(f"{n} = {p['after']!r} {p['unit']}" for n, p in result.parameters.items())
+    return None, f"{why}; set in Python what was tuned: {gains}"
+
+
+def save(result, folder, command=None):
+    """Write result.json, rig.toml, trajectory.csv, to `folder`, all or none, then PNG pictures and
+    report.html; returns their paths.
+
+    command: the line that made the result, for the report, where there is one. A case that no rig
+    file can describe (with a plant or a controller class of one's own) has no rig.toml: a
+    UserWarning, result.json and the report give the reason, and the rig.toml of an earlier result
+    is removed.
+    """
+    check_folder(folder)
+    folder = Path(folder)
+    rig, why = rig_of(result)
+    if why:
+        warnings.warn(why, stacklevel=3)  # the line that called result.save
+        result = result.replace(message=f"{result.message}; {why}")
+    key = result_key(result)
+    runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
+    files = {
+        "result.json": dumps(json_of(result)) + "\n",
+        **({"rig.toml": rig} if rig else {}),
+        "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
+        "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
     }
-    rest = "; the other rows: the case's own run, on its own plant" if others else ""
-    return [f"objective: {of[problem.risk]} of {len(problem.lanes)} {what}{rest}"]
-
-
-def worst_of_scenarios(constraints):
-    """The rows of `constraints`, of those that differ by their scenario alone the one with the
-    least margin.
-    """
-    worst = {}
-    for c in constraints:
-        same = (c["measure"], c["tank"], c["name"].removesuffix(f" in {c['scenario']}"))
-        if same not in worst or c["margin"] < worst[same]["margin"]:
-            worst[same] = c
-    return list(worst.values())
-
-
-def scenario_rows(result):
-    """One dict for each scenario: {name, weight, objective {before, after}, limits_held {before,
-    after}}; [] for the case's own run alone.
-    """
-    problem = result.problem
-    if not problem.scenarios:
-        return []
-    rows = []
-    for i, lane in enumerate(problem.lanes):
-        mine = [limit for limit in problem.limits if limit.lane == i]
-        sides = {k: t[i] for k, t in result.tables.items()}
-        rows.append(
-            {
-                "name": lane.name,
-                "weight": lane.weight,
-                "objective": clean({k: problem.cost(row) for k, row in sides.items()}),
-                "limits_held": {
-                    k: all(limit.margin(row) >= 0 for limit in mine) for k, row in sides.items()
-                },
-            }
-        )
-    return rows
-
-
-COSTLIEST = 5
-
-
-def _scenario_table(result):
-    scenarios = scenario_rows(result)
-    many = len(scenarios) > 12
-    worst = sorted(
-        scenarios,
-        key=lambda s: -np.inf if s["objective"]["after"] is None else -s["objective"]["after"],
+    stale = earlier(folder, CAPTIONS)
+    if not rig and (folder / "result.json").is_file():
+        # of another result: its gains must not be taken for these
+        stale.append(folder / "rig.toml")
+    return write_result(
+        folder,
+        files,
+        lambda: figures(result, runs),
+        lambda drawn: page_of(result, drawn, command),
+        stale,
     )
-    rows = [
-        [
-            s["name"],
-            number(s["weight"], 3),
-            *(
-                number(s["objective"][k]) if s["objective"][k] is not None else "-"
-                for k in ("before", "after")
-            ),
-            ("yes" if s["limits_held"]["after"] else "no") if result.problem.limits else "-",
-        ]
-        for s in (worst[:COSTLIEST] if many else scenarios)
-    ]
-    head = ["scenario", "weight", "objective before", "after", "limits held after"]
-    held = sum(s["limits_held"]["after"] for s in scenarios)
-    kept = f"; limits held after in {held}" if result.problem.limits else ""
-    more = [f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{kept}"] if many else []
-    return [table(rows, head), *more, ""] if rows else []
-
-
-def _validation_table(result):
-    found = result.validation
-    if not found:
-        return []
-    spread = (
-        ", ".join(n if s is None else f"{n} +-{100 * s:g} %" for n, s in found["spread"].items())
-        or "the plant as it is"
-    )
-    noise = ", fresh noise" if found["noise"] else ""
-    rows = [
-        [
-            side,
-            *(number(found["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")),
-            f"{100 * found['limits_held'][side]:.0f} %",
-        ]
-        for side in ("before", "after")
-        if found["limits_held"][side] is not None
-    ]
-    if not rows:
-        return [f"held-out runs: all {found['samples']} failed", ""]
-    head = [
-        f"on {found['samples']} held-out runs",
-        "mean objective",
-        "5 %",
-        "median",
-        "95 %",
-        "all limits held in",
-    ]
-    if not result.problem.limits:  # nothing to hold
-        head, rows = head[:-1], [row[:-1] for row in rows]
-    failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
-    share = f"{_better(found)}; perturbed: {spread}{noise}{failed}"
-    return [table(rows, head), share, ""]
-
-
-def _better(found):
-    """In how many held-out runs tuning gained: a lower cost than that of a run which breaks a limit
-    is no gain, and a higher no loss.
-    """
-    if found["comparable"] == 1.0:
-        return f"tuned is better in {100 * found['better_share']:.0f} % of them"
-    part = f"before and after both hold every limit in {100 * found['comparable']:.3g} % of them"
-    if found["better_share_of_comparable"] is None:
-        return f"{part}, so their objectives are not to be compared"
-    return (
-        f"{part}, and of those tuned is better in {100 * found['better_share_of_comparable']:.0f} %"
-    )
-
-
-def _choice_table(result):
-    if not result.choices:
-        return []
-    rows = [
-        [
-            ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
-            c["status"],
-            number(c["objective"]["before"]),
-            number(c["objective"]["after"]),
-        ]
-        for c in result.choices
-    ]
-    return [table(rows, ["choice", "status", "objective before", "after"]), ""]
-
-
-def _tradeoff_table(result):
-    if not result.tradeoff:
-        return []
-    unit = ms.unit(result.tradeoff["measure"], result.tuned.loop.units)
-    rows = [
-        [
-            number(p["limit"]),
-            p["status"],
-            number(p["objective"]),
-            ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items()),
-        ]
-        for p in result.tradeoff["points"]
-    ]
-    return [
-        table(
-            rows, [f"limit of {result.tradeoff['measure']} [{unit}]", "status", "objective", "at"]
-        ),
-        "",
-    ]

@@ -68,13 +68,8 @@ def remarks_of(ensemble):
     ]
 
 
-def text(ensemble):
-    """The ensemble as a page of text."""
-    return "\n".join(parts_of(ensemble))
-
-
-def parts_of(ensemble):
-    """What `text` says: a list of lines and tables."""
+def lines(ensemble):
+    """What is printed of an Ensemble: lines and tables."""
     units, rows = ensemble.case.loop.units, []
     for name, found in ensemble.summary().items():
         shape, per = ensemble.measures[name].shape[1:], ms.MEASURES[name].per
@@ -285,7 +280,7 @@ def page_of(ensemble, drawn, command=None):
         facts,
         said,
         html.drawings(drawn, CAPTIONS),
-        parts_of(ensemble),
+        lines(ensemble),
         command,
         provenance.provenance(ensemble.case, ensemble.seed),
     )

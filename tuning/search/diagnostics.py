@@ -16,7 +16,8 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.step_size import StepWarning, check_run, step_warnings
 from tuning.problem import scenarios as sc
-from tuning.uncertainty.distributions import Correlated, Draws
+from tuning.uncertainty.distributions import Correlated
+from tuning.uncertainty.draws import Draws
 
 MOST = 16
 """Runs that are made to see whether the explicit step is unstable near empty in one."""

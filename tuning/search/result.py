@@ -1,7 +1,6 @@
 """A tuning result, and what it says of itself in words."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import unknown
 from tuning.problem.problem import EXPLODED
+from tuning.problem.result import Result
 from tuning.problem.status import Status
 from tuning.search.diagnostics import flat_words
 from tuning.search.kkt import SLOPING, UNSTABLE
@@ -39,8 +39,8 @@ class ParameterChange:
     exercised: bool
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TuningResult:
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class TuningResult(Result):
     """What `tune` found. `print(result)` for the table, `.save(dir)` for files, `.plot()` for
     pictures, `result["controller.k"].after`.
 
@@ -58,6 +58,8 @@ class TuningResult:
     certificate: what is known of fresh plants, where asked. case and tuned are the Case before and
         after.
     """
+
+    REPORT = "tuning.report.tuning"
 
     case: Any
     tuned: Any
@@ -104,36 +106,9 @@ class TuningResult:
     def __iter__(self):
         return iter(self.parameters)
 
-    def to_json(self):
-        """The JSON object of `jaxtank tune --json`."""
-        from tuning.report.tuning import json_of
-
-        return json_of(self)
-
     def replace(self, **changes: Any) -> "TuningResult":
         """A copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, rig.toml, trajectory.csv, the pictures and report.html, which says the
-        line `command`, to a folder.
-        """
-        from tuning.report.tuning_figures import save
-
-        return save(self, folder, command)
-
-    def plot(self) -> dict[str, Any]:
-        """Matplotlib figures {name: figure}: responses before and after, convergence, landscape,
-        and what else there is to show.
-        """
-        from tuning.report.tuning_figures import figures
-
-        return figures(self)
-
-    def __repr__(self):
-        from tuning.report.tuning import text
-
-        return text(self)
 
 
 def constraint_rows(problem, table):

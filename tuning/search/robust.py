@@ -14,13 +14,16 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.problem.problem import Problem
+from tuning.problem.result import Shown
 from tuning.search.baseline import own_values
 from tuning.search.diagnostics import HELD_OUT, summary_of, validate
 from tuning.search.result import TuningResult
 from tuning.search.tuner import tune
-from tuning.uncertainty.distributions import Draws, stated
+from tuning.uncertainty.distributions import stated
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
-from tuning.uncertainty.study import Ensemble, ensemble
+from tuning.uncertainty.study import ensemble
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
@@ -44,6 +47,21 @@ class Certificate(NamedTuple):
     fresh: int  # plants run afterwards
     broken: int  # of those, how many broke a limit
     interval95: list  # Clopper and Pearson
+
+    _repr_html_ = Shown._repr_html_
+    _lines = Shown._lines
+
+    def __str__(self):
+        low, high = self.interval95
+        rows = {
+            "plants of the search": self.scenarios,
+            "support scenarios": self.support,
+            "scenario bound": f"{self.bound:.2g} (confidence 1 - {CONFIDENCE:g})",
+            "validation plants": self.fresh,
+            "validation plants that break a limit": self.broken,
+            "probability of breaking a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
+        }
+        return "\n".join(f"{name}: {value}" for name, value in rows.items())
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):

@@ -44,10 +44,8 @@ def spectral_radius(problem, zs, clock):
     state, or a transport delay makes the state too long to ask.
     """
     steady = []
-    plateaus = (
-        problem.loop.reference.plateaus() if hasattr(problem.loop.reference, "plateaus") else []
-    )
-    for r in plateaus:
+    plateaus = problem.loop.reference.plateaus()
+    for r in () if plateaus is None else plateaus:
         try:
             steady.append((r, *equilibrium(problem.loop.plant, r)))
         except InputError:

@@ -107,7 +107,7 @@ class Store:
         """Digest of a batch, its number and what it is of: it tells a file that was changed or
         exchanged, by accident or by hand.
         """
-        mine = json.dumps({n: v for n, v in self.manifest.items() if n != "told"}, sort_keys=True)
+        mine = json.dumps({n: v for n, v in self.manifest.items() if n != "origin"}, sort_keys=True)
         return digest(
             [
                 np.frombuffer(f"{mine} {k}".encode(), dtype=np.uint8),
@@ -166,10 +166,10 @@ def read_manifest(folder):
 
 
 def check_same(mine, theirs, folder):
-    """Raise InputError, naming what differs, unless two manifests are of one ensemble. "told" is
+    """Raise InputError, naming what differs, unless two manifests are of one ensemble. "origin" is
     for people and `merge`: the limits in it decide nothing that is in a batch.
     """
-    other = [k for k in mine if k != "told" and mine[k] != theirs.get(k)]
+    other = [k for k in mine if k != "origin" and mine[k] != theirs.get(k)]
     if other:
         raise InputError(
             f"{str(folder)!r} holds another ensemble; what differs: {', '.join(other)}"

@@ -1,6 +1,4 @@
-"""How a parameter varies. Each distribution has one method, `quantile`, so that random, Latin
-hypercube and Sobol draws all work.
-"""
+"""Distributions of parameters by their quantile functions; imported by every study of `tuning`."""
 
 import dataclasses
 import math
@@ -10,14 +8,27 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import check_value, describe, get_value, is_real, shortened, split_index
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import is_real
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Uniform:
-    """Uniform between low and high, in the parameter's unit; or, with relative, between (1 -
-    relative) and (1 + relative) times the parameter's own value. tied: one factor (or value) for
-    all entries of an array.
+    """Uniform between two values, or relative to the parameter's own value.
+
+    Attributes
+    ----------
+    low, high : float or None
+        Ends, in the parameter's unit.
+    relative : float or None
+        In place of the ends: half-width as a share of the parameter's own value [-].
+    tied : bool
+        One draw for all entries of an array.
+
+    Examples
+    --------
+    >>> Uniform(relative=0.1).quantile(np.array([0.0, 0.5]), np.array(2.0)).tolist()
+    [1.8, 2.0]
     """
 
     low: float | None = None
@@ -26,9 +37,7 @@ class Uniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
-        (...).
-        """
+        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
         if self.relative is not None:
             return nominal * (1.0 + self.relative * (2.0 * p - 1.0))
         assert self.low is not None and self.high is not None  # `check`
@@ -50,8 +59,21 @@ class Uniform:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogUniform:
-    """Uniform in the logarithm: between low and high, or with factor between 1/factor and factor
-    times the parameter's own value.
+    """Uniform in the logarithm between two values, or within a factor of the parameter's own value.
+
+    Attributes
+    ----------
+    low, high : float or None
+        Ends above 0, in the parameter's unit.
+    factor : float or None
+        In place of the ends: between 1/factor and factor times the own value [-].
+    tied : bool
+        One draw for all entries of an array.
+
+    Examples
+    --------
+    >>> LogUniform(factor=2.0).quantile(np.array([0.0, 1.0]), np.array(3.0)).tolist()
+    [1.5, 6.0]
     """
 
     low: float | None = None
@@ -60,9 +82,7 @@ class LogUniform:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
-        (...).
-        """
+        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
         if self.factor is not None:
             return nominal * self.factor ** (2.0 * p - 1.0)
         assert self.low is not None and self.high is not None  # `check`
@@ -82,8 +102,23 @@ class LogUniform:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Normal:
-    """Normal with standard deviation sd (or relative times the parameter's own value) about mean
-    (its own value where None), cut off at `cut` standard deviations to either side.
+    """Normal distribution, truncated to either side.
+
+    Attributes
+    ----------
+    mean : float or None
+        The parameter's own value where None.
+    sd, relative : float or None
+        Standard deviation in the parameter's unit, or as a share of the mean; one of them.
+    cut : float
+        Truncated at so many standard deviations [-].
+    tied : bool
+        One draw for all entries of an array.
+
+    Examples
+    --------
+    >>> Normal(relative=0.05).quantile(np.array([0.5, 1.0]), np.array(2.0)).round(6).tolist()
+    [2.0, 2.3]
     """
 
     mean: float | None = None
@@ -93,9 +128,7 @@ class Normal:
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...), for a parameter that is `nominal`
-        (...).
-        """
+        """Return values (draws, ...) at probabilities p (draws, ...); nominal: (...) own value."""
         tail = scipy.special.ndtr(-self.cut)
         centre = nominal if self.mean is None else self.mean
         spread = self.sd if self.relative is None else self.relative * np.abs(centre)
@@ -115,14 +148,29 @@ class Normal:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Discrete:
-    """One of `values`, with `weights` (equal where None)."""
+    """One of several values.
+
+    Attributes
+    ----------
+    values : tuple of float
+        In the parameter's unit.
+    weights : tuple of float or None
+        Their probabilities, up to a factor; equal where None.
+    tied : bool
+        One draw for all entries of an array.
+
+    Examples
+    --------
+    >>> Discrete(values=(1.0, 2.0)).quantile(np.array([0.2, 0.7]), np.array(1.0)).tolist()
+    [1.0, 2.0]
+    """
 
     values: tuple
     weights: tuple | None = None
     tied: bool = False
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-        """Values (draws, ...) at probabilities p (draws, ...)."""
+        """Return values (draws, ...) at probabilities p (draws, ...)."""
         weights = (
             np.ones(len(self.values))
             if self.weights is None
@@ -144,12 +192,27 @@ class Discrete:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Correlated:
-    """Several scalars that vary together: normal with a covariance, as an identification gives it,
-    or by its Cholesky factor.
+    """Several scalars with a joint normal distribution, as an identification gives it.
 
-    names: (n,) dotted names of scalars or entries; covariance: (n, n) in their units; cut: as in
-    Normal, of each independent part. What would leave the range that a parameter allows is held at
-    its end. Its key in a dict of distributions is free to choose.
+    What would leave the range that a parameter allows is clipped to its end. The key of this
+    distribution in a dict of distributions is free to choose.
+
+    Attributes
+    ----------
+    names : tuple of str
+        (n,) dotted names of scalars or entries.
+    covariance : tuple
+        (n, n) in their units.
+    mean : tuple or None
+        (n,); their own values where None.
+    cut : float
+        Each independent part is truncated at so many standard deviations [-].
+
+    Examples
+    --------
+    >>> pair = Correlated(names=("plant.drain[0]", "x0[1]"), covariance=((4.0, 0.0), (0.0, 1.0)))
+    >>> pair.factor().tolist()
+    [[2.0, 0.0], [0.0, 1.0]]
     """
 
     names: tuple
@@ -158,13 +221,11 @@ class Correlated:
     cut: float = 3.0
 
     def factor(self) -> np.ndarray:
-        """(n, n) lower Cholesky factor."""
+        """Return the (n, n) lower Cholesky factor of the covariance."""
         return np.linalg.cholesky(np.asarray(self.covariance, dtype=float))
 
     def check(self, name: str) -> None:
-        """Raise InputError unless the covariance is symmetric and positive definite, one row for
-        each name.
-        """
+        """Raise InputError unless the covariance is symmetric, positive definite and (n, n)."""
         try:
             matrix, n = np.asarray(self.covariance, dtype=float), len(self.names)
         except (TypeError, ValueError):
@@ -194,8 +255,22 @@ KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discre
 
 
 def stated(distributions):
-    """{name: distribution} of what a study was given: a bare number is a share, uniform to either
-    side, as a case's `uncertain` has it. Raises InputError for what is neither.
+    """Return {name: distribution} of what a study was given.
+
+    Parameters
+    ----------
+    distributions : dict
+        {name: distribution, or a relative half-width as in a case's `uncertain`}.
+
+    Raises
+    ------
+    InputError
+        A value that is neither.
+
+    Examples
+    --------
+    >>> stated({"plant.drain": 0.1})["plant.drain"].relative
+    0.1
     """
     if not isinstance(distributions, Mapping):
         raise InputError(
@@ -215,147 +290,60 @@ def stated(distributions):
     return found
 
 
-class Draws:
-    """The distributions of a case as a map from the unit cube: `dimensions` probabilities in,
-    {name: (draws, ...)} out.
-
-    distributions: {dotted name: distribution} (an array's entries vary each on its own, unless
-    tied; zeros of a relative spread stay zero and take no dimension). Raises InputError for an
-    unknown name, one given twice, and a distribution that can leave the range that its parameter
-    allows.
-    """
-
-    def __init__(self, loop, distributions):
-        if not distributions:
-            raise InputError("nothing is uncertain: name at least one parameter")
-        self.parts, self.dimensions, self.labels, self.ends = [], 0, [], {}
-        taken = []
-        for name, distribution in distributions.items():
-            distribution.check(name)
-            correlated = isinstance(distribution, Correlated)
-            for one in map(_spelled, distribution.names if correlated else (name,)):
-                base = split_index(one)[0]
-                if (
-                    one in taken
-                    or base in taken
-                    or (not split_index(one)[1] and any(split_index(t)[0] == base for t in taken))
-                ):
-                    raise InputError(f"uncertain {one} is given twice")
-                if describe(loop, one)["kind"] == "static":
-                    raise InputError(
-                        f"uncertain {one}: is part of the compiled program and cannot vary from"
-                        " draw to draw"
-                    )
-                taken.append(one)
-            if correlated:
-                nominal = np.array([float(get_value(loop, one)) for one in distribution.names])
-                count, labels = len(nominal), list(distribution.names)
-            else:
-                nominal = np.asarray(get_value(loop, name), dtype=float)
-                whole = nominal.ndim == 0 or distribution.tied
-                count = 1 if whole else int(_moves(distribution, nominal).sum())
-                where = [] if whole else np.argwhere(_moves(distribution, nominal))
-                labels = [name] if whole else [f"{name}[{','.join(map(str, i))}]" for i in where]
-            if correlated:
-                self.ends[name] = [_ends(describe(loop, one)) for one in distribution.names]
-            self.parts.append(
-                (name, distribution, nominal, slice(self.dimensions, self.dimensions + count))
-            )
-            self.dimensions += count
-            self.labels += labels
-        # held within their ranges
-        together = {
-            one for d in distributions.values() if isinstance(d, Correlated) for one in d.names
-        }
-        for corner in (np.zeros, np.ones):
-            for name, value in self.values(corner((1, self.dimensions))).items():
-                if name not in together:
-                    check_value(f"uncertain {name}", value[0], describe(loop, name))
-        for name, d in distributions.items():
-            if isinstance(d, Discrete):
-                check_value(
-                    f"uncertain {name}", np.asarray(d.values, dtype=float), describe(loop, name)
-                )
-
-    def values(self, p):
-        """{name: (draws, ...)} at probabilities p (draws, dimensions)."""
-        found = {}
-        for name, distribution, nominal, columns in self.parts:
-            mine = p[:, columns]
-            if isinstance(distribution, Correlated):
-                tail = scipy.special.ndtr(-distribution.cut)
-                mean = nominal if distribution.mean is None else np.asarray(distribution.mean)
-                drawn = (
-                    mean
-                    + scipy.special.ndtri(tail + (1.0 - 2.0 * tail) * mine)
-                    @ distribution.factor().T
-                )
-                ends = self.ends[name]
-                found.update(
-                    {
-                        one: np.clip(drawn[:, i], *ends[i])
-                        for i, one in enumerate(distribution.names)
-                    }
-                )
-                continue
-            if nominal.ndim == 0 or distribution.tied:
-                shaped = mine.reshape(-1, *([1] * nominal.ndim)) + np.zeros(nominal.shape)
-            else:
-                shaped = np.full((len(p), *nominal.shape), 0.5)
-                shaped[:, _moves(distribution, nominal)] = mine
-            found[name] = distribution.quantile(shaped, nominal)
-        return found
-
-
-def _spelled(name):
-    """`name` with its index as numbers are written: "a[00]" is "a[0]"."""
-    base, index = split_index(name)
-    return base + (f"[{','.join(map(str, index))}]" if index else "")
-
-
-def _ends(meta):
-    """(low, high) of a parameter's own range; just above a low end that does not belong to it."""
-    low = -math.inf if meta["low"] is None else meta["low"] + (1e-9 if meta["strict"] else 0.0)
-    return low, math.inf if meta["high"] is None else meta["high"]
-
-
-def _moves(distribution, nominal):
-    """Which entries a distribution moves: a relative spread leaves zeros alone."""
-    relative = (
-        getattr(distribution, "relative", None) is not None
-        or getattr(distribution, "factor", None) is not None
-    )
-    return nominal != 0 if relative else np.ones(nominal.shape, dtype=bool)
-
-
 def parse(name, text):
-    """The distribution of a command line: "uniform:LOW:HIGH", "uniform:5%", "loguniform:LOW:HIGH",
-    "loguniform:FACTOR", "normal:5%", "normal:MEAN:SD", "discrete:V1:V2:..."; "tied" at the end
-    gives all entries of an array one draw.
+    """Return the distribution of a text of the command line.
+
+    Parameters
+    ----------
+    name : str
+        The parameter, for the error.
+    text : str
+        "uniform:LOW:HIGH", "uniform:5%", "loguniform:LOW:HIGH", "loguniform:FACTOR",
+        "normal:5%", "normal:MEAN:SD" or "discrete:V1:V2:..."; ":tied" at the end gives all
+        entries of an array one draw.
+
+    Raises
+    ------
+    InputError
+        Any other text.
+
+    Examples
+    --------
+    >>> parse("plant.drain", "uniform:5%").relative
+    0.05
     """
     kind, *parts = [p.strip() for p in text.split(":")]
     tied = bool(parts) and parts[-1] == "tied"
-    parts = parts[:-1] if tied else parts
-    try:
-        share = float(parts[0][:-1]) / 100 if len(parts) == 1 and parts[0].endswith("%") else None
-        numbers = None if share is not None else [float(p) for p in parts]
-    except ValueError:
-        kind = ""
-    if kind in ("uniform", "normal") and share is not None:
-        found = KINDS[kind](relative=share, tied=tied)
-    elif kind in ("uniform", "loguniform") and numbers and len(numbers) == 2:
-        found = KINDS[kind](low=numbers[0], high=numbers[1], tied=tied)
-    elif kind == "loguniform" and numbers and len(numbers) == 1:
-        found = LogUniform(factor=numbers[0], tied=tied)
-    elif kind == "normal" and numbers and len(numbers) == 2:
-        found = Normal(mean=numbers[0], sd=numbers[1], tied=tied)
-    elif kind == "discrete" and numbers:
-        found = Discrete(values=tuple(numbers), tied=tied)
-    else:
+    fields = _fields(kind, parts[:-1] if tied else parts)
+    if fields is None:
         raise InputError(
             f"{name} = {text!r}: must be uniform:LOW:HIGH, uniform:5%, loguniform:LOW:HIGH,"
             " loguniform:FACTOR, normal:5%, normal:MEAN:SD or discrete:V1:V2, with :tied for one"
             " draw of a whole array"
         )
+    found = KINDS[kind](**fields, tied=tied)
     found.check(name)
     return found
+
+
+FORMS = {
+    ("uniform", 2): ("low", "high"),
+    ("loguniform", 2): ("low", "high"),
+    ("loguniform", 1): ("factor",),
+    ("normal", 2): ("mean", "sd"),
+}
+"""{(kind, count of numbers): their fields}."""
+
+
+def _fields(kind, parts):
+    """{field: value} of the numbers after the kind of a distribution; None where they fit none."""
+    try:
+        if kind in ("uniform", "normal") and len(parts) == 1 and parts[0].endswith("%"):
+            return {"relative": float(parts[0][:-1]) / 100}
+        numbers = [float(p) for p in parts]
+    except ValueError:
+        return None
+    if kind == "discrete" and numbers:
+        return {"values": tuple(numbers)}
+    names = FORMS.get((kind, len(numbers)))
+    return None if names is None else dict(zip(names, numbers))

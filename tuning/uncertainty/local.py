@@ -1,4 +1,7 @@
-"""The columns of a sensitivity study, and how exact derivatives fill them."""
+"""The columns of a sensitivity study, and exact derivatives as one way to fill them.
+
+Imported by `sensitivity_study` and its report.
+"""
 
 from typing import NamedTuple, cast
 
@@ -11,15 +14,16 @@ from jaxtank.loop import run as lp
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal
 
 CHUNK = 16
-"""Parameters that slopes are carried of at once."""
+"""Parameters whose derivatives are computed at once."""
 
 NORMAL_WIDTH = 2.0
 """Half-width of a normal distribution, in standard deviations [-]."""
 
 
 class Column(NamedTuple):
-    """One entry of one measure and what it feels: `felt` is {quantity: (D,) or (D, 2)} in the order
-    of the parameters.
+    """The sensitivity of one entry of one measure to every parameter.
+
+    effects: {quantity: (D,) or (D, 2)} in the order of the parameters.
     """
 
     measure: str
@@ -27,13 +31,13 @@ class Column(NamedTuple):
     unit: str
     nominal: float  # value of the case's own run, NaN where it has none
     not_finite: int  # runs of the study in which it is no finite number
-    felt: dict
+    effects: dict
     reason: str  # why some or all indices are absent, "" where none is
     empty: bool = False  # no parameter has an index
 
 
 def entries_of(case, names):
-    """[(measure, its label with the entry counted from 1, unit)] of every entry of the measures."""
+    """Return [(measure, label, unit)] of every entry of the measures, counted from 1."""
     found = []
     for m in names:
         per = ms.MEASURES[m].per
@@ -45,67 +49,64 @@ def entries_of(case, names):
 
 
 def local_columns(case, draws, names, key, progress=None):
-    """(Columns by derivatives at the case's own values, {parameter: half-width}): forward mode, at
-    most CHUNK numbers at once.
+    """Return the Columns by derivatives at the case's own values, and {parameter: half-width}.
 
-    felt: "effect", derivative times half-width; "derivative", NaN where entries are tied;
+    Their effects: "effect", derivative times half-width; "derivative", NaN where entries are tied;
     "elasticity", percent of the measure for each percent of the parameter. A parameter whose
     entries are tied moves all of them by their own half-widths. Raises NonFiniteError.
     """
     widths = half_widths(draws)
     scalars = list(dict.fromkeys(name for width in widths for name in width))
-    slopes = []
+    nominal, derivatives = _derivatives(case, scalars, names, key, progress)
+    where = {name: i for i, name in enumerate(scalars)}
+    effect = [sum(derivatives[:, where[n]] * w for n, w in width.items()) for width in widths]
+    effect = np.stack(effect, axis=1)
+    alone = [next(iter(width)) if len(width) == 1 else None for width in widths]
+    absent = np.full(len(nominal), np.nan)
+    single = np.stack([derivatives[:, where[n]] if n else absent for n in alone], axis=1)
+    own = np.array([float(get_value(case.loop, n)) if n else np.nan for n in alone])
+    elasticity = single * own / np.where(nominal == 0, np.nan, nominal)[:, None]
+    effects = {"effect": effect, "derivative": single, "elasticity": elasticity}
+    half = [next(iter(w.values())) if len(w) == 1 else list(w.values()) for w in widths]
+    return _columns(case, names, nominal, effects), dict(zip(draws.labels, half))
+
+
+def _columns(case, names, nominal, effects):
+    """The Columns of (K,) nominal entries and {quantity: (K, D)}."""
+    columns = []
+    for k, (measure, label, unit) in enumerate(entries_of(case, names)):
+        row = {quantity: values[k] for quantity, values in effects.items()}
+        good = bool(np.isfinite(row["effect"]).all())
+        reason = "" if good else "its derivative is not finite"
+        columns.append(Column(measure, label, unit, float(nominal[k]), int(not good), row, reason))
+    return columns
+
+
+def _derivatives(case, scalars, names, key, progress):
+    """(K,) entries of the measures and (K, scalars) their derivatives, CHUNK scalars at once."""
+    found, measures = [], {}
     for start in range(0, len(scalars), CHUNK):
-        values = {
-            name: float(get_value(case.loop, name)) for name in scalars[start : start + CHUNK]
-        }
-        measures, rates, _, broken = lp.sensitivities(case.loop, case.clock, names, values, key)
-        if broken:
+        chunk = scalars[start : start + CHUNK]
+        values = {name: float(get_value(case.loop, name)) for name in chunk}
+        measures, rates, _, diverged = lp.sensitivities(case.loop, case.clock, names, values, key)
+        if diverged:
             raise NonFiniteError(
                 f"{case.name}: a level stops being finite at the case's own values, so there are no"
                 " derivatives"
             )
-        slopes.append(
-            np.concatenate([np.asarray(rates[m]).reshape(-1, len(values)) for m in names])
-        )
+        rows = [np.asarray(rates[m]).reshape(-1, len(values)) for m in names]
+        found.append(np.concatenate(rows))
         if progress is not None:
             progress(min(start + CHUNK, len(scalars)), len(scalars))
     nominal = np.concatenate([np.ravel(measures[m]) for m in names])
-    slopes, where = np.concatenate(slopes, axis=1), {name: i for i, name in enumerate(scalars)}
-    effects = np.stack(
-        [sum(slopes[:, where[n]] * w for n, w in width.items()) for width in widths], axis=1
-    )
-    alone = [next(iter(width)) if len(width) == 1 else None for width in widths]
-    derivatives = np.stack(
-        [slopes[:, where[n]] if n else np.full(len(nominal), np.nan) for n in alone], axis=1
-    )
-    own = np.array([float(get_value(case.loop, n)) if n else np.nan for n in alone])
-    elasticities = derivatives * own / np.where(nominal == 0, np.nan, nominal)[:, None]
-    columns = []
-    for k, (measure, label, unit) in enumerate(entries_of(case, names)):
-        felt = {"effect": effects[k], "derivative": derivatives[k], "elasticity": elasticities[k]}
-        good = np.isfinite(effects[k]).all()
-        columns.append(
-            Column(
-                measure,
-                label,
-                unit,
-                float(nominal[k]),
-                int(not good),
-                felt,
-                "" if good else "its slope is not finite",
-            )
-        )
-    half = [
-        next(iter(width.values())) if len(width) == 1 else list(width.values()) for width in widths
-    ]
-    return columns, dict(zip(draws.labels, half))
+    return nominal, np.concatenate(found, axis=1)
 
 
 def half_widths(draws):
-    """For each dimension {name of a scalar that it moves: by how much}: half the range of the
-    distribution, or NORMAL_WIDTH standard deviations of a normal one (of each by itself, where
-    several are correlated).
+    """Return for each dimension {name of a scalar that it moves: half-width}.
+
+    The half-width is half the range of the distribution, or NORMAL_WIDTH standard deviations of a
+    normal one (of each by itself, where several are correlated).
     """
     found = []
     for name, d, nominal, _ in draws.parts:

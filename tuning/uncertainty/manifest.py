@@ -1,5 +1,6 @@
-"""What the shards of an ensemble are of, as JSON in their manifest: enough to join them without
-saying it again.
+"""What the shards of an ensemble are of, as JSON in their manifest, so that a folder can be joined.
+
+Imported by `study` and the command `merge`.
 """
 
 import dataclasses
@@ -16,17 +17,15 @@ KINDS = {c.__name__: c for c in (ds.Uniform, ds.LogUniform, ds.Normal, ds.Discre
 WORDS = {
     "samples": int,
     "key": int,
-    "lanes": int,
+    "batch": int,
     "draws": str,
     "measures": list,
     "distributions": dict,
 }
 
 
-def told(case, limits):
-    """What the manifest says of a case and its limits: {"rig": text of a rig file, or None where no
-    file describes it, "limits": dict}.
-    """
+def origin_of(case, limits):
+    """Return {"rig": text of a rig file, None where no file describes the case, "limits": dict}."""
     try:
         text = rig.dump(case)
     except InputError:
@@ -40,7 +39,13 @@ def told(case, limits):
 
 
 def to_json(distributions):
-    """{name: {"kind", fields}} of {name: distribution}."""
+    """Return {name: {"kind", fields}} of {name: distribution}.
+
+    Examples
+    --------
+    >>> to_json({"plant.drain": ds.Uniform(relative=0.1)})["plant.drain"]["relative"]
+    0.1
+    """
     return {
         n: {
             "kind": type(d).__name__,
@@ -54,7 +59,13 @@ def to_json(distributions):
 
 
 def from_json(found):
-    """{name: distribution} of what `to_json` gives. Raises InputError for anything else."""
+    """Return {name: distribution} of what `to_json` gives; InputError for anything else.
+
+    Examples
+    --------
+    >>> from_json(to_json({"plant.drain": ds.Uniform(relative=0.1)}))["plant.drain"].relative
+    0.1
+    """
     built = {}
     for name, fields in found.items():
         kind = KINDS.get(cast(Any, fields.get("kind"))) if isinstance(fields, dict) else None
@@ -73,15 +84,15 @@ def _tuples(value) -> Any:
 
 
 def restore(folder):
-    """(Case, options of `ensemble`) of the shards in a folder. Raises InputError where the manifest
-    does not say them.
+    """Return (Case, options of `ensemble`) of the shards in a folder.
 
     Nothing is trusted: the rig file is read as any other, and the loop made from it must be, bit
-    for bit, that of the shards (`ensemble` compares their digests).
+    for bit, that of the shards (`ensemble` compares their digests). Raises InputError where the
+    manifest does not state them.
     """
     manifest = batch_store.read_manifest(folder)
     bad = [name for name, kind in WORDS.items() if not isinstance(manifest.get(name), kind)]
-    asked = manifest.get("told")
+    asked = manifest.get("origin")
     if bad or not isinstance(asked, dict) or not isinstance(asked.get("limits"), dict):
         raise InputError(
             f"{str(folder)!r}: the manifest does not say what its shards are of; give the case and"
@@ -93,9 +104,9 @@ def restore(folder):
             " Python"
         )
     case = rig.loads(asked["rig"], f"manifest of {str(folder)!r}")
-    options = {n: manifest[n] for n in ("samples", "key", "lanes", "draws")}
+    options = {n: manifest[n] for n in ("samples", "key", "batch", "draws")}
     named = all(isinstance(m, str) for m in manifest["measures"])
-    if options["lanes"] < 1 or options["samples"] > 10**8 or not named:
+    if options["batch"] < 1 or options["samples"] > 10**8 or not named:
         raise InputError(f"{str(folder)!r}: the manifest is not one of this program")
     return case, {
         **options,

@@ -1,11 +1,11 @@
-"""Which parameter moves which measure: exact derivatives, Morris' elementary effects, Sobol's
-shares of the variance.
+"""Which parameter changes which measure: derivatives, Morris' elementary effects, Sobol indices.
+
+Imported by `tuning` and its commands.
 """
 
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -14,41 +14,56 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from tuning.problem import scenarios as sc
+from tuning.problem.result import Result
 from tuning.uncertainty import indices
-from tuning.uncertainty.distributions import Correlated, Draws, stated
+from tuning.uncertainty.batches import Runs, check_devices
+from tuning.uncertainty.distributions import Correlated, stated
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.local import Column, entries_of, local_columns
-from tuning.uncertainty.sampling import spread_of
-from tuning.uncertainty.study import check_devices
+from tuning.uncertainty.sampling import check_whole, spread_of
 
 METHODS = ("local", "morris", "sobol")
 
 SAMPLES = {"local": None, "morris": 32, "sobol": 512}
-"""Trajectories of Morris and base points of Sobol unless told otherwise."""
+"""Default number of trajectories of Morris and of base points of Sobol."""
 
 LEAST, MOST = {"morris": 4, "sobol": 16}, 1 << 20
-"""Fewest samples that an interval can be drawn from, and most that are taken."""
-
-LANES, NUMBERS = 64, 1 << 22
-"""Runs in a batch, and the samples that all of them may have together: what is prepared before the
-loop is held for each.
-"""
+"""Fewest samples that an interval can be computed from, and most that are taken."""
 
 RANKED_BY = {"local": "effect", "morris": "mu_star", "sobol": "total"}
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SensitivityResult:
-    """What `sensitivity` found. `.text()` for tables, `.to_json()`, `.figures()` for pictures,
-    `.save(dir)` for files.
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class SensitivityResult(Result):
+    """How sensitive measures of a case are to its parameters; made by `tuning.sensitivity`.
 
-    parameters: (D,) dotted names of what varies; values: {name: its own value (list of them where
-    entries are tied)}; half_width: {name: (D,) of the local method, in the parameter's unit};
-    columns: one Column for each entry of each measure; runs: simulations; failed: how many of them
-    stopped being finite; samples: trajectories or base points, None for the local method.
+    Attributes
+    ----------
+    case : Case
+    method : str
+        "local", "morris" or "sobol".
+    samples : int or None
+        Trajectories or base points; None for the local method.
+    runs, failed : int
+        Simulations, and how many of them diverged.
+    seed : int
+    distributions : dict
+        {dotted name: distribution}.
+    parameters : list of str
+        (D,) dotted names of what varies.
+    half_width : dict
+        {name: half-width, a list where entries are tied} of the local method, in the parameter's
+        unit.
+    columns : list of Column
+        One for each entry of each measure.
+    notes : list of str
+    wall_s : float
+        [s].
     """
+
+    REPORT = "tuning.report.sensitivity_tables"
 
     case: Any
     method: str
@@ -64,42 +79,12 @@ class SensitivityResult:
     wall_s: float
 
     def order(self, column):
-        """The parameters' indices, the one that moves the column most first; those without an index
-        last.
+        """Return the indices of the parameters, the most influential one first.
+
+        Those without a sensitivity come last.
         """
-        size = np.abs(column.felt[RANKED_BY[self.method]])
+        size = np.abs(column.effects[RANKED_BY[self.method]])
         return np.argsort(np.where(np.isfinite(size), -size, np.inf), kind="stable")
-
-    def to_json(self):
-        """The JSON object of `jaxtank sensitivity --json`."""
-        from tuning.report.sensitivity_tables import json_of
-
-        return json_of(self)
-
-    def text(self):
-        """The result as a page of text."""
-        from tuning.report.sensitivity_tables import text
-
-        return text(self)
-
-    def figures(self):
-        """Matplotlib figures {"tornado" or "sobol": figure}."""
-        from tuning.report.sensitivity_tables import figures
-
-        return figures(self)
-
-    plot = figures
-
-    def save(self, folder, command=None):
-        """Write result.json, sensitivity.csv, the picture and report.html, which says the line
-        `command`, to a folder; returns their paths.
-        """
-        from tuning.report.sensitivity_tables import save
-
-        return save(self, folder, command)
-
-    def __repr__(self):
-        return self.text()
 
 
 def sensitivity(
@@ -115,75 +100,82 @@ def sensitivity(
     devices: int = 1,
     progress: Callable | None = None,
 ) -> SensitivityResult:
-    """Which uncertain parameter moves which measure of a case.
+    """Return how sensitive measures of a case are to its uncertain parameters.
 
-    distributions: {dotted name: distribution}; what the case calls uncertain, uniform within its
-    own share, where None; spread: one share for all that the case calls uncertain [-], instead of
-    `distributions`. method: "local": derivative at the case's own values times half-width of the
-    distribution; "morris": elementary effects over `samples` (32) trajectories, samples (D + 1)
-    runs;
-    "sobol": first and total order from `samples` (512) base points, rounded up to a power of 2,
-    samples (D + 2) runs. measures: names, those of the case's objective, rms_error_total and
-    max_level where None; seed: of the points and of the sensor noise, which is the same in every
-    run; batch: runs at once; devices: of this process, each of which takes batches of its own, to
-    the same bits; progress: called with (runs done, runs in all). Returns a SensitivityResult.
-    Raises InputError before anything is run, and NonFiniteError if the local method meets a run
-    that is not finite.
+    Sources: Morris, Technometrics 33(2) 1991, 161; Saltelli et al., Comput. Phys. Commun. 181(2)
+    2010, 259 (see `tuning.uncertainty.indices`).
+
+    Parameters
+    ----------
+    case : Case
+    distributions : dict or None
+        {dotted name: distribution}; what the case calls uncertain where None.
+    method : {"local", "morris", "sobol"}
+        "local": derivative at the case's own values times half-width of the distribution;
+        "morris": elementary effects over `samples` (32) trajectories, samples (D + 1) runs;
+        "sobol": first and total order from `samples` (512) base points, rounded up to a power of
+        2, samples (D + 2) runs.
+    measures : sequence of str or None
+        Those of the case's objective, rms_error_total and max_level where None.
+    samples : int or None
+    spread : float or None
+        One relative half-width for all that the case calls uncertain, in place of
+        `distributions` [-].
+    seed : int
+        Of the points and of the sensor noise, which is the same in every run.
+    batch : int or None
+        Runs at once.
+    devices : int
+        Of this process; each takes batches of its own, to the same bits.
+    progress : callable or None
+        Called with (runs done, runs in all).
+
+    Returns
+    -------
+    SensitivityResult
+
+    Raises
+    ------
+    InputError
+        Before anything is run.
+    NonFiniteError
+        The run of the local method diverges.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 8.0})
+    >>> found = tuning.sensitivity(case, {"plant.pump_gain": 0.1}, measures=["max_level"])
+    >>> found.parameters, [c.label for c in found.columns]
+    (['plant.pump_gain[0]'], ['max_level of tank 1', 'max_level of tank 2'])
     """
-    began = time.perf_counter()
+    began, notes = time.perf_counter(), []
     if method not in METHODS:
         raise unknown("method", method, METHODS)
     given = what_varies(case, distributions, spread)
     draws = Draws(case.loop, given)
     if not draws.dimensions:
         raise InputError(
-            "nothing moves: a relative spread leaves zeros alone, and all values are zero"
+            "nothing varies: a relative spread leaves zeros alone, and all values are zero"
         )
     names = check_measures(case, measures, method)
-    notes = []
-    if method == "local":
-        if samples is not None:
-            notes.append("the local method takes one run and its derivatives: samples are not used")
-        samples = None
-    else:
-        samples = check_samples(samples, method, notes)
-        for name, d in given.items():
-            if isinstance(d, Correlated):
-                raise InputError(
-                    f"{name}: parameters that vary together have no effects of their own; take the"
-                    " local method"
-                )
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(f"seed = {seed!r}: must be a whole number from 0 to {2**31 - 1}")
-    if batch is not None and (isinstance(batch, bool) or not isinstance(batch, int) or batch < 1):
-        raise InputError(f"batch = {batch!r}: must be a whole number of at least 1")
+    samples = check_samples(samples, method, notes)
+    _check_arguments(given, method, seed, batch)
     check_devices(devices)
     random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
     # one key for all runs: differences are the parameters' alone
     key = jax.random.key(seed) if random else None
     lp.check(case.loop, case.clock, key)
-    half_width = {}
+    half_width, runs, failed = {}, 1, 0
     if method == "local":
         columns, half_width = local_columns(case, draws, names, key, progress)
-        runs, failed = 1, 0
     else:
-        points = (indices.morris_points if method == "morris" else indices.sobol_points)(
-            draws.dimensions, samples, seed
-        )
+        make = indices.morris_points if method == "morris" else indices.sobol_points
+        points = make(draws.dimensions, samples, seed)
         run = Runs(case, draws, names, key, batch, progress, devices)
-        found = run(points.reshape(-1, draws.dimensions)).reshape(*points.shape[:2], -1)
-        columns = [
-            _column(
-                case,
-                names,
-                k,
-                run.nominal[k],
-                found[..., k],
-                _indices(method, points, found[..., k], seed),
-            )
-            for k in range(found.shape[-1])
-        ]
-        runs, failed = found.shape[0] * found.shape[1], run.failed
+        columns = _columns(case, names, method, points, run, seed)
+        runs, failed = points.shape[0] * points.shape[1], run.failed
     return SensitivityResult(
         case=case,
         method=method,
@@ -200,9 +192,23 @@ def sensitivity(
     )
 
 
+def _check_arguments(given, method, seed, batch):
+    """Raise InputError for parameters that vary together, a seed or a batch that is none."""
+    for name, d in given.items():
+        if isinstance(d, Correlated) and method != "local":
+            raise InputError(
+                f"{name}: parameters that vary together have no effects of their own; take the"
+                " local method"
+            )
+    check_whole("seed", seed, 0, 2**31 - 1)
+    if batch is not None:
+        check_whole("batch", batch, 1)
+
+
 def what_varies(case, distributions=None, spread=None):
-    """{name: distribution} of a study: `distributions`, or what the case calls uncertain, within
-    one `spread` or its own.
+    """Return {name: distribution} of a study.
+
+    Those given, or what the case calls uncertain, within one `spread` or its own.
     """
     if spread is not None and (
         isinstance(spread, bool) or not isinstance(spread, (int, float)) or not 0 < spread < 1
@@ -210,14 +216,16 @@ def what_varies(case, distributions=None, spread=None):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
     if distributions is not None and spread is not None:
         raise InputError(
-            "distributions say what varies, spread how much of the case's own: give one of them"
+            "distributions name what varies, spread how much all that the case calls uncertain"
+            " varies: give one of them"
         )
     return spread_of(case, spread) if distributions is None else stated(distributions)
 
 
 def check_measures(case, measures, method):
-    """The names of the measures of a study, if the case has them all and the method can say
-    something of each.
+    """Return the names of the measures of a study.
+
+    Raises InputError where the case lacks one or the method cannot treat it.
     """
     if measures is None:
         names = [
@@ -232,8 +240,8 @@ def check_measures(case, measures, method):
         for m in names:
             if not ms.serves(m, case.loop):
                 raise InputError(
-                    f"measure {m} means nothing for {case.name}: it has no changes of setpoint, or"
-                    " nothing is poured"
+                    f"measure {m} is undefined for {case.name}: it has no changes of setpoint, or"
+                    " no inflow disturbance"
                 )
             if method == "local" and ms.MEASURES[m].counts:
                 raise InputError(
@@ -244,98 +252,46 @@ def check_measures(case, measures, method):
 
 
 def check_samples(samples, method, notes):
-    """The number of samples, for Sobol a power of 2; says in `notes` if that is not what was asked."""
+    """Return the number of samples, for Sobol a power of 2, None for the local method.
+
+    A note is added to `notes` where it is not what was asked for.
+    """
+    if method == "local":
+        if samples is not None:
+            notes.append("the local method takes one run and its derivatives: samples are not used")
+        return None
     samples = SAMPLES[method] if samples is None else samples
-    if (
-        isinstance(samples, bool)
-        or not isinstance(samples, int)
-        or not LEAST[method] <= samples <= MOST
-    ):
+    whole = isinstance(samples, int) and not isinstance(samples, bool)
+    if not whole or not LEAST[method] <= samples <= MOST:
         raise InputError(
             f"samples = {samples!r}: the method {method} takes a whole number from {LEAST[method]}"
             f" to {MOST}"
         )
     if method == "sobol" and samples & (samples - 1):
+        rounded = 1 << samples.bit_length()
         notes.append(
-            f"samples: {samples} rounded up to {1 << samples.bit_length()}, Sobol points are even"
-            " in powers of 2"
+            f"samples: {samples} rounded up to {rounded}; Sobol points are evenly spread in powers"
+            " of 2"
         )
-        samples = 1 << samples.bit_length()
+        return rounded
     return samples
 
 
-class Runs:
-    """A case as a function of the unit cube: (n, D) probabilities in, (n, K) entries of measures
-    out, NaN where a run is not finite.
-
-    Batches have one size, so that one compiled program serves; the case's own run goes first. After
-    a call `nominal` (K,) holds its values and `failed` the number of other runs that stopped being
-    finite.
-    """
-
-    def __init__(self, case, draws, names, key, batch=None, progress=None, devices=1):
-        (self.group,) = sc.groups_of([sc.Lane("", case, key, 1.0)])
-        self.own = {
-            name: np.asarray(get_value(case.loop, name))[None]
-            for name in draws.values(np.zeros((0, draws.dimensions)))
-        }
-        self.draws, self.names, self.progress = draws, names, progress
-        self.batch = batch or max(
-            8, min(LANES, 1 << (max(1, NUMBERS // case.clock.samples).bit_length() - 1))
-        )
-        self.nominal: Any = None
-        self.failed = 0
-        self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
-
-    def _batch(self, device, values):
-        measures, broken = sc.values_of(self.group, self.names, jax.device_put(values, device))
-        flat = np.concatenate(
-            [np.asarray(measures[m])[:, 0].reshape(len(broken), -1) for m in self.names], axis=1
-        )
-        return np.where(np.asarray(broken), np.nan, flat), np.asarray(broken)[:, 0]
-
-    def __call__(self, p):
-        values = {
-            name: np.concatenate([self.own[name], v]) for name, v in self.draws.values(p).items()
-        }
-        total, found = len(p) + 1, []
-        size = min(self.batch, total)
-        starts = range(0, total, size)
-        for group in (
-            starts[i : i + len(self.devices)] for i in range(0, len(starts), len(self.devices))
-        ):
-            rows = [
-                np.minimum(np.arange(start, start + size), total - 1) for start in group
-            ]  # the last run repeated to fill the batch
-            done = self.pool.map(
-                self._batch,
-                self.devices,
-                [{name: v[r] for name, v in values.items()} for r in rows],
-            )
-            for start, (flat, lost) in zip(group, done):
-                found.append(flat[: total - start])
-                self.failed += int(lost[: total - start].sum()) - int(start == 0 and lost[0])
-            if self.progress is not None:
-                self.progress(min(group[-1] + size, total) - 1, len(p))
-        found = np.concatenate(found)
-        self.nominal = found[0]
-        return found[1:]
-
-
-def _column(case, names, k, nominal, y, felt):
-    measure, label, unit = entries_of(case, names)[k]
-    bad = int(np.sum(~np.isfinite(y)))
-    known, reason = np.isfinite(felt["total" if "total" in felt else "mu_star"]), ""
-    if not known.all():
-        reason = (
-            "fewer than 2 samples in which it is finite"
-            if np.min(felt["kept"]) < 2
-            else "it does not vary"
-        )
-    return Column(measure, label, unit, float(nominal), bad, felt, reason, not known.any())
-
-
-def _indices(method, points, y, seed):
-    if method == "sobol":
-        return indices.sobol_indices(y, seed)
-    return indices.morris_indices(indices.morris_effects(points, y))
+def _columns(case, names, method, points, run, seed):
+    """The Columns of a study by runs at `points` (samples, runs of each, D)."""
+    found = run(points.reshape(-1, points.shape[-1])).reshape(*points.shape[:2], -1)
+    columns = []
+    for k, (measure, label, unit) in enumerate(entries_of(case, names)):
+        y, nominal = found[..., k], float(run.nominal[k])
+        if method == "sobol":
+            effects, ranking = indices.sobol_indices(y, seed), "total"
+        else:
+            effects = indices.morris_indices(indices.morris_effects(points, y))
+            ranking = "mu_star"
+        known, reason = np.isfinite(effects[ranking]), ""
+        if not known.all():
+            few = np.min(effects["kept"]) < 2
+            reason = "fewer than 2 samples in which it is finite" if few else "it does not vary"
+        bad = int(np.sum(~np.isfinite(y)))
+        columns.append(Column(measure, label, unit, nominal, bad, effects, reason, not known.any()))
+    return columns

@@ -1,174 +1,34 @@
-"""The same loop over many draws of what is uncertain: fixed-size batches, running measures only, on
-one device or many.
+"""Run a case on many draws of what is uncertain: fixed-size batches, running measures only.
+
+Imported by `tuning` and its commands.
 """
 
-import dataclasses
-import functools
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.analysis.steady_state import steady_flows
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from jaxtank.xla.flags import WIDE
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage import batch_store
 from tuning.storage.evaluation_log import folder_of
 from tuning.uncertainty import manifest as shards
-from tuning.uncertainty.distributions import Draws, stated
-from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
+from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
+from tuning.uncertainty.distributions import stated
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.feasibility import infeasible
+from tuning.uncertainty.result import Ensemble
+from tuning.uncertainty.sampling import check_whole, probabilities, spread_of
 
-LANES = 256
-"""Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
-
-NOISE = 1 << 27
-"""Bytes of sensor noise that a batch may hold: long noisy runs have smaller batches."""
-
-TAIL = 0.05
-"""Share of the draws that the conditional value at risk is the mean of [-]."""
-
-RESTS = 1 << 14
-"""Draws whose steady states are looked for at once: a plateau takes some 100 bytes a draw."""
-
-FAN_DRAWS, FAN_ROWS = 512, 240
-"""Draws and time stamps of a fan chart."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ensemble:
-    """What `ensemble` gives: N draws and what each came to.
-
-    values: {name: (N, ...)} drawn parameters; measures: {name: (N, ...)}; failed: (N,) True where
-    the run left the numbers; infeasible: (N,) True where some plateau of the reference has no
-    steady state below the rims and within the pumps' limits, None where that is not known in closed
-    form; fan: {"t", "r", "x", "u": quantiles (5, rows, ...)} of the first draws, or None.
-    """
-
-    case: Any
-    distributions: dict
-    labels: list
-    values: dict
-    measures: dict
-    failed: np.ndarray
-    infeasible: np.ndarray | None
-    limits: list
-    fan: dict | None
-    wall_s: float
-    seed: int
-    method: str
-
-    @property
-    def samples(self) -> int:
-        """Number of draws N."""
-        return len(self.failed)
-
-    def summary(self) -> dict[str, Any]:
-        """{measure: {mean, mean_interval95, sd, p05, p50, p95, cvar95, max}} over the draws whose
-        run is finite; one entry per output, tank or pump where the measure has several. cvar95 is
-        of the worse side: the lower one for a level's minimum. sd and the mean's interval, which is
-        cut at what the measure cannot pass, are None for a single draw.
-        """
-        found = {}
-        for name, values in self.measures.items():
-            kept = values[~self.failed]
-            sign = ms.MEASURES[name].sense
-            if not len(kept):
-                found[name] = {
-                    k: None
-                    for k in ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")
-                }
-                continue
-            with np.errstate(invalid="ignore"):
-                worst = sign * np.sort(sign * kept, axis=0)[-max(1, math.ceil(TAIL * len(kept))) :]
-                mean, sd = (
-                    kept.mean(axis=0),
-                    (kept.std(axis=0, ddof=1) if len(kept) > 1 else np.zeros(kept.shape[1:])),
-                )
-                p05, p50, p95 = np.quantile(kept, (0.05, 0.5, 0.95), axis=0, method="inverted_cdf")
-                half = 1.959964 * sd / math.sqrt(len(kept))
-                found[name] = {
-                    "mean": mean,
-                    "mean_interval95": [
-                        _within(name, kept, end) for end in (mean - half, mean + half)
-                    ],
-                    "sd": sd,
-                    "p05": p05,
-                    "p50": p50,
-                    "p95": p95,
-                    "cvar95": worst.mean(axis=0),
-                    "max": kept.max(axis=0),
-                }
-                if len(kept) == 1:
-                    found[name] |= {"sd": None, "mean_interval95": None}
-        return found
-
-    def violations(self) -> list[dict[str, Any]]:
-        """[{name, limit, count, probability, interval95}]: how often each limit is broken; a run
-        that failed counts as breaking it. The intervals are those of Clopper and Pearson.
-        """
-        rows = []
-        for limit in self.limits:
-            values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
-            broken = int(np.sum(self.failed | (limit.margins(values) < 0)))
-            rows.append(
-                {
-                    "name": limit.label,
-                    "limit": limit.value,
-                    "unit": ms.unit(limit.measure, self.case.loop.units),
-                    "count": broken,
-                    "probability": broken / self.samples,
-                    "interval95": clopper_pearson(broken, self.samples),
-                }
-            )
-        return rows
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON object of `jaxtank uncertainty --json`."""
-        from tuning.report.uncertainty import json_of
-
-        return json_of(self)
-
-    def plot(self):
-        """Matplotlib figures {name: figure}: fan of the levels, violations, rig."""
-        from tuning.report.uncertainty import figures
-
-        return figures(self)
-
-    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
-        """Write result.json, draws.csv, the pictures and report.html, which says the line
-        `command`, to a folder.
-        """
-        from tuning.report.uncertainty import save
-
-        return save(self, folder, command)
-
-    def __repr__(self):
-        from tuning.report.uncertainty import text
-
-        return text(self)
-
-
-def _within(name, values, end):
-    """`end` of an interval of measure `name`, moved to what the measure cannot pass (a share 0 and
-    1, say); values: (N, ...) that it had.
-    """
-    low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
-    end = (
-        end if low is None else np.maximum(end, np.minimum(low, values.min(axis=0)))
-    )  # a value that did pass it is not argued with
-    return end if high is None else np.minimum(end, np.maximum(high, values.max(axis=0)))
+FAN_DRAWS = 512
+"""Draws of a fan chart."""
 
 
 def ensemble(
@@ -181,7 +41,7 @@ def ensemble(
     measures: Sequence[str] | None = None,
     limits: Mapping[str, Any] | None = None,
     fan: bool = True,
-    lanes: int | None = None,
+    batch: int | None = None,
     devices: int = 1,
     shard: tuple[int, int] | None = None,
     folder: str | Path | None = None,
@@ -192,272 +52,192 @@ def ensemble(
 ) -> Ensemble | None:
     """Run a case on `samples` draws of what is uncertain.
 
-    distributions: {dotted name: distribution, or a share as in a case's `uncertain`}, the case's
-    own where None; key: seed of draws and sensor noise (draw i has the noise of fold_in(key, i),
-    whatever the layout); draws: "random", "latin" or "sobol"; measures: names, those of a summary
-    where None; limits as in `tune`; fan: keep quantiles of the first draws' levels; lanes: draws in
-    a batch;
-    devices: local devices to use; shard: (i, n), run only the i-th of n shares of the batches, into
-    `folder` (`merge` joins them); checkpoint (or folder): where finished batches are kept, with
-    which resume=True goes on; merge: run nothing, only join what lies there, and refuse an
-    incomplete set; progress: called with the number of draws done. Under `jax.distributed` every
-    process runs its share of the batches and all get the whole. Numbers of a draw do not depend on
-    any of it. Returns an Ensemble (None for a shard). Raises InputError before anything is run.
+    The numbers of a draw do not depend on batches, devices, shards or processes.
+
+    Parameters
+    ----------
+    case : Case
+    distributions : dict or None
+        {dotted name: distribution, or a relative half-width as in a case's `uncertain`}; those of
+        the case where None.
+    samples : int
+        Number of draws.
+    key : int
+        Seed of draws and sensor noise; draw i has the noise of fold_in(key, i).
+    draws : {"random", "latin", "sobol"}
+    measures : sequence of str or None
+        Names; those of a summary where None.
+    limits : dict or None
+        {measure: limit} as in `tune`; those of the case where None.
+    fan : bool
+        Keep quantiles of the trajectories of the first draws.
+    batch : int or None
+        Draws run at once on a device; a size that fits the case where None.
+    devices : int
+        Local devices to use.
+    shard : (int, int) or None
+        (i, n): run only the i-th of n shares of the batches, into the checkpoint (`merge` joins
+        them). Under `jax.distributed` every process runs its share and all get the whole.
+    checkpoint : path or None
+        Folder where finished batches are kept; `folder` is its former name.
+    resume : bool
+        Go on with the batches in the checkpoint.
+    merge : bool
+        Run nothing, only join the batches in the checkpoint.
+    progress : callable or None
+        Called with the number of draws done.
+
+    Returns
+    -------
+    Ensemble or None
+        None for a shard.
+
+    Raises
+    ------
+    InputError
+        Before anything is run; for `merge` also where a batch is missing.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 8.0})
+    >>> spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
+    >>> found = tuning.ensemble(case, spread, samples=4, measures=["max_level"], limits={})
+    >>> found.samples, found.measures["max_level"].shape
+    (4, (4, 2))
     """
     began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
-    if shard is not None and not (
-        isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]
-    ):
-        raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
-    for name, value in (("samples", samples), ("key", key)):
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int)
-            or not (0 if name == "key" else 1) <= value <= 2**31 - 1
-        ):
-            raise InputError(
-                f"{name} = {value!r}: must be a whole number from {0 if name == 'key' else 1} to"
-                f" {2**31 - 1}"
-            )
-    distributions = spread_of(case) if distributions is None else stated(distributions)
-    space = Draws(case.loop, distributions)
-    held = resolve_limits(case, limits)
-    wanted = (
-        tuple(m for m in ms.placed("summary") if ms.serves(m, case.loop))
-        if measures is None
-        else tuple(measures)
-    )
-    ms.check_names(wanted)
-    wanted = tuple(dict.fromkeys([*wanted, *(limit.measure for limit in held)]))
-    random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
-    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
+    _check_arguments(shard, samples, key)
     check_devices(devices)
-    lanes = lanes or _lanes(case, random, samples)
-    p = probabilities(draws, space.dimensions, samples, key)
-    count = -(-samples // lanes)
-    store: Any = None
+    distributions = spread_of(case) if distributions is None else stated(distributions)
+    limited = resolve_limits(case, limits)
+    names = _measure_names(case, measures, limited)
+    plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
+    store = None
     if folder is not None:
-        manifest = _fingerprint(case, distributions, samples, key, draws, wanted, lanes)
-        manifest["told"] = shards.told(case, case.limits if limits is None else limits)
-        store = batch_store.Store(
-            folder,
-            manifest,
-            resume,
-            shared=shard is not None or jax.process_count() > 1,
-            anew=not merge,
-        )
-    mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
-    mine = [k for k in mine if k % jax.process_count() == jax.process_index()]
-    todo = [k for k in mine if store is None or not store.has(k)]
-    if merge and todo:
-        raise InputError(
-            f"merge: {len(todo)} of {count} batches are missing in {str(folder)!r}, the first of"
-            f" them number {todo[0]}"
-        )
-    run = _Runner(case, wanted, key if random else None, devices)
-    batches = {}
-    for group in (todo[i : i + devices] for i in range(0, len(todo), devices)):
-        indices = [np.arange(k * lanes, (k + 1) * lanes) for k in group]
-        found = run([_rows(space, p, i) for i in indices], indices)
-        for k, batch in zip(group, found):
-            if store is not None:
-                store.put(k, batch)
-            batches[k] = batch
-        if progress is not None:
-            progress(min(samples, lanes * (len(mine) - len(todo) + len(batches))))
+        manifest = _manifest(case, distributions, limits, samples, key, draws, names, plan.batch)
+        shared = shard is not None or jax.process_count() > 1
+        store = batch_store.Store(folder, manifest, resume, shared=shared, anew=not merge)
+    batches = _batches(plan, store, Runner(case, names, plan.seed, devices), shard, merge, progress)
     if shard is not None:
         return None
-    shapes = {
-        m: (lanes,) if ms.MEASURES[m].per == "run" else (lanes, ms.entries(m, case.loop.plant))
-        for m in wanted
-    }
-    for k in mine:
-        if k not in batches:
-            batches[k] = cast(Any, store).get(k, {**shapes, "failed": (lanes,)})
     if jax.process_count() > 1:
-        batches = _gather(batches, count)
-    whole = {
-        name: np.concatenate([batches[k][name] for k in range(count)])[:samples]
+        batches = gather(batches, plan.count)
+    joined = {
+        name: np.concatenate([batches[k][name] for k in range(plan.count)])[:samples]
         for name in batches[0]
     }
-    values = space.values(p)
+    values = plan.space.values(plan.points)
+    first = {n: v[:FAN_DRAWS] for n, v in values.items()}
     return Ensemble(
         case=case,
         distributions=distributions,
-        labels=space.labels,
+        labels=plan.space.labels,
         values=values,
-        measures={m: whole[m] for m in wanted},
-        failed=whole["failed"] > 0,
-        infeasible=_infeasible(case, values),
-        limits=held,
-        fan=(
-            _fan(case, {n: v[:FAN_DRAWS] for n, v in values.items()}, key if random else None)
-            if fan
-            else None
-        ),
+        measures={m: joined[m] for m in names},
+        failed=joined["failed"] > 0,
+        infeasible=infeasible(case, values),
+        limits=limited,
+        fan=fan_of(case, first, plan.seed) if fan else None,
         wall_s=time.perf_counter() - began,
         seed=key,
         method=draws,
     )
 
 
-def check_devices(devices):
-    """Raise InputError unless this process has so many."""
-    if isinstance(devices, bool) or not isinstance(devices, int) or devices < 1:
-        raise InputError(f"devices = {devices!r}: must be a whole number of at least 1")
-    if devices > jax.local_device_count():
+def _check_arguments(shard, samples, key):
+    """Raise InputError for a shard, a number of samples or a seed that is none."""
+    good = isinstance(shard, tuple) and len(shard) == 2 and 1 <= shard[0] <= shard[1]
+    if shard is not None and not good:
+        raise InputError(f"shard = {shard!r}: must be (i, n), i from 1 to n")
+    check_whole("samples", samples, 1, 2**31 - 1)
+    check_whole("key", key, 0, 2**31 - 1)
+
+
+def _measure_names(case, measures, limited):
+    """The measures of a study, those of its limits among them."""
+    if measures is None:
+        measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]
+    ms.check_names(tuple(measures))
+    return tuple(dict.fromkeys([*measures, *(limit.measure for limit in limited)]))
+
+
+def _numbers(count, shard):
+    """The numbers of the batches that this shard and this process run."""
+    mine = [k for k in range(count) if shard is None or k % shard[1] == shard[0] - 1]
+    return [k for k in mine if k % jax.process_count() == jax.process_index()]
+
+
+class _Plan(NamedTuple):
+    """What the batches of an ensemble are made of."""
+
+    space: Draws
+    points: np.ndarray  # (samples, dimensions) probabilities
+    seed: int | None  # of the sensor noise
+    batch: int  # draws in a batch
+    count: int  # of batches
+    shapes: dict  # {name: shape} of what a batch holds
+
+
+def _plan(case, space, names, samples, key, draws, batch):
+    """Check the runs of an ensemble and lay them out in batches."""
+    random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
+    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
+    batch = batch or batch_size(case, random, samples)
+    points = probabilities(draws, space.dimensions, samples, key)
+    shapes = {
+        m: (batch,) if ms.MEASURES[m].per == "run" else (batch, ms.entries(m, case.loop.plant))
+        for m in names
+    }
+    count = -(-samples // batch)
+    return _Plan(
+        space, points, key if random else None, batch, count, shapes | {"failed": (batch,)}
+    )
+
+
+def _batches(plan, store, runner, shard, merge, progress):
+    """Run the batches of this shard that the store lacks; returns {number: batch} of all of it."""
+    mine = _numbers(plan.count, shard)
+    missing = [k for k in mine if store is None or not store.has(k)]
+    if merge and missing:
+        where = repr(str(store.folder)) if store is not None else "no folder"
         raise InputError(
-            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices"
-            " before jax starts)"
+            f"merge: {len(missing)} of {plan.count} batches are missing in {where}, the first of"
+            f" them number {missing[0]}"
         )
+    done = len(mine) - len(missing)
+
+    def report(batches):
+        if progress is not None:
+            progress(min(len(plan.points), plan.batch * (done + batches)))
+
+    found = _run_missing(plan, store, runner, missing, report)
+    if shard is None and store is not None:
+        found |= {k: store.get(k, plan.shapes) for k in mine if k not in found}
+    return found
 
 
-def _lanes(case, random, samples):
-    size = case.clock.samples * case.loop.plant.tanks * 8 if random else 1
-    most = max(1, min(LANES, NOISE // size))
-    return 1 << (min(most, max(1, samples)).bit_length() - 1)
+def _run_missing(plan, store, runner, numbers, report):
+    """Run the batches of these numbers and keep them in the store; returns {number: batch}.
 
-
-def _rows(space, p, indices):
-    """Values of the draws at `indices`, the last draw repeated past the end."""
-    return space.values(p[np.minimum(indices, len(p) - 1)])
-
-
-class _Runner:
-    """A batch on each of `devices` at once, by the program that one device runs alone, on a thread
-    of its own. One program partitioned over the devices (shard_map) rounds the last bit differently
-    from the program of a single device; this does not.
+    report: called with the number of batches run.
     """
-
-    def __init__(self, case, names, seed, devices):
-        self.case, self.names, self.seed = case, names, seed
-        self.devices = jax.local_devices()[:devices]
-        self.pool = ThreadPoolExecutor(devices)
-
-    def __call__(self, rows, indices):
-        """[{measure: (lanes, ...), "failed": (lanes,)}] of batches, at most one for each device."""
-        return list(self.pool.map(self._one, self.devices, rows, indices))
-
-    def _one(self, device, rows, indices):
-        values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
-        found = _run(self.case.loop, values, indices, self.seed, self.case.clock, self.names)
-        return {n: np.asarray(v) for n, v in found.items()}
+    found, width, last = {}, len(runner.devices), len(plan.points) - 1
+    for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
+        indices = [np.arange(k * plan.batch, (k + 1) * plan.batch) for k in group]
+        # the last draw repeated to fill the last batch
+        rows = [plan.space.values(plan.points[np.minimum(i, last)]) for i in indices]
+        for k, measures in zip(group, runner(rows, indices)):
+            if store is not None:
+                store.put(k, measures)
+            found[k] = measures
+        report(len(found))
+    return found
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"), compiler_options=WIDE)
-def _run(loop, values, indices, seed, clock, names):
-    def one(values, index):
-        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
-        measures, broken = lp.evaluate_and_flag(with_values(loop, values), clock, names, noise)
-        return {**measures, "failed": broken.astype(jnp.result_type(float))}
-
-    return jax.vmap(one)(values, indices)
-
-
-def _gather(batches, count):
-    """The batches of all processes, in order."""
-    from jax.experimental import multihost_utils
-
-    most = -(-count // jax.process_count())
-    template = next(iter(batches.values()))
-    padded = {
-        n: np.stack([batches.get(k, template)[n] for k in _share(count, most)]) for n in template
-    }
-    everywhere = multihost_utils.process_allgather(padded)
-    return {
-        k: {n: v[k % jax.process_count(), k // jax.process_count()] for n, v in everywhere.items()}
-        for k in range(count)
-    }
-
-
-def _share(count, most):
-    return [i * jax.process_count() + jax.process_index() for i in range(most)]
-
-
-def _infeasible(case, values):
-    """(N,) True where a plateau of the reference has no steady state within rims and pumps; None
-    where the plant has no closed form.
-    """
-    plant = case.loop.plant
-    if (
-        getattr(plant, "pipes", None) != ()
-        or plant.pumps != len(plant.outputs)
-        or not hasattr(case.loop.reference, "plateaus")
-    ):
-        return None
-    plateaus = jnp.asarray(np.array(case.loop.reference.plateaus(case.clock.duration)))
-    count = len(next(iter(values.values())))
-    size, found = min(count, RESTS), []
-    # the last draw repeated past the end, so that every block is of one size
-    for start in range(0, count, size):
-        index = np.minimum(np.arange(start, start + size), count - 1)
-        found.append(
-            np.asarray(_no_rest(case.loop, {n: v[index] for n, v in values.items()}, plateaus))
-        )
-    return np.concatenate(found)[:count]
-
-
-@jax.jit
-def _no_rest(loop, values, plateaus):
-    def one(values):
-        here = with_values(loop, values)
-
-        def at(y):
-            speeds, u = steady_flows(here.plant, y)
-            levels = speeds * speeds / (2.0 * here.plant.gravity)
-            high = levels > here.plant.rim * (1.0 + 1e-12)
-            return (
-                jnp.any(speeds < 0)
-                | jnp.any(high)
-                | jnp.any(u < here.actuator.low)
-                | jnp.any(u > here.actuator.high)
-            )
-
-        return jnp.any(jax.vmap(at)(plateaus))
-
-    return jax.vmap(one)(values)
-
-
-def _fan(case, values, seed):
-    """{"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that
-    are finite, "of" how many}: quantiles 5, 25, 50, 75, 95 % at fixed times.
-    """
-    every, lanes = max(1, (case.clock.samples - 1) // FAN_ROWS), 64
-    size, found = len(next(iter(values.values()))), []
-    for start in range(0, size, lanes):
-        index = np.minimum(np.arange(start, start + lanes), size - 1)
-        rows = {n: v[index] for n, v in values.items()}
-        t, r, x, u = _trajectories(
-            case.loop, rows, index.astype(np.uint32), seed, case.clock, every
-        )
-        keep = min(lanes, size - start)
-        found.append((np.asarray(x)[:keep], np.asarray(u)[:keep]))
-    x, u = (np.concatenate(column) for column in zip(*found))
-    good = np.isfinite(x).all(axis=(1, 2))
-    if not good.any():
-        return None
-    cuts = (0.05, 0.25, 0.5, 0.75, 0.95)
-    return {
-        "t": np.asarray(t)[0],
-        "r": np.asarray(r)[0],
-        "x": np.quantile(x[good], cuts, axis=0),
-        "u": np.quantile(u[good], cuts, axis=0),
-        "draws": int(good.sum()),
-        "of": size,
-    }
-
-
-@functools.partial(jax.jit, static_argnames=("seed", "clock", "every"))
-def _trajectories(loop, values, indices, seed, clock, every):
-    def one(values, index):
-        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
-        run = lp.simulate_compiled(with_values(loop, values), clock, noise, every)[0]
-        return run.t, run.r, run.x, run.u
-
-    return jax.vmap(one)(values, indices)
-
-
-def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
+def _manifest(case, distributions, limits, samples, key, draws, names, batch):
+    """What the batches of an ensemble are of, as JSON: those of another one are refused."""
     leaves, structure = jax.tree.flatten(case.loop)
     return {
         "case": case.name,
@@ -468,7 +248,8 @@ def _fingerprint(case, distributions, samples, key, draws, wanted, lanes):
         "samples": samples,
         "key": key,
         "draws": draws,
-        "measures": list(wanted),
-        "lanes": lanes,
+        "measures": list(names),
+        "batch": batch,
         "jax": jax.__version__,
+        "origin": shards.origin_of(case, case.limits if limits is None else limits),
     }

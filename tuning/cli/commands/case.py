@@ -1,98 +1,115 @@
-"""`jaxtank list`, `show`, `init`, `export`, `simulate`, `compare`, `bench`, `completion`: a case as
-it is.
-"""
+"""`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one case as it is."""
 
 import sys
+from pathlib import Path
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.files import write_folder
-from tuning.cli.options import tell_written
-from tuning.cli.values import open_case, whole
+from tuning.cli.arguments import option
+from tuning.cli.options import report_written
+from tuning.cli.values import open_case
 from tuning.cli.values import seed as seed_of
 
 
+def add(commands, parents):
+    """Add the commands of this module to the parser's `commands`."""
+    common, case, run = parents
+    one = commands.add_parser("list", parents=[common], help="print every case")
+    one.set_defaults(run=list_cases)
+    one = commands.add_parser(
+        "show",
+        parents=[common, case],
+        help="one case: rig, controller, every parameter, published numbers, departures",
+    )
+    one.set_defaults(run=show)
+    option(one, "--out", "DIR", "folder for rig.png and rig.svg, the rig drawn from its topology")
+    one = commands.add_parser(
+        "simulate",
+        parents=[common, case, run],
+        help="one run: measures; with --out its trajectory and pictures",
+    )
+    one.set_defaults(run=simulate)
+    one.add_argument(
+        "--gif",
+        action="store_true",
+        help="with --out also run.gif, the tanks of the rig filling and emptying",
+    )
+    _add_init(commands, [common, case])
+    _add_export(commands, [common, case])
+
+
+def _add_init(commands, parents):
+    one = commands.add_parser(
+        "init",
+        parents=parents,
+        help="print a complete rig file to edit: every key, its unit and range",
+    )
+    one.set_defaults(run=init)
+    one.add_argument(
+        "--short", action="store_true", help="only what differs from the preset, and what is tuned"
+    )
+    one.add_argument(
+        "--tanks", action="store_true", help="described tank by tank, without its preset"
+    )
+
+
+def _add_export(commands, parents):
+    one = commands.add_parser(
+        "export",
+        parents=parents,
+        help="the controller and its observer as one C99 file or MATLAB function",
+    )
+    one.set_defaults(run=export)
+    option(one, "--lang", "LANG", "c (default) or m", "c")
+    option(one, "--precision", "TYPE", "double (default) or float, of C", "double")
+    option(one, "--name", "NAME", "of the functions (default: the case's)")
+    option(one, "--out", "DIR", "folder for the file (default: print it)")
+
+
 def list_cases(args):
+    """Print every case with its title."""
     from jaxtank import presets
     from tuning.report import tables
 
     cases = {f"{p}/{n}": c.title for p in presets.PAPERS for n, c in presets.load(p).cases.items()}
-    print(
-        tables.dumps(cases)
-        if args.json
-        else tables.table([[n, t] for n, t in cases.items()], ["case", ""])
-    )
+    rows = [[name, title] for name, title in cases.items()]
+    print(tables.dumps(cases) if args.json else tables.table(rows, ["case", ""]))
     return 0
 
 
 def show(args):
+    """Print the manual of one case; with --out draw its rig."""
     case = open_case(args)
-    from tuning.report import artifacts, tables
     from tuning.report import case as manual
+    from tuning.report import tables
 
-    written = []
-    if args.out:
-        from pathlib import Path
-
-        from tuning.report import figures
-        from tuning.report import html as page
-
-        try:
-            drawn = figures.rig(case.loop, None, case.name)
-            alone = {f"{name}.svg": page.alone(figure, name) for name, figure in drawn.items()}
-        except Exception as error:
-            figures.failed("rig", error)
-            for name in ("rig.svg", "rig.png"):  # of another rig
-                Path(args.out, name).unlink(missing_ok=True)
-        else:
-            written = write_folder(Path(args.out), alone | artifacts.pngs(drawn))
+    written = _draw_rig(case, Path(args.out)) if args.out else []
     print(tables.dumps(manual.json_of(case)) if args.json else manual.text(case))
-    tell_written(written, args)
+    report_written(written, args)
     return 0
 
 
-def init(args):
-    if args.short and args.tanks:
-        raise InputError(
-            "--short and --tanks: the short file names its preset; give one of the two"
-        )
-    case = open_case(args)
-    from jaxtank import rig
-    from tuning.report import tables
+def _draw_rig(case, folder):
+    """Write rig.svg and rig.png; where the rig cannot be drawn, remove those of another one."""
+    from tuning.report import artifacts, figures, html
 
-    text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
-    print(
-        tables.dumps({"case": case.name, "rig": text}) if args.json else text,
-        end="\n" if args.json else "",
-    )
-    return 0
-
-
-def export_law(args):
-    case = open_case(args)
-    from pathlib import Path
-
-    from jaxtank.export.printer import function_name
-    from jaxtank.export.source import export
-    from tuning.report import tables
-
-    text = export(case, args.lang, args.precision, args.name)
-    name = args.name or function_name(case)
-    if args.json:
-        print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
-    if args.out:
-        tell_written(write_folder(Path(args.out), {f"{name}.{args.lang}": text}), args)
-    elif not args.json:
-        print(text, end="")
-    return 0
+    try:
+        drawn = figures.rig(case.loop, None, case.name)
+        alone = {f"{name}.svg": html.alone(figure, name) for name, figure in drawn.items()}
+    except Exception as error:
+        figures.failed("rig", error)
+        for name in ("rig.svg", "rig.png"):
+            (folder / name).unlink(missing_ok=True)
+        return []
+    return artifacts.write_files(folder, alone | artifacts.pngs(drawn))
 
 
 def simulate(args):
+    """Run a case once and print its measures; with --out write the run."""
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
     seed, case = seed_of(args), open_case(args)
     import jax
 
-    from jaxtank import measures as ms
     from jaxtank.loop import run, step_size
     from tuning.problem.scenarios import noisy
     from tuning.report import artifacts, tables
@@ -100,9 +117,9 @@ def simulate(args):
     from tuning.search import baseline, provenance
 
     key = jax.random.key(seed) if noisy(case) else None
-    if step_size.step_warnings(case.loop, case.clock):
+    if step_size.doubts(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
-    values = {m: v for m, v in baseline.run_measures(case.loop, case.clock, key).items()}
+    values = dict(baseline.run_measures(case.loop, case.clock, key))
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),
@@ -112,77 +129,50 @@ def simulate(args):
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
-    written = (
-        artifacts.save_run(case, artifacts.run_for_people(case, key), payload, args.out, args.gif)
-        if args.out
-        else []
-    )
+    written = []
+    if args.out:
+        trajectory = artifacts.run_for_people(case, key)
+        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif)
     if args.json:
         print(tables.dumps(payload))
     else:
-        print(f"{case.name}: {case.title}\n")
-        rows = [
-            [m, ms.unit(m, case.loop.units), tables.numbers(values[m]), s.doc]
-            for m, s in ms.MEASURES.items()
-            if m in values and m not in ms.times()
-        ]
-        print(tables.table(rows, ["measure", "unit", "value", ""]))
-    tell_written(written, args)
+        print(f"{case.name}: {case.title}\n\n{tables.measure_table(values, case.loop.units)}")
+    report_written(written, args)
     return 0
 
 
-def compare(args):
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from jaxtank import presets
-    from tuning.report import papers as compare
-    from tuning.report import tables
-
-    papers = presets.PAPERS if args.paper == "all" else (args.paper,)
-    for paper in papers:
-        presets.load(paper)  # an unknown one is told before anything runs
-    found = {}
-    for paper in papers:
-        if not args.quiet:
-            print(f"running {paper}", file=sys.stderr, flush=True)
-        found[paper] = compare.measure(paper)
-    written = compare.save(found, args.out, args.line) if args.out else []
-    if args.json:
-        print(tables.dumps(found if args.paper == "all" else found[args.paper]))
-    else:
-        print(
-            compare.markdown(found)
-            if args.markdown
-            else "\n\n".join(compare.text(page) for page in found.values())
+def init(args):
+    """Print a rig file of the case."""
+    if args.short and args.tanks:
+        raise InputError(
+            "--short and --tanks: the short file names its preset; give one of the two"
         )
-    tell_written(written, args)
-    return 0
-
-
-def bench(args):
-    rounds = whole("--rounds", args.rounds, 1, 1000)
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    from tuning.bench import bench
+    case = open_case(args)
+    from jaxtank import rig
     from tuning.report import tables
 
-    if args.cases:
-        from jaxtank import presets, rig
-
-        names = presets.names() if args.cases == ["all"] else args.cases
-        result = bench.measure_cases({name: rig.open_case(name) for name in names}, rounds)
-        print(tables.dumps(result) if args.json else bench.text_of_cases(result))
-        return 0
-    result = bench.measure(rounds)
-    print(tables.dumps(result) if args.json else bench.text(result))
+    text = rig.short(case) if args.short else rig.complete(case, tankwise=args.tanks)
+    if args.json:
+        print(tables.dumps({"case": case.name, "rig": text}))
+    else:
+        sys.stdout.write(text)
     return 0
 
 
-def completion(args):
-    from tuning.cli import completion
-    from tuning.cli.parser import parser
+def export(args):
+    """Print the controller and its observer as source text, or write it to --out."""
+    case = open_case(args)
+    from jaxtank.export import source
+    from jaxtank.export.printer import function_name
+    from tuning.report import artifacts, tables
 
-    print(completion.script(args.shell, parser()), end="")
+    text = source.export(case, args.lang, args.precision, args.name)
+    name = args.name or function_name(case)
+    if args.json:
+        print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
+    if args.out:
+        written = artifacts.write_files(Path(args.out), {f"{name}.{args.lang}": text})
+        report_written(written, args)
+    elif not args.json:
+        sys.stdout.write(text)
     return 0

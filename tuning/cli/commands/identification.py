@@ -8,7 +8,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import tell_unreachable
+from tuning.cli.options import report_unreachable
 
 LONGEST = 1e7
 """Longest experiment that is planned [s]: four months."""
@@ -206,7 +206,7 @@ def run(args):
             f"written to {printable(args.out)}: " + ", ".join(p.name for p in written),
             file=sys.stderr,
         )
-        tell_unreachable(found.identified, written, args)
+        report_unreachable(found.identified, written, args)
     if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
         words = "; ".join(f"cannot tell {identification.untold(d)}" for d in found.directions)
         print(

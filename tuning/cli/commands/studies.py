@@ -5,12 +5,69 @@ import sys
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
-from tuning.cli.options import devices_of, distributions_of, limits_of, tell_written
+from tuning.cli.arguments import Parser, changes, on_devices, option, repeatable, uncertain
+from tuning.cli.options import devices_of, distributions_of, limits_of, report_written
+from tuning.cli.terminal import Line
 from tuning.cli.values import open_case, whole
 from tuning.cli.values import seed as seed_of
 
 
+def add(commands, parents):
+    """Add the commands of this module to the parser's `commands`."""
+    common, case, run = parents
+    one = commands.add_parser(
+        "uncertainty",
+        parents=[common, case, run, _draws(), on_devices()],
+        help="the same loop over N draws: bands, percentiles, violations",
+    )
+    one.set_defaults(run=uncertainty)
+    option(one, "--shard", "I/N", "run the I-th of N shares into --out DIR; merge joins them")
+    option(one, "--resume", "DIR", "go on where a killed run with --out DIR ended")
+    one = commands.add_parser(
+        "merge",
+        parents=[common, run, changes(), _draws()],
+        help="join the shards of an ensemble in a folder",
+    )
+    one.set_defaults(run=merge)
+    one.add_argument(
+        "case",
+        metavar="DIR",
+        help="where the shards are; or their case, with their options and --out DIR",
+    )
+    _add_sensitivity(commands, [common, case, run, uncertain(), on_devices()])
+
+
+def _draws():
+    """The parent parser of the options that shards of one ensemble share."""
+    found = Parser(add_help=False, parents=[uncertain()])
+    option(found, "--samples", "N", "draws (default 1000)", "1000")
+    option(found, "--draws", "KIND", "random (default), latin or sobol", "random")
+    repeatable(found, "--limit", "MEASURE=VALUE", "a limit to count violations of")
+    repeatable(found, "--measure", "NAME", "a measure to keep, in place of the default ones")
+    return found
+
+
+def _add_sensitivity(commands, parents):
+    one = commands.add_parser(
+        "sensitivity",
+        parents=parents,
+        help="which parameter changes which measure: local, Morris, Sobol",
+    )
+    one.set_defaults(run=sensitivity)
+    text = "local (default: exact derivatives), morris or sobol"
+    option(one, "--method", "NAME", text, "local")
+    text = "trajectories of morris (default 32), base points of sobol (default 512, a power of 2)"
+    option(one, "--samples", "N", text)
+    repeatable(
+        one,
+        "--measure",
+        "NAME",
+        "a measure to look at (default: those of the objective, rms_error_total, max_level)",
+    )
+
+
 def uncertainty(args):
+    """Run a case on many draws of its uncertain parameters."""
     shard = None
     if args.shard is not None:
         shard = _shard(args.shard)
@@ -18,17 +75,17 @@ def uncertainty(args):
             raise InputError(f"--shard {args.shard!r}: needs --out DIR, where the shares meet")
     args.out = args.resume or args.out
     devices = devices_of(args)
-    progress = (
-        None if args.quiet else lambda done: print(f"{done} draws", file=sys.stderr, flush=True)
-    )
+    line = Line(args.quiet)
+    line.compiling("the simulation", 5)
     found = _ensemble(
         args,
         devices=devices,
         shard=shard,
         folder=args.out,
         resume=args.resume is not None,
-        progress=progress,
+        progress=lambda done: line.show(f"{done} draws"),
     )
+    line.end()
     if found is None:
         if not args.quiet:
             print(
@@ -37,15 +94,13 @@ def uncertainty(args):
                 file=sys.stderr,
             )
         return 0
-    return _told(found, args)
+    return _report(found, args)
 
 
 def merge(args):
-    """Of a folder alone, by what its manifest says; of a case with the options of its shards and
-    --out DIR.
-    """
+    """Join shards: of a folder by its manifest, or of a case with the options of its shards."""
     if args.out:
-        return _told(_ensemble(args, folder=args.out, resume=True, merge=True), args)
+        return _report(_ensemble(args, folder=args.out, resume=True, merge=True), args)
     if not os.path.isdir(args.case):
         raise InputError(
             f"merge {args.case!r}: is no folder; give the one that the shards were written to"
@@ -69,7 +124,7 @@ def merge(args):
     if args.limit:
         options["limits"] = limits_of(args, case.replace(limits=options["limits"]))
     args.out = args.case
-    return _told(ensemble(case, folder=args.out, resume=True, merge=True, **options), args)
+    return _report(ensemble(case, folder=args.out, resume=True, merge=True, **options), args)
 
 
 def _ensemble(args, **options):
@@ -88,15 +143,15 @@ def _ensemble(args, **options):
     )
 
 
-def _told(found, args):
-    """Write, print and end with an Ensemble."""
+def _report(found, args):
+    """Write and print an Ensemble; returns the exit code."""
     from tuning.report import tables
 
     try:
         written = found.save(args.out, args.line) if args.out else []
-    finally:  # a disk that is full costs the files, not the answer
-        print(tables.dumps(found.to_json()) if args.json else repr(found))
-    tell_written(written, args)
+    finally:  # a full disk costs the files, not the printed result
+        print(tables.dumps(found.to_json()) if args.json else str(found))
+    report_written(written, args)
     return 0
 
 
@@ -116,36 +171,30 @@ def _shard(text):
 
 
 def sensitivity(args):
+    """Print which parameter changes which measure."""
     devices = devices_of(args)
     seed, case = seed_of(args), open_case(args)
     varied = distributions_of(args, case)
-    from tuning.report import sensitivity_tables, tables
-    from tuning.uncertainty.sensitivity_study import MOST, sensitivity
+    from tuning.report import tables
+    from tuning.uncertainty import sensitivity_study as study
 
-    terminal, told = sys.stderr.isatty(), [0]
-
-    def progress(done, total):
-        if args.quiet or (not terminal and done < total and done - told[0] < total / 10):
-            return
-        told[0] = done
-        start, end = ("\r", "") if terminal else ("", "\n")
-        print(f"{start}run {done}/{total}", end=end, file=sys.stderr, flush=True)
-
-    result = sensitivity(
+    line = Line(args.quiet)
+    derivatives = " and its derivatives" if args.method == "local" else ""
+    line.compiling(f"the simulation{derivatives}", 5)
+    result = study.sensitivity(
         case,
         varied,
         method=args.method,
         measures=args.measure or None,
-        samples=None if args.samples is None else whole("--samples", args.samples, 1, MOST),
+        samples=None if args.samples is None else whole("--samples", args.samples, 1, study.MOST),
         seed=seed,
         devices=devices,
-        progress=progress,
+        progress=line.runs,
     )
-    if terminal and not args.quiet:
-        print(file=sys.stderr)
+    line.end()
     try:
         written = result.save(args.out, args.line) if args.out else []
     finally:
-        print(tables.dumps(sensitivity_tables.json_of(result)) if args.json else result.text())
-    tell_written(written, args)
+        print(tables.dumps(result.to_json()) if args.json else str(result))
+    report_written(written, args)
     return 0

@@ -1,25 +1,87 @@
-"""`jaxtank tune`."""
+"""`jaxtank tune`: gains under limits, for the scenarios of the case or for many drawn plants."""
 
 import contextlib
-import functools
 import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
+from tuning.cli.arguments import option, repeatable, uncertain
 from tuning.cli.interrupts import Interrupts, put_back
 from tuning.cli.options import (
     choices_of,
     distributions_of,
     limits_of,
+    report_unreachable,
+    report_written,
     scenarios_of,
-    tell_unreachable,
-    tell_written,
     tradeoff_of,
 )
+from tuning.cli.terminal import Line
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
+
+
+def add(commands, parents):
+    """Add the command to the parser's `commands`."""
+    one = commands.add_parser(
+        "tune", parents=[*parents, uncertain()], help="tune the gains of a case under its limits"
+    )
+    one.set_defaults(run=tune)
+    _add_problem(one)
+    _add_search(one)
+    _add_robust(one)
+
+
+def _add_problem(one):
+    """Options on what is tuned, under which limits, and judged by which runs."""
+    text = "a parameter to tune; replaces those of the case"
+    repeatable(one, "--free", "NAME=LOW:HIGH", text)
+    text = "a hard limit; MEASURE=none drops one, none drops all"
+    repeatable(one, "--limit", "MEASURE=VALUE", text)
+    text = "a term of the objective, which is minimised (default rms_error_total=1)"
+    repeatable(one, "--objective", "MEASURE=WEIGHT", text)
+    repeatable(
+        one,
+        "--scenario",
+        "NAME=VALUE[;NAME=VALUE]",
+        'a run to tune for, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value'
+        " of the case); replaces those of the case; none: the case's own run",
+    )
+    text = "a static number or text to try the values of"
+    repeatable(one, "--choose", "NAME=V1,V2", text)
+    text = "validation runs of the tuned gains (default 64, 0 for none)"
+    option(one, "--validation", "N", text, "64")
+    text = "also: the best objective for N (6) values of one limit"
+    option(one, "--tradeoff", "MEASURE=LOW:HIGH[:N]", text)
+    one.add_argument(
+        "--bound",
+        action="store_true",
+        help="also: the perfect-information open-loop optimum, which no controller can beat",
+    )
+
+
+def _add_search(one):
+    """Options on how the search runs."""
+    text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
+    option(one, "--method", "NAME", text, "auto")
+    option(one, "--starts", "N", "local searches (default 8)", "8")
+    option(one, "--screening", "N", "Sobol points before them (default 64)", "64")
+    option(one, "--iterations", "N", "iterations of each local search (default 60)", "60")
+    option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
+    text = "go on where a killed run with --out DIR ended, to the same answer"
+    option(one, "--resume", "DIR", text)
+
+
+def _add_robust(one):
+    """Options on many plants at once."""
+    text = "many drawn plants at once: mean, cvar or worst of their costs, limits held on every one"
+    option(one, "--robust", "RISK", text)
+    option(one, "--samples", "N", "plants of --robust (default 64)")
+    option(one, "--fresh", "N", "validation plants of --robust (default 1024)")
+    text = "constraint tightening of --robust, as a share of each limit; validation is without it"
+    option(one, "--back-off", "SHARE", text)
 
 
 def tune(args):
@@ -31,138 +93,159 @@ def tune(args):
 
 
 def _tune(args):
+    """Tune, then what was asked for besides; write and print the result."""
     seed, case = seed_of(args), open_case(args)
-    from jaxtank.rig import check_objective
-    from tuning.report import tables, tuning
-    from tuning.search import tuner
+    from tuning.report import tables
 
-    free = once("--free", [pair("--free", text, span) for text in args.free])
-    objective = once(
-        "--objective",
-        [pair("--objective", text, lambda v: number("--objective", v)) for text in args.objective],
-    )
-    if objective:
-        objective = check_objective(objective)
-    limits, scenarios, sweep = limits_of(args, case), scenarios_of(args), tradeoff_of(args)
-    if sweep:  # before the search, which would be lost
-        from tuning.problem.limits import resolve_in
-        from tuning.problem.scenarios import check_scenarios, lanes_of
-
-        runs = check_scenarios(case, case.scenarios if scenarios is None else scenarios)
-        resolve_in(lanes_of(case, runs, seed), {sweep[0]: sweep[1][0]})
+    task, sweep = _task(args, case, seed), tradeoff_of(args)
+    if sweep:  # before the search, which would be in vain
+        _check_tradeoff(case, task, sweep)
+    finder, case, own = _finder(args, case, task)
     folder = args.resume or args.out
-    choices, varied = choices_of(args), distributions_of(args, case)
-    only = (args.samples, args.fresh, args.back_off)
-    if (varied is not None or any(v is not None for v in only)) and args.robust is None:
-        raise InputError(
-            "--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust"
-        )
-    finder = tuner.tune
-    more: dict[str, Any] = {"choices": choices, "scenarios": scenarios}
-    if args.robust is not None:
-        from tuning.search.robust import tune_robust
-
-        if choices or scenarios:
-            raise InputError(
-                "--robust makes scenarios of its own: no --choose and no --scenario but none"
-                " beside it"
-            )
-        if scenarios == ():  # --scenario none: plants of the case's own run alone
-            case = case.replace(scenarios=())
-        finder = functools.partial(
-            tune_robust,
-            distributions=varied,
-            risk=args.robust,
-            samples=whole("--samples", args.samples or "64", 2, 100_000),
-            fresh=whole("--fresh", args.fresh or "1024", 1, 100_000),
-            back_off=number("--back-off", args.back_off or "0"),
-        )
-        scenarios, more = None, {}
-    progress = Progress(
-        tables.objective_unit(objective or case.objective, case.loop.units), args.quiet
-    )
+    unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
+    progress = Progress(unit, args.quiet)
     result = finder(
         case,
+        **{k: v for k, v in task.items() if k != "scenarios"},
+        **own,
         method=args.method,
-        free=free,
-        objective=objective,
-        limits=limits,
-        **more,
         batch=None if args.batch is None else whole("--batch", args.batch, 1, 100_000),
         validation=whole("--validation", args.validation, 0, 100_000),
         log=folder,
         resume=args.resume is not None,
         starts=whole("--starts", args.starts, 1, 1000),
-        seed=seed,
         screening=whole("--screening", args.screening, 1, 65536),
         iterations=whole("--iterations", args.iterations, 1, 100_000),
         progress=progress,
     )
-    if not args.quiet and sys.stderr.isatty():
-        print(file=sys.stderr)
-    if sweep and not progress.stop and result.status != "interrupted":
-        from tuning.search.pareto import tradeoff
-
-        answer = {n: p["after"] for n, p in result.parameters.items()}
-        options = {
-            "free": free,
-            "objective": objective,
-            "limits": limits,
-            "scenarios": scenarios,
-            "seed": seed,
-        }
-        options["screening"] = whole("--screening", args.screening, 1, 65536)
-        with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
-            result = result.replace(
-                tradeoff=tradeoff(case, *sweep, start=answer, progress=progress.check, **options)
-            )
-    if args.bound and not progress.stop and result.status != "interrupted":
-        from tuning.optimal_input.perfect_information import bound
-
-        result = result.replace(
-            bound=bound(result.tuned, objective, limits, progress=progress.check)
-        )
+    progress.line.end()
+    result = _besides(args, case, result, task, sweep, progress)
     args.out = folder
-    try:
-        written = result.save(folder, args.line) if folder else []
-    finally:  # a disk that is full costs the files, not the answer; and the log is kept
-        print(tables.dumps(result.to_json()) if args.json else tuning.text(result))
-    if folder and result.status != "interrupted":
-        from tuning.storage.evaluation_log import discard
-
-        discard(folder)  # the result is whole: there is nothing left to go on with
-    tell_written(written, args)
-    tell_unreachable(result.tuned, written, args)
-    if not args.out and not args.json and not args.quiet:
-        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
+    _finish(args, result)
     return EXIT["interrupted" if progress.stop else result.status]
 
 
+def _task(args, case, seed) -> dict[str, Any]:
+    """What is tuned, under which limits, for which runs: keywords of `tuning.tune`."""
+    from jaxtank.rig import check_objective
+
+    free = once("--free", [pair("--free", text, span) for text in args.free])
+    weights = [pair("--objective", t, lambda v: number("--objective", v)) for t in args.objective]
+    objective = once("--objective", weights)
+    return {
+        "free": free,
+        "objective": check_objective(objective) if objective else objective,
+        "limits": limits_of(args, case),
+        "scenarios": scenarios_of(args),
+        "seed": seed,
+    }
+
+
+def _check_tradeoff(case, task, sweep):
+    """Raise InputError where the limit of --tradeoff is undefined in every run."""
+    from tuning.problem.limits import resolve_in
+    from tuning.problem.scenarios import check_scenarios, lanes_of
+
+    scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
+    measure, values = sweep
+    lanes = lanes_of(case, check_scenarios(case, scenarios), task["seed"])
+    resolve_in(lanes, {measure: values[0]})
+
+
+def _finder(args, case, task):
+    """(function that tunes, case, its own keywords): `tune`, or `tune_robust` under --robust."""
+    choices, varied = choices_of(args), distributions_of(args, case)
+    if args.robust is None:
+        only = (varied, args.samples, args.fresh, args.back_off)
+        if any(value is not None for value in only):
+            raise InputError(
+                "--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust"
+            )
+        from tuning.search.tuner import tune as finder
+
+        return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
+    if choices or task["scenarios"]:
+        raise InputError(
+            "--robust makes scenarios of its own: no --choose and no --scenario but none beside it"
+        )
+    from tuning.search.robust import tune_robust
+
+    if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
+        case = case.replace(scenarios=())
+    task["scenarios"] = None
+    return (
+        tune_robust,
+        case,
+        {
+            "distributions": varied,
+            "risk": args.robust,
+            "samples": whole("--samples", args.samples or "64", 2, 100_000),
+            "fresh": whole("--fresh", args.fresh or "1024", 1, 100_000),
+            "back_off": number("--back-off", args.back_off or "0"),
+        },
+    )
+
+
+def _besides(args, case, result, task, sweep, progress):
+    """`result` with the trade-off and the bound, where asked for and not interrupted."""
+    if sweep and not progress.stop and result.status != "interrupted":
+        from tuning.search.pareto import tradeoff
+
+        start = {n: p["after"] for n, p in result.parameters.items()}
+        screening = whole("--screening", args.screening, 1, 65536)
+        with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
+            found = tradeoff(
+                case, *sweep, start=start, screening=screening, progress=progress.check, **task
+            )
+            result = result.replace(tradeoff=found)
+    if args.bound and not progress.stop and result.status != "interrupted":
+        from tuning.optimal_input.perfect_information import bound
+
+        found = bound(result.tuned, task["objective"], task["limits"], progress=progress.check)
+        result = result.replace(bound=found)
+    return result
+
+
+def _finish(args, result):
+    """Write and print the result; a checkpoint that is no longer needed is removed."""
+    from tuning.report import tables
+
+    written = []
+    try:
+        written = result.save(args.out, args.line) if args.out else []
+    finally:  # a full disk costs the files, not the printed result; and the checkpoint is kept
+        print(tables.dumps(result.to_json()) if args.json else str(result))
+    if args.out and result.status != "interrupted":
+        from tuning.storage.evaluation_log import discard
+
+        discard(args.out)
+    report_written(written, args)
+    report_unreachable(result.tuned, written, args)
+    if not args.out and not args.json and not args.quiet:
+        print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
+
+
 class Progress(Interrupts):
-    """A line per evaluation on a terminal, a line per local search elsewhere. Ctrl-C is taken
-    between evaluations, from the second on: the first is of the values that the case has, and what
-    follows it is compiled first.
+    """A line per evaluation on a terminal, a line per local search elsewhere.
+
+    Ctrl-C is taken between evaluations, from the second on: the first is of the values that the
+    case has, and what follows it is compiled first.
     """
 
     def __init__(self, unit, quiet):
         super().__init__()
-        self.unit, self.quiet, self.last, self.terminal = unit, quiet, None, sys.stderr.isatty()
+        self.unit, self.last, self.line = unit, None, Line(quiet)
+        self.line.compiling("the simulation and its derivatives", 15)
 
     def __call__(self, event):
         if event["evaluations"] > 1:
             self.check()
-        if self.quiet or (not self.terminal and event["start"] == self.last):
+        if not self.line.terminal and event["start"] == self.last:
             return
         self.last = event["start"]
         breaks = " (breaks a limit)" if event["best_violation"] else ""
         best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}{breaks}"
-        line = (
+        self.line.show(
             f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
             f" {event['evaluations']}  best {best}"
-        )
-        print(
-            f"\r{line:<70}" if self.terminal else line,
-            end="" if self.terminal else "\n",
-            file=sys.stderr,
-            flush=True,
         )

@@ -1,0 +1,134 @@
+"""Input validation of leaves: real, finite and within their ranges.
+
+Imports core only; may be imported by every folder.
+"""
+
+from collections.abc import Collection
+from typing import Any, cast
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.fields import Meta, is_real, number
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import walk
+
+
+def check_leaves(
+    tree: Any, names: Collection[str] | None = None, vacant: Collection[str] = ()
+) -> None:
+    """Check the concrete leaves of a component; traced ones are passed over.
+
+    Parameters
+    ----------
+    tree : component
+    names : dotted names of the leaves to check; all of them where None
+    vacant : dotted names of leaves that may be None, which a gain schedule fills
+
+    Raises
+    ------
+    InputError for a leaf that is no real number, not finite or out of its range.
+
+    Examples
+    --------
+    >>> from jaxtank.instruments import LevelSensor
+    >>> check_leaves(LevelSensor(noise=[-1.0]))
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: noise[0] = -1 cm: must be at least 0 cm
+    """
+    for name, value, meta in walk(tree):
+        if names is not None and name not in names:
+            continue
+        if isinstance(value, Tracer) or (
+            value is None and (meta.get("like") is not None or name in vacant)
+        ):
+            continue
+        check_value(name, value, meta)
+
+
+def check_value(name: str, value: Any, meta: Meta) -> None:
+    """Check that every entry of a value is real, finite and within its range.
+
+    Parameters
+    ----------
+    name : what messages call it
+    value : number or array
+    meta : its "unit", "low", "high" and "strict", as `leaf` stores them
+
+    Raises
+    ------
+    InputError, naming the first entry that fails.
+
+    Examples
+    --------
+    >>> check_value("k", 0.0, {"unit": "1/s", "low": 0.0, "high": None, "strict": True})
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: k = 0 1/s: must be above 0 1/s
+    """
+    if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
+        raise InputError(
+            f"{name} = {shortened(cast(Any, value))}: must be a number or an array, np.array(...)"
+        )
+    if not is_real(value):
+        raise InputError(
+            f"{name} = {shortened(value)}: must be a real number or an array of real numbers"
+        )
+    array: np.ndarray[Any, Any] = np.asarray(value)
+    low, high = meta["low"], meta["high"]
+    # whole numbers of 2^64 and more are no numbers to numpy
+    array = number(value) if array.dtype == object else array
+    good = np.isfinite(array)
+    if low is not None:
+        good = good & ((array > low) if meta["strict"] else (array >= low))
+    if high is not None:
+        good = good & (array <= high)
+    if np.all(good):
+        return
+    index = tuple(int(i) for i in np.argwhere(~good)[0])
+    raise InputError(_out_of_range(name, array[index], index, meta))
+
+
+def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Meta) -> str:
+    """The message for an entry that is not finite or out of range."""
+    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+    label = name + (f"[{','.join(map(str, index))}]" if index else "")
+    if not np.isfinite(entry):
+        return f"{label} = {entry}{unit}: must be a finite number"
+    if meta["high"] is not None and entry > meta["high"]:
+        return f"{label} = {entry:g}{unit}: must be at most {meta['high']:g}{unit}"
+    bound = "above" if meta["strict"] else "at least"
+    return f"{label} = {entry:g}{unit}: must be {bound} {meta['low']:g}{unit}"
+
+
+def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = False) -> None:
+    """Check that each entry of one leaf is below that of another; traced ones are passed over.
+
+    Parameters
+    ----------
+    name : what messages call the component
+    part : component
+    lower, upper : names of its leaves, of equal shapes [V]
+    equal : whether they may be equal
+
+    Raises
+    ------
+    InputError, naming the first entry that fails.
+
+    Examples
+    --------
+    >>> from jaxtank.instruments import PumpBank
+    >>> check_order("actuator", PumpBank(low=[5.0], high=[3.0]), "low", "high")
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: actuator.low[0] = 5 V: must be below actuator.high[0] = 3 V
+    """
+    a, b = getattr(part, lower), getattr(part, upper)
+    if any(isinstance(v, Tracer) for v in jax.tree.leaves((a, b))):
+        return
+    for i, (low, high) in enumerate(zip(np.ravel(a), np.ravel(b))):
+        if not (low <= high if equal else low < high):
+            most = "at most" if equal else "below"
+            raise InputError(
+                f"{name}.{lower}[{i}] = {low:g} V: must be {most} {name}.{upper}[{i}] = {high:g} V"
+            )

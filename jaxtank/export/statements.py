@@ -1,0 +1,146 @@
+"""The statements of exported code, on scalars: what lowering makes and the printers print.
+
+Imports nothing of this package; may be imported by every module of this folder.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+REAL, WHOLE, TRUTH = "real", "whole", "truth"
+
+
+class Ref(NamedTuple):
+    """A variable, or an entry of an array."""
+
+    name: str
+    index: int | None = None
+
+
+class Define(NamedTuple):
+    """name = op(args)."""
+
+    kind: str
+    name: str
+    op: str
+    args: tuple
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads."""
+        return names(self.args)
+
+
+class Array(NamedTuple):
+    """An array of reals with its entries."""
+
+    name: str
+    entries: tuple
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads."""
+        return names(self.entries)
+
+
+class Matrix(NamedTuple):
+    """A matrix operation, name = op(operands), on arrays by name.
+
+    Operations and their `sizes`: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
+    "forward" and "backward" (n, k): solve L x = b and L' x = b.
+    """
+
+    name: str
+    op: str
+    operands: tuple
+    sizes: tuple
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads."""
+        return set(self.operands)
+
+
+class Until(NamedTuple):
+    """The end of a loop: leave it unless `test`, a variable, is true."""
+
+    test: Any
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads."""
+        return names([self.test])
+
+
+class Loop(NamedTuple):
+    """A loop of `count` passes, or until it ends by itself where `count` is None.
+
+    After each pass of the body every carried variable takes its new value, all at once.
+    """
+
+    count: int | None
+    carried: tuple  # ((kind, name, start), ...)
+    body: list
+    new: tuple
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads, in its body too."""
+        inside = set().union(*(s.reads for s in self.body))
+        return inside | names(self.new) | names(start for _, _, start in self.carried)
+
+
+Statement = Define | Array | Matrix | Until | Loop
+
+
+def names(entries: Iterable) -> set[str]:
+    """Return the names of the variables among numbers and Refs."""
+    return {e.name for e in entries if isinstance(e, Ref)}
+
+
+def every(statements: Iterable[Statement]) -> Iterator[Statement]:
+    """Yield each statement, and those of a loop's body after the loop.
+
+    Examples
+    --------
+    >>> inner = Define(REAL, "v1", "sqrt", (Ref("x", 0),))
+    >>> [type(s).__name__ for s in every([Loop(3, (), [inner], ())])]
+    ['Loop', 'Define']
+    """
+    for s in statements:
+        yield s
+        if isinstance(s, Loop):
+            yield from every(s.body)
+
+
+def matrix_operations(statements: Iterable[Statement]) -> set[str]:
+    """Return the matrix operations that occur in the statements.
+
+    Examples
+    --------
+    >>> sorted(matrix_operations([Matrix("m2", "cholesky", ("a1",), (3,))]))
+    ['cholesky']
+    """
+    return {s.op for s in every(statements) if isinstance(s, Matrix)}
+
+
+def used(statements: list[Statement], wanted: set[str]) -> list[Statement]:
+    """Return the statements that the variables named in `wanted` depend on, in order.
+
+    Examples
+    --------
+    >>> a = Define(REAL, "v1", "sqrt", (Ref("x", 0),))
+    >>> b = Define(REAL, "v2", "exp", (Ref("x", 0),))
+    >>> [s.name for s in used([a, b], {"v1"})]
+    ['v1']
+    """
+    kept = []
+    for s in reversed(statements):
+        if isinstance(s, Loop):
+            if not wanted & {name for _, name, _ in s.carried}:
+                continue
+            s = s._replace(body=used(s.body, names(s.new)))
+        elif not isinstance(s, Until) and s.name not in wanted:
+            continue
+        wanted = wanted | s.reads
+        kept.append(s)
+    return kept[::-1]

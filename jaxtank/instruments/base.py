@@ -1,0 +1,213 @@
+"""The roles Sensor and Actuator: what a closed loop asks of the instruments of a rig.
+
+Holds abstract classes only; imports core, and may be imported by every folder above.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Self, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxtank.core.clock import PIECE, Clock
+from jaxtank.core.numerics import clip
+
+
+class Sensor(abc.ABC):
+    """The level sensors of a rig, one per tank: readings of levels.
+
+    A sensor of one's own is a `component` with its own `step`. A sensor with noise has a leaf
+    `noise` (n,) and is given standard normal deviates, which are drawn before the time loop
+    (`draw`); a sensor with memory, such as a lag, also has its own `init`.
+
+    Examples
+    --------
+    >>> from jaxtank import component, leaf
+    >>> @component
+    ... class Quantised(Sensor):
+    ...     resolution: float = leaf("cm", "least difference of two readings", low=0.0, strict=True)
+    ...
+    ...     def step(self, state, x, xi, dt):
+    ...         return tuple(jnp.round(h / self.resolution) * self.resolution for h in x), state
+    >>> [float(y) for y in Quantised(resolution=0.5).step((), (1.2, 3.3), None, 1.0)[0]]
+    [1.0, 3.5]
+    """
+
+    noise: Any = 0.0
+    """(n,) standard deviation of the noise on each level [cm]; a run with noise needs a key."""
+
+    def init(self, x0: Sequence) -> Any:
+        """Return the state before the first sample.
+
+        Parameters
+        ----------
+        x0 : (n,) levels at t = 0 [cm]
+
+        Returns
+        -------
+        A pytree of arrays; () for a sensor without memory.
+        """
+        return ()
+
+    @abc.abstractmethod
+    def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
+        """Return the readings of a sample and the state after it.
+
+        Parameters
+        ----------
+        state : as `init` returns it
+        x : (n,) levels at the time of the sample [cm]
+        xi : (n,) standard normal deviates of the sample [-]; None for a run without a key
+        dt : sampling period [s]
+
+        Returns
+        -------
+        (n,) readings [cm], and the new state
+        """
+
+    def draw(
+        self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
+    ) -> tuple | None:
+        """Return standard normal deviates of a run, drawn before the time loop.
+
+        Parameters
+        ----------
+        key : random key of jax, or None
+        samples : number of samples [-]
+        piece : number of the chunk of a long run to which the samples belong. Each chunk has a key
+            of its own, and the deviates of a run are those of its chunks, end to end.
+
+        Returns
+        -------
+        (n,) arrays (samples,); None without a key, and for a sensor without noise
+        """
+        if key is None or np.ndim(self.noise) == 0:
+            return None
+        tanks = np.shape(self.noise)[-1]
+        drawn = lambda key, count: jax.random.normal(
+            key, (tanks, count), dtype=jnp.result_type(float)
+        )
+        if piece is not None:
+            deviates = drawn(jax.random.fold_in(key, piece), samples)
+        elif samples <= PIECE:
+            deviates = drawn(key, samples)
+        else:
+            whole, last = divmod(samples, PIECE)
+            chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), PIECE))(jnp.arange(whole))
+            remainder = drawn(jax.random.fold_in(key, whole), last)
+            deviates = jnp.concatenate(
+                [jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1
+            )
+        return tuple(deviates[i] for i in range(tanks))
+
+    def without_noise(self) -> Self:
+        """Return the same sensor with all `noise` 0."""
+        if np.ndim(self.noise) == 0:
+            return self
+        return dataclasses.replace(cast(Any, self), noise=np.zeros(np.shape(self.noise)))
+
+
+class Actuator(abc.ABC):
+    """The pumps of a rig: what reaches the plant for the inputs that a controller commands.
+
+    In one sample `limit` first holds the command within the limits, which needs no memory:
+    controller and observer are given its result. `step` then says what reaches the plant, and
+    `driving` which part of that moves liquid.
+
+    An actuator of one's own is a `component` with leaves `low`, `high` and `initial`, (m,) each,
+    and its own `init` and `step`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from jaxtank import component, leaf
+    >>> @component
+    ... class RateLimited(Actuator):
+    ...     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
+    ...     high: np.ndarray = leaf("V", "(m,) upper limit of each pump")
+    ...     initial: np.ndarray = leaf("V", "(m,) input before t = 0")
+    ...     rate: float = leaf("V/s", "largest rate of change", low=0.0, strict=True)
+    ...
+    ...     def init(self, clock):
+    ...         return tuple(self.initial)
+    ...
+    ...     def step(self, state, applied, dt):
+    ...         most = self.rate * dt
+    ...         u = tuple(v + clip(a - v, -most, most) for v, a in zip(state, applied))
+    ...         return u, u
+    >>> pumps = RateLimited(low=[0.0], high=[12.0], initial=[1.0], rate=2.0)
+    >>> u, state = pumps.step(pumps.init(None), pumps.limit((20.0,)), dt=0.5)
+    >>> float(u[0])
+    2.0
+    """
+
+    low: Any
+    """(m,) lower limit of each pump [V]."""
+
+    high: Any
+    """(m,) upper limit of each pump [V]."""
+
+    initial: Any
+    """(m,) input at which the pumps ran before t = 0 [V]."""
+
+    delay: float = 0.0
+    """Transport delay [s], a whole number of samples."""
+
+    @property
+    def pumps(self) -> int:
+        """Number of pumps m [-]."""
+        return np.shape(self.low)[-1]
+
+    @property
+    def allocates(self) -> bool:
+        """Whether `limit` needs the controller's `input_metric`."""
+        return False
+
+    @property
+    def offset(self) -> Any:
+        """(m,) part of the inputs that moves no liquid (see `driving`) [V]."""
+        return 0.0
+
+    def check(self) -> None:  # noqa: B027
+        """Raise InputError for values that contradict each other."""
+
+    @abc.abstractmethod
+    def init(self, clock: Clock) -> Any:
+        """Return the state before the first sample: a pytree of arrays; () without memory."""
+
+    def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
+        """Return the command held within the limits.
+
+        Parameters
+        ----------
+        command : (m,) inputs that the controller commands [V]
+        metric : (g11, g12, g22) of the controller's cost, where `allocates`; else None
+
+        Returns
+        -------
+        (m,) inputs within [low, high] [V]
+        """
+        return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+
+    @abc.abstractmethod
+    def step(self, state: Any, applied: tuple, dt: Any) -> tuple[tuple, Any]:
+        """Return what the plant is given over a sample, and the state after it.
+
+        Parameters
+        ----------
+        state : as `init` returns it
+        applied : (m,) inputs within the limits [V]
+        dt : sampling period [s]
+
+        Returns
+        -------
+        (m,) inputs at the plant, held over the sample [V], and the new state
+        """
+
+    def driving(self, u: tuple) -> tuple:
+        """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: all of it."""
+        return u

@@ -1,0 +1,230 @@
+"""Kills `jaxtank tune`, `uncertainty` and `identify` at random moments and goes on: python
+tests/audits/fault_drill.py 50 [uncertainty ...] [--record]
+
+Each trial starts one of the commands with --out, sends SIGKILL at a seeded moment, half of them
+anywhere in the time that an undisturbed run takes, half just after some number of evaluations has
+been kept, and goes on with --resume (or once more, where nothing had been kept yet). What goes on
+may be killed as well, up to four times. The folder must then hold the files of an undisturbed run,
+byte by byte but for the wall time and the command line that the report tells, and nothing else.
+
+Processes are forked from one that has imported everything and started no jax, and find the programs
+that the runs left alone compiled (jax's compilation cache): a kill tells more in a search than in
+seconds of imports and compilation.
+"""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from pathlib import Path
+
+SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
+COMMANDS = {
+    "tune": ["tune", *SHORT, "--starts", "2", "--screening", "4", "--validation", "4", "--quiet"],
+    "uncertainty": ["uncertainty", *SHORT, "--samples", "3000", "--quiet"],
+    "identify": [
+        *["identify", "cascaded/pi", "--data", "log/trajectory.csv", "--start", "case", "--starts", "4", "--hold-back", "0", "--quiet"],
+        *["--column", "t=t [s]", "--column", "pump1=u1 [V]", "--column", "h1=y1 [V]", "--column", "h2=y2 [V]"],
+        *["--free", "plant.pump_gain[0]=0.02:0.1", "--free", "plant.orifice[0]=0.02:0.08", "--free", "plant.drain[1]=0.02:0.08"],
+    ],
+}  # fmt: skip
+AFRESH = re.compile(r"no evaluations\.jsonl|no ensemble to go on with|had ended")
+PATIENCE = 300.0  # s
+
+
+def prepare(cache):
+    """Import what the commands need, here, once; `cache`: where compiled programs are kept."""
+    import jax
+    import matplotlib
+
+    matplotlib.use("Agg")
+
+    import tuning.identification.fit
+    import tuning.report.identification
+    import tuning.report.uncertainty
+    import tuning.search.tuner  # noqa: F401
+    from tuning.cli import main as cli
+
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)  # nothing of jax has started
+    return cli
+
+
+def start(cli, words):
+    """The id of a process that runs `jaxtank words` here; what it says is in said.txt."""
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            file = os.open("said.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+            os.dup2(file, 1)
+            os.dup2(file, 2)
+            code = cli.main(words)
+            sys.stdout.flush()
+        finally:
+            os._exit(code)
+    return child
+
+
+def ended(child, patience=PATIENCE):
+    """The exit code of a process, None where it has not ended within `patience` [s]."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.002)
+    return None
+
+
+def kept(folder):
+    """How much of a run is kept in its folder: lines of the log, or batches."""
+    log = folder / "evaluations.jsonl"
+    lines = log.read_bytes().count(b"\n") if log.exists() else 0
+    return lines + len(list(folder.glob("part-*.npz")))
+
+
+def kill(child, folder, seconds, count):
+    """SIGKILL after `seconds`, or, where count is given, that long after `count` has been kept. The
+    exit code of a run that had ended before, else None.
+    """
+    until = time.monotonic() + PATIENCE
+    while count is not None and kept(folder) < count:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > until:
+            raise TimeoutError(f"{folder}: {kept(folder)} of {count} kept")
+        time.sleep(0.001)
+    code = ended(child, seconds)
+    if code is None:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    return code
+
+
+def contents(folder):
+    """{name: bytes} of a folder, less the wall time and the command line."""
+    found = {}
+    for path in sorted(folder.iterdir()):
+        data = path.read_bytes()
+        if path.name == "result.json":
+            page = json.loads(data)
+            page.pop("wall_s", None)
+            data = json.dumps(page, sort_keys=True).encode()
+        if path.name == "report.html":
+            data = re.sub(rb"jaxtank (tune|uncertainty|identify) [^<]*", b"", data)
+            data = re.sub(rb"<p>[\d.]+ s, |[\d.]+ s(?=</)", b"", data)
+        found[path.name] = data
+    return found
+
+
+def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
+    """{"kills", "trials", "afresh", "wrong"}: kills in all until there are `count`, runs begun once
+    more, what did not come out right.
+    """
+    home, here = Path(tempfile.mkdtemp()), Path.cwd()
+    cli, rng = prepare(str(home / "cache")), random.Random(seed)
+    os.chdir(home)
+    try:
+        log = ["simulate", *SHORT, "--set", "sensor.noise=0.02", "--out", "log", "--quiet"]
+        if ended(start(cli, log)) != 0:
+            raise RuntimeError(Path("said.txt").read_text())
+        whole = {}
+        for name in commands:
+            undisturbed(cli, COMMANDS[name], Path("compiled") / name)
+            began = time.monotonic()
+            code, steps = undisturbed(cli, COMMANDS[name], Path("alone") / name)
+            whole[name] = code, steps, time.monotonic() - began, contents(Path("alone") / name)
+            tell(
+                f"{name}: exit code {code}, {steps} kept on the way, {whole[name][2]:.1f} s",
+                flush=True,
+            )
+        told = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
+        while told["kills"] < count:
+            name = commands[told["trials"] % len(commands)]
+            folder, again, first = Path("run"), False, told["kills"]
+            told["trials"] += 1
+            shutil.rmtree(folder, ignore_errors=True)
+            for attempt in range(12):
+                option = "--resume" if again else "--out"
+                child = start(cli, [*COMMANDS[name], option, str(folder)])
+                if attempt < 4 and (attempt == 0 or rng.random() < 0.5) and told["kills"] < count:
+                    few = rng.randint(1, max(1, whole[name][1])) if rng.random() < 0.5 else None
+                    code = kill(
+                        child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few
+                    )
+                    if code is None:
+                        told["kills"] += 1
+                        again = True
+                        continue
+                else:
+                    code = ended(child)
+                if again and code == 2 and AFRESH.search(Path("said.txt").read_text()):
+                    # nothing had been kept yet, or all was done and only the log went
+                    again = False
+                    told["afresh"] += 1
+                    continue
+                break
+            if code != whole[name][0]:
+                told["wrong"].append(
+                    f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}"
+                )
+            elif contents(folder) != whole[name][3]:
+                mine, theirs = contents(folder), whole[name][3]
+                told["wrong"].append(
+                    f"{name}: differs in"
+                    f" {sorted(n for n in mine.keys() | theirs.keys() if mine.get(n) != theirs.get(n))}"
+                )
+                if os.environ.get("KEEP"):
+                    shutil.copytree(folder, Path(os.environ["KEEP"]) / f"{name}{told['trials']}")
+            tell(
+                f"{name}: {told['kills'] - first} killed, {told['kills']} in all;"
+                f" {len(told['wrong'])} wrong",
+                flush=True,
+            )
+        return told
+    finally:
+        os.chdir(here)
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def undisturbed(cli, words, folder):
+    """(exit code, most that was kept on the way) of a run left alone."""
+    child, most = start(cli, [*words, "--out", str(folder)]), 0
+    while True:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status), most
+        most = max(most, kept(folder))
+        time.sleep(0.005)
+
+
+if __name__ == "__main__":
+    count = int(next((w for w in sys.argv[1:] if w.isdigit()), "50"))
+    began = time.monotonic()
+    found = drill(count, commands=tuple(n for n in COMMANDS if n in sys.argv) or tuple(COMMANDS))
+    print(
+        f"{found['kills']} kills of {found['trials']} runs in {time.monotonic() - began:.0f} s;"
+        f" {found['afresh']} had kept nothing yet; {len(found['wrong'])} did not end as the run"
+        " left alone"
+    )
+    print("\n".join(found["wrong"]))
+    if "--record" in sys.argv:
+        from survived import record
+
+        right = found["trials"] - len(found["wrong"])
+        record(
+            "kills",
+            found["kills"],
+            f"{right} of {found['trials']} runs ended with the bytes of a run left alone",
+        )
+    sys.exit(1 if found["wrong"] else 0)

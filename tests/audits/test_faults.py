@@ -1,0 +1,593 @@
+"""Kills, full disks, folders that cannot be written to, Ctrl-C, two runs in one folder: one line,
+the promised exit code, nothing lost.
+"""
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import interrupt_drill
+import numpy as np
+import pytest
+
+import tuning
+from jaxtank import presets
+from jaxtank.core import files
+from jaxtank.core.errors import InputError
+from jaxtank.plots import responses
+from tuning.cli import main
+from tuning.report import figures
+from tuning.storage import batch_store, evaluation_log, folder_lock
+
+HERE = Path(__file__).parent
+SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
+SIMULATE = ["simulate", *SHORT, "--quiet"]
+SEARCH = [
+    "tune",
+    *SHORT,
+    "--starts",
+    "1",
+    "--screening",
+    "2",
+    "--validation",
+    "0",
+    "--iterations",
+    "3",
+    "--quiet",
+]
+SPREAD = ["uncertainty", *SHORT, "--samples", "20", "--quiet"]
+JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
+WRITERS = {
+    "simulate": SIMULATE,
+    "uncertainty": SPREAD,
+    "tune": SEARCH,
+    "sensitivity": ["sensitivity", *SHORT, "--quiet"],
+    "export": ["export", "cascaded/pi"],
+    "show": ["show", "cascaded/pi"],
+    "identify": ["identify", "cascaded/pi", "--data", "log.csv", "--quiet"],
+    "compare": ["compare", "cascaded"],
+}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def say(words, capsys):
+    """(exit code, stdout, lines of stderr) of a command."""
+    code = main.main([str(w) for w in words])
+    said = capsys.readouterr()
+    return code, said.out, said.err.splitlines()
+
+
+@contextlib.contextmanager
+def small_disk(size):
+    """No file may grow past `size` bytes: what is written past it fails, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.fixture
+def frozen(tmp_path):
+    """A folder with an old result in it that nobody may write to, root included."""
+    folder = tmp_path / "frozen"
+    folder.mkdir()
+    (folder / "result.json").write_text("old")
+    if os.geteuid():
+        folder.chmod(0o500)
+        yield folder
+        folder.chmod(0o700)
+        return
+    bind = subprocess.run(["mount", "--bind", folder, folder], capture_output=True)
+    if bind.returncode:
+        pytest.skip("root, to whom permissions say nothing, may not mount read-only here")
+    subprocess.run(["mount", "-o", "remount,ro,bind", folder], check=True)
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+# Files together.
+
+
+def test_files_are_replaced_together_or_not_at_all(tmp_path):
+    (tmp_path / "a").write_text("old a")
+    (tmp_path / "b").write_text("old b")
+    with small_disk(1000), pytest.raises(OSError, match="too large"):
+        files.write_together(tmp_path, {"a": "new a", "b": "x" * 2000})
+    (tmp_path / "c").mkdir()
+    with pytest.raises(IsADirectoryError):
+        files.write_together(tmp_path, {"a": "new a", "c": "new c"})
+    assert {p.name for p in tmp_path.iterdir()} == {"a", "b", "c"}
+    assert ((tmp_path / "a").read_text(), (tmp_path / "b").read_text()) == ("old a", "old b")
+    files.write_together(tmp_path, {"a": "new a", "b": b"new b"})
+    assert ((tmp_path / "a").read_text(), (tmp_path / "b").read_text()) == ("new a", "new b")
+
+
+def test_a_log_and_batches_on_a_full_disk(tmp_path):
+    """/dev/full takes nothing."""
+    (tmp_path / evaluation_log.NAME).symlink_to("/dev/full")
+    with pytest.raises(InputError, match=r"evaluations\.jsonl.*No space left.*--resume"):
+        evaluation_log.Log(tmp_path, {"p": 1})
+    with small_disk(100), pytest.raises(InputError, match=r"manifest\.json.*too large.*--resume"):
+        batch_store.Store(tmp_path / "new", {"measures": ["x" * 200]})
+    assert not list((tmp_path / "new").iterdir())
+
+
+def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
+    log = evaluation_log.Log(tmp_path, {"p": 1})
+    with small_disk(2000), pytest.raises(InputError, match="make room, then --resume"):
+        for i in range(100):
+            log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
+    again, made = evaluation_log.Log(tmp_path, {"p": 1}, resume=True), []
+    assert [
+        again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3))
+        for i in range(20)
+    ] == [(float(i), 1 / 3) for i in range(20)]
+    assert made[0] > 5 and made == list(range(made[0], 20))
+
+
+# The command on a full disk, and where nothing can be written.
+
+
+def old_result(folder, words, capsys):
+    """What a first run wrote; its log, if it needs one, is log.csv."""
+    if words[0] == "identify":
+        row = "".join(f"{k},{3 + k % 5},{4 + 0.01 * k},{4 - 0.01 * k}\n" for k in range(60))
+        Path("log.csv").write_text("t_s,pump_V,upper_V,lower_tank_V\n" + row)
+        folder.mkdir()
+        (folder / "result.json").write_text("old" * 5000)
+    else:
+        assert say([*words, "--out", folder], capsys)[0] in (0, 3)
+    return contents(folder)
+
+
+@pytest.mark.slow_for("uncertainty")
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in ("simulate", "uncertainty", "show") else pytest.param(n, marks=pytest.mark.slow)
+        for n in WRITERS
+    ],
+)
+def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words, folder = WRITERS[name], tmp_path / "out"
+    before = old_result(folder, words, capsys)
+    # enough for a log, or a batch, not for the largest file of the result
+    room = 0.5 * max(map(len, before.values()))
+    seed = ["--seed", "1"] if name in ("simulate", "tune", "uncertainty") else []
+    with small_disk(int(room)):
+        code, out, err = say([*words, *seed, "--out", folder], capsys)
+    last = [line for line in err if line.startswith("jaxtank: ")]
+    assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
+    assert "Traceback" not in "".join(err)
+    after, drawn = (
+        contents(folder),
+        {n for n in before if n.endswith((".png", ".svg", ".gif", ".html"))},
+    )
+    # there was no room for the new one: all of the old is there
+    if after.get("result.json") == before.get("result.json"):
+        assert {n: data for n, data in after.items() if n in before} == before
+    else:  # the new one, with no picture of the old
+        assert (
+            not drawn & after.keys()
+            and before.keys() - drawn <= after.keys()
+            and json.loads(after["result.json"])
+        )
+    # the old result of identify here is its result.json alone
+    left = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
+    assert all(
+        n == evaluation_log.NAME or n == batch_store.MANIFEST or batch_store.NAME.fullmatch(n)
+        for n in left
+    ), left
+    if name in ("tune", "uncertainty", "sensitivity", "identify"):
+        assert out.strip()  # the answer is told all the same
+
+
+# identify, sensitivity and compare: test_page.py
+DRAWERS = [
+    "simulate",
+    "show",
+    *(pytest.param(n, marks=pytest.mark.slow) for n in ("tune", "uncertainty")),
+]
+
+
+@pytest.mark.parametrize("name", DRAWERS)
+def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, capsys, monkeypatch):
+    """A text that matplotlib cannot set, in one kind of picture; then a function that cannot draw."""
+    monkeypatch.chdir(tmp_path)
+    words, folder = WRITERS[name], tmp_path / "out"
+    whole = old_result(folder, words, capsys)
+    plot, broken = (responses, "responses") if name == "simulate" else (figures, "rig")
+    usual = getattr(plot, broken)
+
+    def unset(*args):
+        drawn = usual(*args)
+        for figure in drawn.values() if isinstance(drawn, dict) else [drawn]:
+            figure.suptitle(r"$\x{$")
+        return drawn
+
+    def undrawn(*_):
+        raise ZeroDivisionError
+
+    for fault in (unset, undrawn):
+        monkeypatch.setattr(plot, broken, fault)
+        code, _, err = say([*words, "--out", folder], capsys)
+        notes = [line for line in err if line.startswith("jaxtank: ")]
+        assert (
+            code in (0, 3)
+            and len(notes) >= 1
+            and all("note: " in n and "could not be drawn" in n for n in notes)
+        ), err
+        left = contents(folder)
+        missing = whole.keys() - left.keys()
+        assert missing and all(n.endswith((".png", ".svg")) for n in missing)
+        if name != "show":
+            assert json.loads(left["result.json"]) and (name == "simulate" or "report.html" in left)
+
+
+@pytest.mark.parametrize("name", DRAWERS)
+def test_what_a_file_calls_things_is_never_set_as_mathematics(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text("""case = "cascaded/pi"
+name = "$\\\\x{$ $\\\\y{$"
+[values]
+"clock.dt" = 1.0
+"clock.duration" = 400.0
+[[scenario]]
+name = "$\\\\x{$"
+seed = 1
+""")
+    words = [WRITERS[name][0], "rig.toml", *(w for w in WRITERS[name][1:] if w not in SHORT)]
+    old_result(tmp_path / "out", WRITERS[name], capsys)
+    code, _, err = say([*words, "--out", "new"], capsys)
+    assert code in (0, 3) and not [
+        line for line in err if "could not be drawn" in line or "internal error" in line
+    ], err
+    assert {n for n in contents(tmp_path / "out") if n.endswith(".png")} - {
+        "estimates.png"
+    } <= contents(tmp_path / "new").keys()
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen, capsys):
+    for folder in (frozen, frozen / "in" / "it", frozen / "result.json" / "under"):
+        code, out, err = say([*WRITERS[name], "--out", folder], capsys)
+        assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), (
+            err
+        )
+    assert contents(frozen) == {"result.json": b"old"}
+
+
+def test_a_folder_that_cannot_be_is_refused_at_the_door(tmp_path, capsys):
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for folder, why in ((tmp_path / "link", "nowhere"), ("a\0b", "NUL")):
+        code, out, err = say([*WRITERS["simulate"], "--out", folder], capsys)
+        assert (
+            code == 2
+            and out == ""
+            and len(err) == 1
+            and err[0].startswith("jaxtank: --out")
+            and why in err[0]
+        ), err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link"]
+
+
+def test_output_that_cannot_be_written_is_one_line():
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*JAXTANK, "completion", "bash"], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (2, "jaxtank: output: No space left on device\n")
+
+
+# Two runs in one folder.
+
+HOLDER = """
+import sys, time
+from tuning.storage.folder_lock import hold
+with hold(sys.argv[1], shared=sys.argv[2] == "shared"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextlib.contextmanager
+def another(folder, kind="alone"):
+    """A process that holds a folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(folder), kind], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_folder_is_one_runs_at_a_time_and_a_dead_one_holds_nothing(tmp_path, capsys):
+    folder = tmp_path / "out"
+    with another(folder) as process:
+        began = time.monotonic()
+        code, out, err = say([*SIMULATE, "--out", folder], capsys)
+        assert code == 2 and out == "" and len(err) == 1
+        assert f"process {process.pid}" in err[0] and "give another folder" in err[0]
+        assert time.monotonic() - began < 20 and [p.name for p in folder.iterdir()] == [files.LOCK]
+        (folder / f".result.json.k3x{files.ASIDE}").write_text("half")
+        (folder / ".mine").write_text("whole")
+    with folder_lock.hold(folder):  # its process was killed
+        assert {p.name for p in folder.iterdir()} == {files.LOCK, ".mine"}
+        assert int((folder / files.LOCK).read_text()) == os.getpid()
+    assert [p.name for p in folder.iterdir()] == [".mine"]
+
+
+def test_shares_of_one_ensemble_hold_a_folder_together(tmp_path):
+    with another(tmp_path, "shared"):
+        with folder_lock.hold(tmp_path, shared=True):
+            (tmp_path / f".part{files.ASIDE}").write_text("of the other")
+        assert (tmp_path / files.LOCK).exists() and (tmp_path / f".part{files.ASIDE}").exists()
+        with pytest.raises(InputError, match="another run"), folder_lock.hold(tmp_path):
+            pass
+
+
+def test_a_folder_made_for_nothing_is_removed(tmp_path):
+    with pytest.raises(KeyError), folder_lock.hold(tmp_path / "a" / "b"):
+        raise KeyError
+    assert not list(tmp_path.iterdir())
+    with folder_lock.hold(tmp_path / "a" / "b"):
+        (tmp_path / "a" / "b" / "result.json").write_text("{}")
+    assert [p.name for p in (tmp_path / "a" / "b").iterdir()] == ["result.json"]
+    with folder_lock.hold(None):
+        pass
+
+
+@pytest.mark.slow
+def test_two_at_once(tmp_path):
+    """Both may be right one after the other; neither is wrong."""
+    command = [
+        *JAXTANK,
+        "uncertainty",
+        *SHORT,
+        "--samples",
+        "3000",
+        "--quiet",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    alone = [
+        *JAXTANK,
+        "uncertainty",
+        *SHORT,
+        "--samples",
+        "3000",
+        "--quiet",
+        "--out",
+        str(tmp_path / "alone"),
+    ]
+    subprocess.run(alone, check=True, capture_output=True)
+    both = [
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [(*p.communicate(), p.returncode) for p in both]
+    assert sorted(code for *_, code in said) in ([0, 2], [0, 0])
+    assert all(
+        err == "" if code == 0 else "another run" in err and err.count("\n") == 1
+        for _, err, code in said
+    )
+    mine, theirs = contents(tmp_path / "out"), contents(tmp_path / "alone")
+    assert mine.keys() == theirs.keys() and mine["draws.csv"] == theirs["draws.csv"]
+
+
+# Ctrl-C.
+
+
+def interrupted(words, folder, lines, number=signal.SIGINT):
+    """(stderr, exit code) of a command that gets a signal once its log has so many lines; 0: as
+    soon as the folder is there.
+    """
+    process = subprocess.Popen(
+        [*JAXTANK, *words, "--out", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    log, until = folder / evaluation_log.NAME, time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < until:
+        if (lines == 0 and folder.exists()) or (
+            log.exists() and log.read_bytes().count(b"\n") >= lines > 0
+        ):
+            break
+        time.sleep(0.005)
+    process.send_signal(number)
+    return process.communicate(timeout=120)[1], process.returncode
+
+
+LONG = [
+    "tune",
+    "cascaded/pi",
+    "--set",
+    "clock.dt=1",
+    "--set",
+    "clock.duration=400",
+    "--screening",
+    "64",
+    "--validation",
+    "0",
+]
+
+
+@pytest.mark.slow_for("6")
+@pytest.mark.parametrize("lines", [6, *(pytest.param(n, marks=pytest.mark.slow) for n in (11, 25))])
+def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
+    said, code = interrupted([*LONG, "--starts", "40", "--quiet"], tmp_path / "out", lines)
+    assert code == 130 and "interrupted" in said and "Traceback" not in said, said
+    found = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert found["status"] == "interrupted" and "best point so far" in found["message"]
+    evaluated = (tmp_path / "out" / evaluation_log.NAME).read_bytes().count(b"\n") - 1
+    assert 0 < evaluated < 200 and found["evaluations"]["simulations"] > 0
+    assert (tmp_path / "out" / "rig.toml").exists() and not (tmp_path / "out" / files.LOCK).exists()
+
+
+@pytest.mark.parametrize(
+    ("lines", "number", "word"),
+    [
+        (0, signal.SIGTERM, "terminated"),
+        pytest.param(0, signal.SIGINT, "interrupted", marks=pytest.mark.slow),
+        # only the case's own values have been evaluated: what follows is compiled first
+        pytest.param(2, signal.SIGINT, "interrupted", marks=pytest.mark.slow),
+    ],
+)
+def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folder(
+    lines, number, word, tmp_path
+):
+    said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
+    assert (said, code) == (f"jaxtank: {word}\n", 128 + number)
+    left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
+    assert left <= {evaluation_log.NAME}
+    with folder_lock.hold(tmp_path / "out"):
+        pass
+
+
+ENTRY = """
+import os, signal, sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with it ignored
+
+class Interrupting:
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from tuning.cli.main import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("module", ["tuning.cli.parser", "numpy", "jax"])
+def test_ctrl_c_in_an_import_ends_the_program_at_once(module):
+    command = [sys.executable, "-c", ENTRY.format(module=module), "simulate", *SHORT]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "jaxtank: interrupted\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
+    """As a shell has it for Ctrl-C when a script runs a command in the background."""
+    code = (
+        f"import os, signal, time; signal.signal({int(number)}, signal.SIG_IGN)\n"
+        "from tuning.cli import interrupts; interrupts.listen()\n"
+        f"os.kill(os.getpid(), {int(number)}); time.sleep(0.5); print('went on')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
+
+
+def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
+    """The first is answered while an evaluation is compiled that takes for ever."""
+    code = (
+        "import os, signal, sys, time; from tuning.cli import interrupts; interrupts.listen();"
+        " search = interrupts.Interrupts()\nsearch.check(); os.kill(os.getpid(),"
+        " signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\nos.kill(os.getpid(),"
+        " signal.SIGINT); time.sleep(60); print('went on')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    first, second = done.stderr.splitlines()
+    assert (done.returncode, done.stdout, second) == (130, "", "jaxtank: stopped at once")
+    assert "best point so far" in first
+
+
+def test_importing_the_library_leaves_signals_alone():
+    code = (
+        "import signal; before = [signal.getsignal(n) for n in (signal.SIGINT,"
+        " signal.SIGTERM)]\nimport jaxtank, tuning, tuning.cli.main, tuning.cli.interrupts,"
+        " tuning.search.tuner, tuning.cli.commands.tuning\ntuning.cli.main.main(['list'])\nassert"
+        " before == [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]\nassert"
+        " signal.set_wakeup_fd(-1) == -1"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def test_signals_at_random_moments():
+    found = interrupt_drill.drill(
+        4, seed=3, commands=("tune", "simulate"), takes={"tune": 4.0, "simulate": 2.0}
+    )
+    assert found["signals"] == 4 and not found["wrong"], found["wrong"]
+
+
+@pytest.mark.slow
+def test_two_hundred_signals():
+    found = interrupt_drill.drill(200)
+    assert found["signals"] == 200 and not found["wrong"], found["wrong"]
+
+
+def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
+    """Two of three searches are in the log: the third alone is run, and the answer has the same
+    bits; another problem's log is refused.
+    """
+    case, k = presets.find("cascaded/pi"), np.arange(80.0)
+    wave = 3 + np.sin(k / 9)
+    log = tuning.log(
+        t=4 * k,
+        u=wave[:, None],
+        y=np.stack([4 + 0.5 * np.sin(k / 9 - 1), 4 + 0.3 * np.sin(k / 9 - 2)], axis=1),
+    )
+    free = {"plant.pump_gain[0]": (0.02, 0.1), "plant.drain[1]": (0.02, 0.08)}
+    options = {"start": "case", "starts": 3, "hold_back": 0, "noise": 0.05, "substeps": 2}
+    seen = []
+
+    def stop(fit):
+        seen.append(fit)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    whole = tuning.identify(case, log, free, **options)
+    assert (
+        tuning.identify(case, log, free, folder=tmp_path, progress=stop, **options).status
+        == "interrupted"
+    )
+    assert (tmp_path / evaluation_log.NAME).read_bytes().count(b"\n") == 3
+    again = tuning.identify(
+        case, log, free, folder=tmp_path, resume=True, progress=seen.append, **options
+    )
+    # what is recalled has no slopes
+    assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
+    told = [{k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)]
+    assert json.dumps(told[0]) == json.dumps(told[1])
+    with pytest.raises(InputError, match="of another problem; what differs: noise"):
+        tuning.identify(case, log, free, folder=tmp_path, resume=True, **{**options, "noise": 0.06})
+
+
+# Kills.
+
+
+def drill(*words):
+    done = subprocess.run(
+        [sys.executable, str(HERE / "fault_drill.py"), *words], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_two_kills():
+    assert "2 kills" in drill("2", "uncertainty")
+
+
+@pytest.mark.slow
+def test_fifty_kills():
+    print(drill("50"))

@@ -1,0 +1,100 @@
+"""The command with streams that are closed, full or left by their reader, in a process of its own:
+exit codes and answers as promised.
+"""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tuning.cli import terminal
+
+JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
+SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
+SEARCH = [
+    "tune",
+    *SHORT,
+    "--starts",
+    "1",
+    "--screening",
+    "2",
+    "--validation",
+    "0",
+    "--iterations",
+    "3",
+]
+
+
+def shell(words, tail):
+    """The command followed by redirections in the shell's words."""
+    line = " ".join(f"'{w}'" for w in [*JAXTANK, *words])
+    return subprocess.run(
+        ["bash", "-c", f"{line} {tail}"], capture_output=True, text=True, timeout=120
+    )
+
+
+def figures(out):
+    """What a tuning said, less its time."""
+    return re.sub(r"[\d.]+ s\b", "", out)
+
+
+def test_a_closed_stdout_is_output_that_cannot_be_written(tmp_path):
+    done = shell(["simulate", *SHORT, "--out", str(tmp_path / "run")], ">&-")
+    assert (
+        done.returncode == 2
+        and done.stderr.splitlines()[-1] == "jaxtank: output: Bad file descriptor"
+    )
+    # nothing that was said got into a file
+    assert (tmp_path / "run" / "result.json").read_text().startswith("{")
+
+
+@pytest.mark.parametrize("words", [["completion", "bash"], ["--help"], ["tune", "--help"]])
+@pytest.mark.parametrize("tail", [">&-", ">/dev/full"])
+def test_what_is_printed_alone_and_cannot_be(words, tail):
+    done = shell(words, tail)
+    assert done.returncode == 2 and re.fullmatch(r"jaxtank: output: [\w ]+\n", done.stderr), (
+        done.stderr
+    )
+
+
+@pytest.mark.parametrize("tail", ["2>/dev/full", "2>&-", "2>&- <&-", "2> >(exec true)"])
+def test_bad_input_keeps_its_exit_code(tail):
+    assert shell(["completion", "cmd"], tail).returncode == 2
+
+
+@pytest.mark.slow
+def test_progress_that_cannot_be_told_ends_no_run():
+    """Full or closed: the answer is that of a run whose progress was read."""
+    told = shell(SEARCH, "")
+    assert told.returncode in (0, 3) and "start 1/1" in told.stderr
+    for tail in ("2>/dev/full", "2>&-"):
+        silent = shell(SEARCH, tail)
+        assert (silent.returncode, figures(silent.stdout)) == (
+            told.returncode,
+            figures(told.stdout),
+        ), tail
+
+
+def test_ctrl_c_where_nobody_can_be_told_of_it():
+    """The handler of the signal speaks, too."""
+    code = (
+        "import os, signal, sys; from tuning.cli import interrupts, terminal; terminal.guard();"
+        " found = interrupts.Interrupts(); found.check()\nos.kill(os.getpid(),"
+        " signal.SIGINT)\nprint(found.stop)"
+    )
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=full, text=True
+        )
+    assert (done.returncode, done.stdout) == (0, "True\n")
+
+
+def test_a_forgiving_stream_writes_what_is_taken(tmp_path):
+    with open(tmp_path / "told", "w+b") as file:
+        raw = terminal.Forgiving(file.fileno())
+        assert (
+            raw.write(b"start 1/8\n") == 10 and not raw.isatty() and raw.fileno() == file.fileno()
+        )
+        assert (tmp_path / "told").read_bytes() == b"start 1/8\n"
+    assert terminal.Forgiving(10**6).write(b"lost") == 4  # no descriptor has that number

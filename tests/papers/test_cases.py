@@ -1,0 +1,185 @@
+"""What must hold of every case of every paper: it can be shown, written, read back, run and
+compared.
+"""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, walk
+from jaxtank.loop.run import evaluate_compiled
+from tuning.bench.bench import is_one_function
+from tuning.cli import main
+from tuning.report.papers import measure
+
+NAMES = presets.names()
+NEW = [name for name in NAMES if not name.startswith("gouta2015")]
+CONTRACT = {
+    "gouta2015": "ngpc backstepping backstepping-ff ngpc-table1 backstepping-boxqp ngpc-slow",
+    "gouta2022": (
+        "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed"
+        " chadpc-trapezoid"
+    ),
+    "mirakhorli": (
+        "sfc smc hybrid smc-printed lqi sfc-warm smc-warm hybrid-warm smc-printed-warm lqi-warm"
+    ),
+    "calofir": "backstepping backstepping-perturbed",
+    "cascaded": "pi open-loop",
+    "khalid": (
+        "gpc gpc-nc2 gpc-nc30 laguerre gpc-mimo laguerre-mimo gpc-constrained gpc-nc2-constrained"
+        " gpc-nc30-constrained laguerre-constrained gpc-mimo-constrained laguerre-mimo-constrained"
+    ),
+}
+NAMES_THAT_MUST_EXIST = {
+    "gouta2022/chadpc": "controller.Tp observer.l plant.pump_gain actuator.dead_zone",
+    "gouta2022/pid": "controller.Kc controller.Ti controller.Td",
+    "gouta2022/fopi": "controller.order",
+    "mirakhorli/sfc": "controller.K",
+    "mirakhorli/hybrid": (
+        "controller.K controller.surface controller.ks controller.phi controller.b controller.w"
+    ),
+    "mirakhorli/lqi": "controller.Q controller.R",
+    "calofir/backstepping": "controller.K_phi controller.K_y",
+    "khalid/laguerre": "controller.r_w controller.a controller.operating_point",
+    "khalid/gpc": "controller.r_w controller.operating_point",
+}
+STATICS_THAT_MUST_EXIST = {
+    "mirakhorli/hybrid": "controller.pairing actuator.delay",
+    "khalid/gpc": "controller.Nc controller.Np",
+    "khalid/laguerre": "controller.N controller.Np",
+}
+# a quadratic programme inside the loop: an inner loop of matrix factorisations
+# (controllers/incremental.py)
+NOT_ONE_FUNCTION = {
+    name for name in NAMES if name.startswith("khalid") and name.endswith("-constrained")
+}
+
+
+def test_every_case_of_the_contract_is_there():
+    for paper, cases in CONTRACT.items():
+        assert set(cases.split()) <= set(presets.load(paper).cases), paper
+
+
+def test_names_of_the_contract():
+    for name, leaves in NAMES_THAT_MUST_EXIST.items():
+        for leaf in [*leaves.split(), "x0", "sensor.noise", "actuator.low", "actuator.high"]:
+            assert np.all(np.isfinite(np.asarray(get_value(presets.find(name).loop, leaf)))), (
+                name,
+                leaf,
+            )
+    for name, fields in STATICS_THAT_MUST_EXIST.items():
+        assert set(fields.split()) <= {
+            n for n, _, _ in walk(presets.find(name).loop, kind="static")
+        }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NEW)
+def test_a_case_is_checked_and_its_rig_file_is_itself(name):
+    case = rig.check(presets.find(name))
+    import tomllib
+
+    again = rig.from_table(tomllib.loads(rig.dump(case)))
+    assert jax.tree.structure(again.loop) == jax.tree.structure(case.loop)
+    for a, b in zip(jax.tree.leaves(again.loop), jax.tree.leaves(case.loop)):
+        np.testing.assert_array_equal(a, b)
+    assert again.clock == case.clock and dict(again.free) == dict(case.free)
+
+
+@pytest.mark.parametrize("name", NEW)
+def test_what_a_case_frees_is_a_leaf_within_its_range(name):
+    case, preset = presets.find(name), presets.load(name.split("/")[0])
+    for parameter, free in case.free.items():
+        value = np.asarray(get_value(case.loop, parameter))
+        assert np.all((value >= free.low) & (value <= free.high)), (parameter, value, free)
+        rig.check_free(case.loop, parameter, *free)
+    for parameter, free in preset.tunable.items():
+        assert free.low < free.high, parameter
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NEW)
+def test_a_case_is_shown(name, capsys):
+    assert main.main(["show", name]) == 0
+    said = capsys.readouterr().out
+    assert "departures from the paper" in said and "controller." in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n in NEW if n not in NOT_ONE_FUNCTION])
+def test_a_case_is_one_function(name):
+    case = presets.find(name)
+    program = (
+        evaluate_compiled.lower(
+            case.loop, case.clock, ("rms_error_total", "max_level"), None, False
+        )
+        .compile()
+        .as_text()
+    )
+    assert is_one_function(program, case.clock.samples)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_a_case_is_simulated_by_the_command(name, tmp_path, capsys):
+    assert main.main(["simulate", name, "--out", str(tmp_path), "--quiet"]) == 0
+    assert (tmp_path / "responses.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", presets.PAPERS)
+def test_a_paper_is_compared_and_every_difference_has_a_reason(paper):
+    rows = measure(paper)["rows"]
+    assert any(r["verdict"] == "reproduced" for r in rows) or paper in ("gouta2015", "cascaded")
+    for r in rows:
+        assert r["verdict"] in (
+            "quoted",
+            "reproduced",
+            "partly",
+            "not reproduced",
+            "differs",
+            "not measured",
+        )
+        assert r["verdict"] in ("quoted", "reproduced") or r["reason"], r["quantity"]
+
+
+def test_printed_units_follow_the_rig(capsys):
+    assert main.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
+    said = capsys.readouterr().out
+    assert " m " in said and "m^3/s" in said and "cm" not in said
+    assert (
+        jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"]
+        == "m^3/(s U0)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "nearest"),
+    [
+        ("gouta2015/backsteping", "gouta2015/backstepping"),
+        ("mirakhorli/SFC", "mirakhorli/sfc"),
+        ("Gouta2022/PI", "gouta2022/pi"),
+        ("khalid/ngpc", "khalid/gpc"),  # of the paper that is named, not of the others
+        ("laguerre-constrained", "khalid/laguerre-constrained"),
+    ],
+)
+def test_a_mistyped_case_is_answered_with_the_nearest(name, nearest):
+    with pytest.raises(InputError, match=rf"^unknown case {name!r}; nearest: {nearest}(,|$)"):
+        presets.find(name)
+    paper, _, case = name.partition("/")
+    if paper in presets.PAPERS:
+        with pytest.raises(
+            InputError, match=rf"^unknown case {case!r}; nearest: {nearest.partition('/')[2]}(,|$)"
+        ):
+            presets.load(paper).cases[case]
+
+
+@pytest.mark.parametrize("name", [None, 3, ("gouta2015", "ngpc")])
+def test_a_case_that_is_no_text_is_refused(name):
+    with pytest.raises(InputError, match="must be a text, as 'gouta2015/ngpc'"):
+        presets.find(name)
+    with pytest.raises(InputError, match="unknown paper"):
+        presets.load(name)

@@ -1,0 +1,137 @@
+"""Riccati and Lyapunov equations against SciPy, their derivatives against central differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from scipy import linalg
+
+from jaxtank.analysis.riccati import (
+    discrete_lyapunov,
+    discrete_riccati,
+    lqr,
+    lyapunov,
+    riccati,
+    zero_order_hold,
+)
+
+RICCATI, LQR, DISCRETE_RICCATI = jax.jit(riccati), jax.jit(lqr), jax.jit(discrete_riccati)
+QUADRUPLE = (  # mirakhorli at 12/12: mirakhorli notes S2.3
+    np.array(
+        [
+            [-0.0231362, 0, 0.0525823, 0],
+            [0, -0.0231362, 0, 0.0299175],
+            [0, 0, -0.0525823, 0],
+            [0, 0, 0, -0.0299175],
+        ]
+    ),
+    np.array([[0.0829417, 0], [0, 0.0478546], [0, 0.0928942], [0.1145385, 0]]),
+)
+
+
+def system(seed, n=5, m=2):
+    rng = np.random.default_rng(seed)
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    q, r = rng.normal(size=(n, n)), rng.normal(size=(m, m))
+    return A, B, q @ q.T, r @ r.T + 0.3 * np.eye(m)
+
+
+def augmented(weight=1e-3):
+    """The quadruple tank with an integrator of each error: its open loop has two poles at 0."""
+    A, B = np.zeros((6, 6)), np.zeros((6, 2))
+    A[:4, :4], B[:4] = QUADRUPLE
+    A[4, 0] = A[5, 1] = 1.0
+    return A, B, np.diag([1.0, 1, 0, 0, weight, weight]), 3.0 * np.eye(2)
+
+
+CONTINUOUS = [
+    system(0),
+    system(1),
+    system(2, n=8, m=1),
+    (*QUADRUPLE, np.diag([1.0, 1, 0, 0]), 3 * np.eye(2)),
+    augmented(),
+    augmented(1e-8),
+]
+
+
+@pytest.mark.parametrize("case", CONTINUOUS, ids=range(len(CONTINUOUS)))
+def test_riccati_against_scipy(case):
+    A, B, Q, R = case
+    P = linalg.solve_continuous_are(A, B, Q, R)
+    np.testing.assert_allclose(RICCATI(*case), P, rtol=1e-8, atol=1e-9 * np.abs(P).max())
+    K = LQR(*case)
+    np.testing.assert_allclose(K, np.linalg.solve(R, B.T @ P), rtol=1e-7, atol=1e-9)
+    assert np.all(np.linalg.eigvals(A - B @ K).real < 0)
+
+
+DISCRETE = [
+    system(3),
+    (np.zeros((3, 3)), *system(4, n=3)[1:]),  # nothing carried over: P = Q
+    (0.98 * linalg.orth(system(5)[0]), *system(6)[1:]),
+    tuple(
+        np.asarray(a)
+        for a in (*zero_order_hold(*QUADRUPLE, 0.1), np.diag([1.0, 1, 0, 0]), 3 * np.eye(2))
+    ),
+    # a random walk in little noise: closed-loop poles at 0.999
+    (np.eye(2), np.eye(2), 1e-6 * np.eye(2), np.eye(2)),
+]
+
+
+@pytest.mark.parametrize("case", DISCRETE, ids=range(len(DISCRETE)))
+def test_discrete_riccati_against_scipy(case):
+    P = linalg.solve_discrete_are(*case)
+    np.testing.assert_allclose(DISCRETE_RICCATI(*case), P, rtol=1e-8, atol=1e-9 * np.abs(P).max())
+
+
+def test_lyapunov_against_scipy():
+    A, _, Q, _ = system(7)
+    np.testing.assert_allclose(
+        lyapunov(A, Q), linalg.solve_continuous_lyapunov(A, -Q), rtol=1e-9, atol=1e-11
+    )
+    np.testing.assert_allclose(
+        discrete_lyapunov(0.4 * A, Q),
+        linalg.solve_discrete_lyapunov(0.4 * A, Q),
+        rtol=1e-9,
+        atol=1e-11,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "solve, case",
+    [
+        (riccati, CONTINUOUS[0]),
+        (lqr, CONTINUOUS[3]),
+        (lqr, augmented()),
+        (discrete_riccati, DISCRETE[0]),
+    ],
+)
+def test_derivatives_forward_and_reverse(solve, case):
+    """Q and R enter through their factors, so that a difference keeps them symmetric."""
+    A, B, Q, R = case
+    scale = np.abs(np.asarray(solve(*case))).max()
+    f = jax.jit(
+        lambda A, B, q, r: (
+            solve(A, B, jnp.asarray(Q) * jnp.outer(q, q), jnp.asarray(R) * jnp.outer(r, r)) / scale
+        )
+    )
+    args = (A, B, np.linspace(0.9, 1.1, len(Q)), np.linspace(0.8, 1.2, len(R)))
+    check_grads(f, args, order=1, modes=("fwd", "rev"), rtol=1e-5, atol=1e-5, eps=1e-6)
+
+
+def test_they_work_in_batches_and_on_a_scalar_by_hand():
+    """a = 0, b = q = r = 1: P = 1, and dP/dq = 1/2; the discrete one with a = 1 is the golden
+    ratio.
+    """
+    one, zero = np.ones((1, 1)), np.zeros((1, 1))
+    value, slope = jax.jit(jax.value_and_grad(lambda q: riccati(zero, one, q * one, one)[0, 0]))(
+        1.0
+    )
+    np.testing.assert_allclose((value, slope), (1.0, 0.5), rtol=1e-13)
+    np.testing.assert_allclose(
+        DISCRETE_RICCATI(one, one, one, one)[0, 0], (1 + 5**0.5) / 2, rtol=1e-14
+    )
+    A, B, Q, R = system(8)
+    batch = jax.jit(jax.vmap(lambda s: riccati(A, B, s * Q, R)))(np.array([0.5, 2.0]))
+    np.testing.assert_allclose(batch[1], RICCATI(A, B, 2 * Q, R), rtol=1e-9, atol=1e-9)

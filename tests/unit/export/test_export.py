@@ -1,0 +1,632 @@
+"""Exported laws, compiled by gcc, against the law in the loop they were made from: 10,000 samples
+of every law of every paper.
+"""
+
+import ctypes
+import dataclasses
+import functools
+import math
+import re
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.controllers.base import Controller
+from jaxtank.core import units
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import component
+from jaxtank.export.source import export
+from jaxtank.plants.network import network
+from jaxtank.rig import schema as rig_words
+from tuning.cli import main
+
+SAMPLES = 10_000
+GCC = shutil.which("gcc")
+needs_gcc = pytest.mark.skipif(GCC is None, reason="no gcc on this machine")
+
+# one case of every law, observer and way of saturating; the rest differ in numbers alone
+QUICK = [
+    "gouta2015/ngpc",
+    "gouta2015/backstepping-boxqp",
+    "gouta2022/chadpc",
+    "gouta2022/fopi",
+    "calofir/backstepping",
+    "cascaded/pi",
+    "mirakhorli/hybrid",
+    "mirakhorli/smc",
+]
+SLOW = [
+    name
+    for name in presets.names()
+    if name not in QUICK and name != "cascaded/open-loop" and "printed" not in name
+]
+EVERY = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+
+
+@functools.cache
+def replayed(name, noise=1e-4, values=()):
+    """(Case, Trajectory, setpoints with rates) of a run of 10,000 samples as host arrays; noise: as
+    a share of the highest rim; values: what is set, as pairs.
+    """
+    case = presets.find(name)
+    noise = noise * float(np.max(np.asarray(case.loop.plant.rim)))
+    values = {
+        "clock.duration": (SAMPLES - 1) * case.clock.dt,
+        "sensor.noise": noise,
+        "actuator.delay": 0.0,
+        **dict(values),
+    }
+    case = rig.set_values(case, values)
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(1)))
+    signals = [
+        np.stack([np.asarray(v) for v in part], axis=1)
+        for part in case.loop.reference.sample(case.clock)
+    ]
+    return case, run, signals
+
+
+class Compiled:
+    """An exported law as Python functions."""
+
+    def __init__(self, case, folder, precision="double"):
+        text = export(case, "c", precision, name="law")
+        source, library = folder / "law.c", folder / "law.so"
+        source.write_text(text)
+        flags = [
+            "-std=c99",
+            "-pedantic",
+            "-O1",
+            "-Wall",
+            "-Wextra",
+            "-Werror",
+            "-Wno-unused-function",
+            "-Wno-unused-variable",
+        ]
+        made = subprocess.run(
+            [GCC, *flags, "-shared", "-fPIC", "-o", library, source, "-lm"],
+            capture_output=True,
+            text=True,
+        )
+        assert made.returncode == 0, made.stderr
+        self.library = ctypes.CDLL(str(library))
+        self.real = ctypes.c_double if precision == "double" else ctypes.c_float
+        self.type = np.float64 if precision == "double" else np.float32
+        self.state = np.zeros(int(re.search(r"LAW_STATE (\d+)", text).group(1)), dtype=self.type)
+
+    def pointer(self, array):
+        return array.ctypes.data_as(ctypes.POINTER(self.real))
+
+    def run(self, case, run, signals):
+        y, r, dr, ddr = (np.ascontiguousarray(v, dtype=self.type) for v in (run.y, *signals))
+        u = np.asarray(case.loop.actuator.initial, dtype=self.type).copy()
+        start = np.asarray(case.loop.x0, dtype=self.type).copy()
+        self.library.law_init(self.pointer(self.state), self.pointer(start), self.pointer(u))
+        out = np.zeros((len(y), len(u)), dtype=self.type)
+        for k in range(len(y)):
+            self.library.law_step(
+                self.pointer(self.state),
+                self.real(run.t[k]),
+                *(self.pointer(v[k]) for v in (y, r, dr, ddr, out)),
+            )
+        return out
+
+
+@pytest.mark.slow_for("gouta2015/ngpc")
+@needs_gcc
+@pytest.mark.parametrize("name", EVERY)
+def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
+    """Within 1e-9 of the pumps' range."""
+    case, run, signals = replayed(name)
+    told = Compiled(case, tmp_path).run(case, run, signals)
+    reach = max(1.0, float(np.abs(run.applied).max()))
+    assert len(told) == SAMPLES and np.ptp(run.applied) > 0
+    np.testing.assert_allclose(told, run.applied, atol=1e-9 * reach, rtol=0)
+
+
+@pytest.mark.slow
+@needs_gcc
+def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, monkeypatch):
+    """As above 40 variables, where the factor is found in loops; of 4, which compile in less time."""
+    monkeypatch.setattr(jaxtank.analysis.qp, "UNROLLED", 3)
+    case = presets.find("khalid/laguerre-constrained")
+    case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt, "controller.rows": 3})
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
+    signals = [
+        np.stack([np.asarray(v) for v in part], axis=1)
+        for part in case.loop.reference.sample(case.clock)
+    ]
+    told = Compiled(case, tmp_path).run(case, run, signals)
+    assert np.ptp(run.applied) > 0.1 * np.abs(run.applied).max()
+    np.testing.assert_allclose(
+        told, run.applied, atol=1e-9 * float(np.abs(run.applied).max()), rtol=0
+    )
+
+
+TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # gouta2022 notes S10
+
+
+@pytest.mark.slow_for("gouta2015/backstepping-values0-0.0001")
+@needs_gcc
+@pytest.mark.parametrize(
+    ("name", "values", "share"),
+    [
+        ("gouta2015/backstepping", (), 1e-4),
+        ("gouta2022/chadpc", TUNED, 1e-4),
+        # the published observer, l = 10 1/s, magnifies what single precision cuts off a level
+        ("gouta2022/chadpc", (), 2e-4),
+        ("mirakhorli/hybrid", (), 1e-4),
+        ("cascaded/pi", (), 1e-4),
+        pytest.param("khalid/laguerre", (), 1e-4, marks=pytest.mark.slow),
+    ],
+)
+def test_c_in_single_precision(name, values, share, tmp_path):
+    """Within 1e-4 of the pumps' range."""
+    case, run, signals = replayed(name, values=values)
+    told = Compiled(case, tmp_path, "float").run(case, run, signals)
+    np.testing.assert_allclose(
+        told, run.applied, atol=share * float(np.abs(run.applied).max()), rtol=0
+    )
+
+
+def matlab(text):
+    """A generated MATLAB function as a Python one, by rewriting its few kinds of statement;
+    independent of the printer of C.
+    """
+    lines, depth = [], 1
+    body = text.split("\n\nfunction out")[0].replace(" ...\n", " ")
+    for line in body.splitlines()[1:]:
+        line = line.strip().rstrip(";")
+        if not line or line.startswith("%"):
+            continue
+        if line in ("end", "else"):
+            depth -= 1
+            if line == "end":
+                continue
+        line = re.sub(
+            r"\b(s|y|r|dr|ddr|u|a\d+|m\d+)\((\d+)\)",
+            lambda m: f"{m.group(1)}[{int(m.group(2)) - 1}]",
+            line,
+        )
+        line = (
+            line.replace("~=", "!=")
+            .replace("&&", " and ")
+            .replace("||", " or ")
+            .replace("~", " not ")
+            .replace("^", "**")
+        )
+        line = line.replace("isempty(s)", "s is None")
+        line = re.sub(r"zeros\(1, (\d+)\)", r"[0.0] * \1", line)
+        line = re.sub(r"for i = 1:(\d+)", r"for i in range(\1)", line)
+        opens = line.startswith(("if ", "for "))
+        lines.append("    " * depth + line + (":" if opens else ""))
+        depth += opens
+    known = {f: getattr(math, f) for f in ("sqrt", "exp", "log", "tanh", "sin", "cos", "floor")}
+    known |= {
+        "pick": lambda c, yes, no: yes if c else no,
+        "abs": abs,
+        "max": max,
+        "min": min,
+        "double": float,
+        "true": True,
+        "false": False,
+    }
+    known |= {
+        f: getattr(math, f)
+        for f in (
+            "erf",
+            "erfc",
+            "log1p",
+            "expm1",
+            "tan",
+            "asin",
+            "acos",
+            "atan",
+            "atan2",
+            "sinh",
+            "cosh",
+        )
+    }
+    known |= {f: getattr(math, f) for f in ("asinh", "acosh", "atanh", "ceil", "isfinite")}
+    known |= {
+        "rem": math.fmod,
+        "fix": math.trunc,
+        "round": round,
+        "nthroot": lambda v, n: math.copysign(abs(v) ** (1 / n), v),
+    }
+    known |= {
+        "sqrt": lambda v: math.sqrt(v) if v >= 0 else math.nan,
+        "sign": np.sign,
+        "Inf": math.inf,
+        "NaN": math.nan,
+    }
+    exec("def law(s, t, y, r, dr, ddr, u):\n" + "\n".join(lines) + "\n    return u, s", known)
+    return known["law"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gouta2015/backstepping",
+        "gouta2022/chadpc",
+        "mirakhorli/hybrid",
+        "cascaded/pi",
+        pytest.param("khalid/laguerre", marks=pytest.mark.slow),
+    ],
+)
+def test_matlab_gives_the_inputs_of_the_loop(name):
+    # it begins with the first readings, the loop with the true levels
+    case, run, signals = replayed(name, noise=0.0)
+    law, s, u = (
+        matlab(export(case, "m")),
+        None,
+        list(map(float, np.asarray(case.loop.actuator.initial))),
+    )
+    for k in range(2000):
+        u, s = law(s, run.t[k], run.y[k], *(v[k] for v in signals), u)
+        np.testing.assert_allclose(
+            u, run.applied[k], atol=1e-9 * max(1.0, float(np.abs(run.applied).max())), rtol=0
+        )
+
+
+FUNCTIONS = (
+    jax.nn.sigmoid,
+    jax.nn.softplus,
+    jax.nn.relu,
+    jax.nn.silu,
+    jax.nn.gelu,
+    jax.scipy.special.erf,
+    jax.scipy.special.erfc,
+    jnp.tanh,
+    jnp.exp,
+    jnp.exp2,
+    jnp.expm1,
+    jnp.sinh,
+    jnp.cosh,
+    jnp.sin,
+    jnp.cos,
+    jnp.tan,
+    jnp.arctan,
+    jnp.arcsinh,
+    jnp.sign,
+    jnp.floor,
+    jnp.ceil,
+    jnp.round,
+    jnp.trunc,
+    jnp.abs,
+    jnp.square,
+    jnp.cbrt,
+    jnp.sinc,
+    jnp.isfinite,
+    lambda x: jnp.log(jnp.abs(x)),
+    lambda x: jnp.log1p(jnp.abs(x)),
+    lambda x: jnp.log10(jnp.abs(x)),
+    lambda x: jnp.sqrt(jnp.abs(x)),
+    lambda x: jnp.arcsin(0.4 * x),
+    lambda x: jnp.arccos(0.4 * x),
+    lambda x: jnp.arctanh(0.4 * x),
+    lambda x: jnp.arccosh(1.0 + x * x),
+    lambda x: jnp.arctan2(x, -0.4),
+    lambda x: jnp.arctan2(-0.3, x),
+    lambda x: jnp.hypot(x, 0.4),
+    lambda x: jnp.logaddexp(x, 0.4),
+    lambda x: jnp.fmod(x, 0.3),
+    lambda x: jnp.mod(x, 0.3),
+    lambda x: x // 0.3,
+    lambda x: (x * 10).astype(int) % 3,
+    lambda x: (x * 10).astype(int) // 3,
+    lambda x: jnp.abs(x) ** 1.7,
+    lambda x: 2.0**x,
+    lambda x: x**3,
+    lambda x: x**-2,
+    lambda x: jnp.clip(x, -0.3, 0.9),
+    lambda x: jnp.where(x > 0.5, x, 2 * x),
+    lambda x: jnp.maximum(x, 0.3),
+    lambda x: jnp.where((x > 0.0) ^ (x > 1.0), 1.0, 2.0),
+    lambda x: jnp.select([x > 1.0, x > 0.0], [x, 2 * x], 0.1),
+    lambda x: jnp.prod(jnp.stack([x, x + 1.0])),
+    lambda x: jnp.cumsum(jnp.stack([x, x * x, 1.0])),
+    lambda x: jnp.argmax(jnp.stack([0.2, x])),
+    lambda x: jnp.cumprod(jnp.stack([x, x + 1.0])),
+    lambda x: jnp.mean(jnp.stack([x, x * x])),
+    lambda x: jnp.argmin(jnp.stack([0.2, x])),
+    lambda x: jax.lax.cond(x > 0.5, lambda y: y, lambda y: 2 * y, x),
+    lambda x: jnp.heaviside(x, 0.5),
+    lambda x: jnp.linalg.norm(x * jnp.arange(3)),
+    lambda x: jax.lax.switch((x > 0.0).astype(int) + (x > 1.0), [jnp.sin, jnp.cos, jnp.square], x),
+)
+"""Of one number: what a controller of one's own may use."""
+
+
+@component
+class EveryFunction(Controller):
+    """Its state is what they are of the error."""
+
+    def _values(self, x):
+        return tuple(jnp.asarray(f(x), dtype=float) for f in FUNCTIONS)
+
+    def init(self, x0, u0):
+        return tuple(0.0 * v for v in self._values(jnp.asarray(0.7)))
+
+    def step(self, state, tick, estimate):
+        return (jnp.tanh(estimate.x[0]),), self._values(estimate.x[0] - tick.r[0])
+
+
+def own():
+    """The case, and the errors at which it is tried."""
+    case = presets.find("cascaded/pi")
+    return case.replace(loop=dataclasses.replace(case.loop, controller=EveryFunction())), (
+        -1.7,
+        -0.61,
+        0.23,
+        0.7,
+        1.37,
+        2.06,
+    )
+
+
+def expected(error):
+    return np.concatenate([np.ravel(f(jnp.float64(error))).astype(float) for f in FUNCTIONS])
+
+
+@needs_gcc
+def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
+    case, errors = own()
+    code = Compiled(case, tmp_path)
+    for error in errors:
+        y, zero, u = np.array([error + 3.0, 1.0]), np.zeros(1), np.zeros(1)
+        code.library.law_init(code.pointer(code.state), code.pointer(y), code.pointer(u))
+        code.library.law_step(
+            code.pointer(code.state),
+            code.real(0.0),
+            *map(code.pointer, (y, np.array([3.0]), zero, zero, u)),
+        )
+        np.testing.assert_allclose(code.state, expected(y[0] - 3.0), rtol=1e-12, atol=1e-15)
+
+
+def test_matlab_of_the_functions_that_a_controller_of_ones_own_may_use():
+    case, errors = own()
+    law = matlab(export(case, "m"))
+    for error in errors:
+        _, state = law(None, 0.0, [error + 3.0, 1.0], [3.0], [0.0], [0.0], [0.0])
+        np.testing.assert_allclose(state, expected(error + 3.0 - 3.0), rtol=1e-12, atol=1e-15)
+
+
+def test_what_cannot_be_exported_is_told():
+    with pytest.raises(InputError, match="plays a signal back"):
+        export(presets.find("cascaded/open-loop"))
+    for option, words in (
+        ({"language": "rust"}, "must be one of c, m"),
+        ({"precision": "half"}, "double, float"),
+        ({"name": "2x"}, "--name"),
+    ):
+        with pytest.raises(InputError, match=words):
+            export(presets.find("cascaded/pi"), **option)
+
+
+def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
+    assert (
+        main.main(
+            [
+                "export",
+                "gouta2015/backstepping",
+                "--set",
+                "controller.k1=0.01",
+                "--lang",
+                "c",
+                "--out",
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
+    text = (tmp_path / "gouta2015_backstepping.c").read_text()
+    assert (
+        "controller.k1 = 0.01 1/s" in text
+        and "measured levels [cm]" in text
+        and "pump inputs [V]" in text
+    )
+    assert main.main(["export", "gouta2015/backstepping", "--lang", "m"]) == 0
+    assert capsys.readouterr().out.startswith("function [u, s] = gouta2015_backstepping(")
+    assert main.main(["export", "gouta2015/backstepping", "--lang", "rust"]) == 2
+
+
+HOSTILE_RIG = """
+name = {name}
+units = ["cm", "V"]
+
+[[tank]]
+name = "t*/ int taken = 1; /*"
+area = 20.0
+rim = 40.0
+drain = 2.0
+
+[[pump]]
+name = "??/"
+gain = 5.0
+to = 1
+low = 0.0
+high = 12.0
+
+[plant]
+gravity = 0.5
+
+[law]
+kind = "pid"
+Kc = 1.6
+Ti = 10.0
+"""
+HOSTILE = [
+    "t*/ int taken(void) { return 1; } /*",
+    "t*\\/ int taken(void) { return 1; } /*",
+    "t**//* /*/ int taken(void) { return 1; } /*",
+    "t*??/",
+    "t ??/ ??( ??) \\",
+    "t %{ %} ... '' \" ??'",
+]
+
+
+def exported(folder, name, language):
+    """The text that `jaxtank export` writes of a rig with a hostile name."""
+    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_words.toml(name)))
+    words = [
+        "export",
+        str(folder / "rig.toml"),
+        "--lang",
+        language,
+        "--name",
+        "law",
+        "--out",
+        str(folder / "out"),
+        "--quiet",
+    ]
+    assert main.main(words) == 0
+    return (folder / "out" / f"law.{language}").read_text()
+
+
+@needs_gcc
+@pytest.mark.parametrize("standard", ["c99", "gnu99"])  # with trigraphs and without
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_stays_within_the_comment_of_c(name, standard, tmp_path):
+    text = exported(tmp_path, name, "c")
+    flags = [
+        f"-std={standard}",
+        "-pedantic",
+        "-O1",
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        "-Wno-unused-function",
+        "-Wno-unused-variable",
+    ]
+    (tmp_path / "law.c").write_text(text)
+    made = subprocess.run(
+        [GCC, *flags, "-c", "-o", tmp_path / "law.o", tmp_path / "law.c"],
+        capture_output=True,
+        text=True,
+    )
+    assert made.returncode == 0, made.stderr
+    symbols = subprocess.run(
+        ["nm", "-g", "--defined-only", tmp_path / "law.o"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert {line.split()[-1] for line in symbols.stdout.splitlines()} == {"law_init", "law_step"}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_name_stays_within_the_comments_of_matlab_and_of_c(name, tmp_path):
+    """One comment, which ends in its last line, in C; every line before the first statement begins
+    with % in MATLAB.
+    """
+    text = exported(tmp_path, name, "c")
+    head, after = text.split("*/", 1)
+    assert (
+        head.startswith("/*")
+        and "/*" not in head[2:]
+        and after.startswith("\n#include <math.h>")
+        and "taken" not in after
+    )
+    assert not re.search(r"\\|\?\?", text)
+    text = exported(tmp_path, name, "m")
+    body = [line for line in text.splitlines()[1:] if not line.startswith("% ") and line != "%"]
+    assert "taken" not in "\n".join(body) and body[0].strip() == "if isempty(s)"
+
+
+@pytest.mark.parametrize(
+    "separator", ["\n", "\r", "\v", "\f", "\x1c", "\x85", "\u2028", "\u2029", "\0", "\ud800"]
+)
+def test_a_line_break_in_the_name_of_a_case_ends_no_comment(separator):
+    """A rig file may not hold one; a Case made in Python may."""
+    case = dataclasses.replace(
+        presets.find("cascaded/pi"),
+        name=f"t{separator}taken = 1;",
+        title=f"t{separator}taken = 1; */",
+    )
+    for language, marks in (("c", (" *", "/*")), ("m", ("%",))):
+        lines = export(case, language, name="law").split("\n")
+        assert all(line.startswith(marks) for line in lines if "taken" in line)
+        assert len(lines) == len(
+            export(presets.find("cascaded/pi"), language, name="law").split("\n")
+        )
+        "\n".join(lines).encode()
+
+
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "V*/ int taken; /*",
+        "V\\\\",
+        "??/",
+        "$\\\\x{$",
+        "cm, V",
+        "<b>",
+        "V\\u2028",
+        "a" * 41,
+        "^2",
+        "V V V*",
+    ],
+)
+def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
+    text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
+    (tmp_path / "rig.toml").write_text(text)
+    assert main.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr()
+    assert (
+        said.out == ""
+        and said.err.count("\n") == 1
+        and "units: entry = " in said.err
+        and not (tmp_path / "out").exists()
+    )
+
+
+def test_units_of_rigs_are_taken():
+    known = [
+        "cm",
+        "V",
+        "U0",
+        "m^3/s",
+        "cm^3/(s V)",
+        "L/min",
+        "%",
+        "-",
+        "°C",
+        "m³/s",
+        "ml / s",
+        "(m^3/s)^2",
+        "m^0.5",
+    ]
+    assert [units.check_unit("unit", one) for one in known] == known
+    with pytest.raises(InputError, match=r"plant\.units: entry = 'cm\*/'"):
+        network(area=1.0, drain=1.0, pump_gain=1.0, feeds=[(0, None)], rim=1.0, units=("cm*/", "V"))
+
+
+@pytest.mark.parametrize("name", ["end", "max", "pick", "s"])
+def test_a_matlab_function_is_not_called_what_matlab_or_the_file_has(name):
+    """Its file would not be read, or would call itself."""
+    case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
+    with pytest.raises(InputError, match=f"--name '{name}'"):
+        export(case, "m")
+    assert f"void {name}_step(" in export(case, "c")
+
+
+@pytest.mark.parametrize("name", ["2 tanks", "日本"])
+def test_a_case_whose_name_is_none_of_the_language_asks_for_one(name):
+    case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
+    with pytest.raises(InputError, match=f"'{name}' gives no name for the function; --name NAME"):
+        export(case)
+    assert "void law_step(" in export(case, name="law")
+
+
+@pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])
+def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
+    assert main.main(
+        ["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]
+    ) == (2 if name else 0)
+    assert (tmp_path / "out").exists() is not bool(name)

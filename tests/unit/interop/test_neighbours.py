@@ -1,0 +1,258 @@
+"""Doors to other libraries: python-control, tables, Gymnasium."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.interop import python_control
+
+
+def test_python_control_sees_the_linearised_rig():
+    """mirakhorli at 12/12: zeros and steady gain of mirakhorli notes S2.3; poles from the printed
+    time constants.
+    """
+    control = pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    system = python_control.to_control(plant, setpoints=(12.0, 12.0))
+    assert sorted(control.zeros(system).real) == pytest.approx([-0.10717, 0.02467], abs=1e-5)
+    np.testing.assert_allclose(
+        control.dcgain(system), [[3.5849, 4.0151], [4.9506, 2.0684]], atol=1e-4
+    )
+    np.testing.assert_allclose(
+        sorted(-1 / control.poles(system).real), [19.0178, 33.4252, 43.2223, 43.2223], atol=1e-3
+    )
+    assert system.state_labels == ["h1", "h2", "h3", "h4"] and system.input_labels == [
+        "pump1",
+        "pump2",
+    ]
+
+
+def test_an_operating_point_is_asked_for():
+    pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    for options in (
+        {},
+        {"setpoints": (12.0, 12.0), "levels": (1.0,) * 4},
+        {"setpoints": (12.0,)},
+        {"outputs": (0, 1)},  # which levels are outputs: no operating point
+        {"outputs": (0, 4), "setpoints": (12.0, 12.0)},
+        {"outputs": (12.0, 12.0)},
+        {"levels": (1.0,) * 4},
+        {"levels": (1.0,) * 3, "inputs": (1.0, 1.0)},
+    ):
+        with pytest.raises(InputError, match="to_control"):
+            python_control.to_control(plant, **options)
+
+
+def test_outputs_of_the_system_are_indices_of_tanks_as_those_of_the_plant():
+    pytest.importorskip("control")
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    system = python_control.to_control(plant, [3, 0], setpoints=(12.0, 12.0))
+    assert system.output_labels == ["y_h4", "y_h1"]
+    np.testing.assert_array_equal(system.C, [[0, 0, 0, 1], [1, 0, 0, 0]])
+    np.testing.assert_allclose(system.A, python_control.to_control(plant, setpoints=(12.0, 12.0)).A)
+    with pytest.raises(
+        InputError, match=r"outputs = \[12.0, 12.0\]: must be indices .* given as setpoints"
+    ):
+        python_control.to_control(plant, [12.0, 12.0])
+
+
+def test_columns_of_a_run_have_units():
+    case = rig.set_values(
+        presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0}
+    )
+    run = jaxtank.simulate(case.loop, case.clock)
+    found = python_control.columns(run, case.loop.units)
+    assert {"t [s]", "h1 [m]", "r1 [m]"} <= set(found) and len(
+        {len(v) for v in found.values()}
+    ) == 1
+    np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
+
+
+def test_columns_share_one_dimension_where_it_is_named():
+    """As xarray takes them: (dimension, values, attributes), time the coordinate of the dimension's
+    name.
+    """
+    case = rig.set_values(
+        presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0}
+    )
+    run = jaxtank.simulate(case.loop, case.clock)
+    found = python_control.columns(run, case.loop.units, dimension="t")
+    flat = python_control.columns(run, case.loop.units)
+    assert {dims for dims, _, _ in found.values()} == {"t"}
+    assert [f"{name} [{attrs['units']}]" for name, (_, _, attrs) in found.items()] == list(flat)
+    for (_, values, _), wanted in zip(found.values(), flat.values()):
+        np.testing.assert_array_equal(values, wanted)
+    xarray = pytest.importorskip("xarray")
+    data = xarray.Dataset(found)
+    assert dict(data.sizes) == {"t": len(flat["t [s]"])} and set(data.coords) == {"t"}
+    assert (
+        float(data.h1.sel(t=20.0, method="nearest"))
+        == flat["h1 [m]"][int(np.abs(flat["t [s]"] - 20.0).argmin())]
+    )
+
+
+def test_the_environment_plays_the_case():
+    """With the law's own inputs as actions, the levels are those of the closed loop; and
+    Gymnasium's own checker has no complaint.
+    """
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    from jaxtank.interop.gymnasium import TankEnv
+
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 150.0}
+    )
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
+    env = TankEnv(case)
+    env.reset(seed=0)
+    low, high = np.asarray(case.loop.actuator.low), np.asarray(case.loop.actuator.high)
+    total, k, ended = 0.0, 0, False
+    while not ended:
+        _, reward, broken, ended, info = env.step(2 * (run.applied[k] - low) / (high - low) - 1)
+        k, total = k + 1, total + reward
+        np.testing.assert_allclose(info["x"], run.x[k], atol=1e-9)
+        assert not broken and info["t"] == pytest.approx(run.t[k])
+    assert k == case.clock.samples - 1
+    assert total == pytest.approx(
+        -np.sum(np.mean((run.e[1:] / 30.0) ** 2, axis=1))
+        - 100 * np.sum(np.maximum(run.x[1:] - 30, 0) ** 2 / 900),
+        rel=1e-6,
+    )
+    check_env(TankEnv(case), skip_render_check=True)
+
+
+EPISODES = {
+    # an outlet that closes, a leak, an orifice that is another one
+    "calofir/backstepping-perturbed": {"clock.duration": 1050.0},
+    # a weak pump, inflows, an ADC, a dead zone
+    "gouta2022/chadpc": {"clock.dt": 0.2, "clock.duration": 500.0},
+    "gouta2015/backstepping-boxqp": {"clock.dt": 0.5, "clock.duration": 150.0},
+    "mirakhorli/hybrid": {"clock.duration": 100.0, "actuator.delay": 0.0},
+    "cascaded/pi": {"plant.rim[1]": 6.0},
+    "khalid/laguerre-constrained": {"clock.duration": 60.0},
+}
+
+
+def pumps_and_sensors(case):
+    """The case with all that stands between an action and a reading, in units of the rig."""
+    actuator, sensor, plant = case.loop.actuator, case.loop.sensor, case.loop.plant
+    reach, rim = np.asarray(actuator.high) - np.asarray(actuator.low), np.asarray(plant.rim)
+    pumps = dataclasses.replace(
+        actuator, lag=np.full(len(reach), 2.5 * case.clock.dt), delay=3 * case.clock.dt
+    )
+    gauges = dataclasses.replace(
+        sensor,
+        noise=0.01 * rim,
+        offset=0.02 * rim * (-1.0) ** np.arange(len(rim)),
+        gain=rim / 5.0,
+        bits=12,
+        full_scale=5.0,
+    )
+    return case.replace(loop=dataclasses.replace(case.loop, actuator=pumps, sensor=gauges))
+
+
+@pytest.mark.slow_for(
+    "calofir/backstepping-perturbed-lag-delay-noise-offset-adc",
+    "cascaded/pi-lag-delay-noise-offset-adc",
+    "gouta2015/backstepping-boxqp-lag-delay-noise-offset-adc",
+    "gouta2015/backstepping-boxqp-own",
+    "gouta2022/chadpc-own",
+    "khalid/laguerre-constrained-lag-delay-noise-offset-adc",
+    "khalid/laguerre-constrained-own",
+    "mirakhorli/hybrid-lag-delay-noise-offset-adc",
+    "mirakhorli/hybrid-own",
+)
+@pytest.mark.parametrize(
+    "change", [lambda case: case, pumps_and_sensors], ids=["own", "lag-delay-noise-offset-adc"]
+)
+@pytest.mark.parametrize("name", EPISODES)
+def test_an_episode_is_the_run_of_the_rig(name, change):
+    """Levels, readings, inputs and what is lost over the rims, with the controller's inputs as
+    actions and the seed of the run.
+    """
+    gymnasium = pytest.importorskip("gymnasium")
+    from jaxtank.interop.gymnasium import TankEnv
+
+    case = change(rig.set_values(presets.find(name), EPISODES[name]))
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(5)))
+    low, high = np.asarray(case.loop.actuator.low), np.asarray(case.loop.actuator.high)
+    env = gymnasium.wrappers.OrderEnforcing(TankEnv(case))
+    seen, info = env.reset(seed=5)
+    rows, k, ended = [(seen[: run.x.shape[1]] * np.max(case.loop.plant.rim), info)], 0, False
+    while not ended:
+        seen, _, broken, ended, info = env.step(2 * (run.applied[k] - low) / (high - low) - 1)
+        rows.append((seen[: run.x.shape[1]] * np.max(case.loop.plant.rim), info))
+        assert not broken
+        k += 1
+    assert len(rows) == case.clock.samples
+    size = float(np.max(np.asarray(case.loop.plant.rim)))
+    found = {
+        field: np.array([info[field] for _, info in rows])
+        for field in ("t", "x", "y", "u", "e", "spilled")
+    }
+    np.testing.assert_allclose(found["x"], run.x, atol=1e-10 * size)
+    np.testing.assert_allclose(found["e"], run.e, atol=1e-10 * size)
+    np.testing.assert_allclose(found["t"], run.t)
+    np.testing.assert_allclose(found["y"], run.y, atol=1e-10 * size)
+    np.testing.assert_allclose([y for y, _ in rows], run.y, atol=1e-10 * size)
+    np.testing.assert_allclose(found["u"][1:], run.u[:-1], atol=1e-10 * float(np.max(np.abs(high))))
+    np.testing.assert_allclose(
+        found["spilled"], run.spilled, atol=1e-8 * max(1.0, run.spilled.max())
+    )
+    if name == "cascaded/pi":
+        assert run.spilled.max() > 0.0
+    if change is pumps_and_sensors:
+        assert np.abs(run.y - run.x).max() > 0.01 * size
+
+
+def test_noise_of_the_environment_follows_its_seed():
+    pytest.importorskip("gymnasium")
+    from jaxtank.interop.gymnasium import TankEnv
+
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"),
+        {"clock.dt": 0.5, "clock.duration": 10.0, "sensor.noise": 0.1},
+    )
+    env = TankEnv(case)
+    one, two, other = (env.reset(seed=s)[0] for s in (1, 1, 2))
+    assert np.array_equal(one, two) and not np.array_equal(one, other)
+
+
+def test_modules_are_reached_from_the_package_when_they_are_used():
+    """Nothing of them is imported with `jaxtank`; without gymnasium only its environment is
+    missing.
+    """
+    code = """
+import sys
+sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
+import jaxtank
+from jaxtank import *
+assert not {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"} & set(sys.modules)
+assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
+assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
+try:
+    jaxtank.environment
+except ImportError as error:
+    print(error)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.startswith("jaxtank.environment needs gymnasium: pip install gymnasium")
+
+
+def test_the_environment_is_reached_from_the_package():
+    pytest.importorskip("gymnasium")
+    ran = subprocess.run(
+        [sys.executable, "-c", "import jaxtank; print(jaxtank.environment.TankEnv.__name__)"],
+        capture_output=True,
+    )
+    assert ran.stdout.decode().strip() == "TankEnv", ran.stderr

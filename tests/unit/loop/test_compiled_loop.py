@@ -1,0 +1,430 @@
+"""The structural causes of speed, and that no transformation changes a result."""
+
+import os
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import loops_in
+
+import jaxtank
+from jaxtank.core.clock import Clock
+from jaxtank.core.kahan import nothing, plus, totals
+from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.run import evaluate_compiled, evaluate_for_reverse
+from jaxtank.xla import flags as _xla
+from jaxtank.xla import hoist
+from jaxtank.xla.barrier import materialised
+from tuning.bench import bench
+
+MEASURES = ("rms_error_total", "max_level")
+GAINS = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
+
+
+@pytest.mark.parametrize("name", ["ngpc", "backstepping", "backstepping-ff", "ngpc-boxqp"])
+def test_the_loop_compiles_to_one_function(gouta, name):
+    case = gouta(name)
+    assert (
+        loops_in(evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False).compile())
+        >= 1
+    )
+
+
+def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
+    """Two calls: the random generator has a loop of its own."""
+    from jaxtank.measures import MEASURES as every
+    from jaxtank.measures import serves
+
+    case = gouta(
+        "ngpc",
+        {
+            "actuator.delay": 1.0,
+            "actuator.lag": 0.5,
+            "actuator.dead_zone": 1.0,
+            "sensor.noise": 0.01,
+            "sensor.bits": 12,
+        },
+    )
+    names = tuple(m for m in every if serves(m, case.loop))
+    assert (
+        loops_in(
+            evaluate_compiled.lower(
+                case.loop, case.clock, names, jax.random.key(0), False
+            ).compile()
+        )
+        >= 2
+    )
+
+
+def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
+    case = gouta("backstepping")
+    assert (
+        loops_in(
+            sensitivities_compiled.lower(
+                case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None
+            ).compile()
+        )
+        >= 1
+    )
+
+
+def test_other_gains_do_not_recompile(gouta):
+    case = gouta("backstepping", {"clock.duration": 20.0})
+    jaxtank.evaluate(case.loop, case.clock, MEASURES)
+    before = evaluate_compiled._cache_size()
+    for k in (0.01, 0.2, 3):
+        jaxtank.evaluate(
+            jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17}),
+            case.clock,
+            MEASURES,
+        )
+    jaxtank.evaluate(
+        gouta("backstepping-table1", {"clock.duration": 20.0}).loop, case.clock, MEASURES
+    )
+    assert evaluate_compiled._cache_size() == before
+
+
+def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
+    """The only arrays as long as the run are the samples of the reference."""
+    sizes = []
+    for duration in (100.0, 1200.0):
+        case = gouta("backstepping", {"clock.duration": duration})
+        stats = (
+            evaluate_compiled.lower(case.loop, case.clock, MEASURES, None, False)
+            .compile()
+            .memory_analysis()
+        )
+        sizes.append(stats.temp_size_in_bytes / case.clock.samples)
+    assert max(sizes) < 8 * 8  # bytes per sample: at most eight float64 arrays of inputs
+
+
+def test_a_gradient_of_two_gains_takes_less_than_ten_megabytes(gouta):
+    case = gouta("backstepping")
+    stats = (
+        sensitivities_compiled.lower(
+            case.loop, case.clock, MEASURES, tuple(GAINS), tuple(GAINS.values()), None
+        )
+        .compile()
+        .memory_analysis()
+    )
+    assert stats.temp_size_in_bytes < 10e6
+    reverse = jax.jit(
+        jax.grad(
+            lambda k1: evaluate_for_reverse(
+                jaxtank.with_values(case.loop, {"controller.k1": k1}), case.clock, MEASURES
+            )["rms_error_total"]
+        )
+    )
+    assert reverse.lower(0.088).compile().memory_analysis().temp_size_in_bytes < 10e6
+
+
+def test_invariant_work_leaves_the_loop_and_nothing_else_changes():
+    """Coefficients are computed before the loop, once each; results and derivatives are those of
+    jax.lax.scan.
+    """
+
+    def run(scan, a, b):
+        def body(carry, x):
+            c = jnp.sqrt(a / b)  # invariant
+            same = jnp.sqrt(a / b)  # and again
+            return carry * c + same * jnp.sin(x), carry
+
+        return scan(body, jnp.float64(1.0), jnp.arange(7.0), length=7)
+
+    def loop_of(scan):
+        jaxpr = jax.make_jaxpr(lambda a, b: run(scan, a, b))(2.0, 3.0)
+        return [e for e in jaxpr.eqns if e.primitive.name == "scan"][0].params["jaxpr"].jaxpr, jaxpr
+
+    inside, whole = loop_of(hoist.scan)
+    assert not {"sqrt", "div"} & {e.primitive.name for e in inside.eqns}
+    assert [e.primitive.name for e in whole.eqns].count("sqrt") == 1
+    assert {"sqrt", "div"} <= {e.primitive.name for e in loop_of(jax.lax.scan)[0].eqns}
+    plain, lean = (run(s, 2.0, 3.0) for s in (jax.lax.scan, hoist.scan))
+    np.testing.assert_allclose(lean[0], plain[0], rtol=1e-15)
+    np.testing.assert_allclose(lean[1], plain[1], rtol=1e-15)
+    for derivative in (jax.grad, jax.jacfwd):
+        a, b = (
+            derivative(lambda a, s=s: run(s, a, 3.0)[0])(2.0) for s in (jax.lax.scan, hoist.scan)
+        )
+        np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def test_vmap_equals_a_python_loop(gouta):
+    case = gouta("ngpc", {"clock.dt": 0.1})
+    horizons = np.array([4.0, 11.0, 30.0])
+    run = lambda Tp: jaxtank.evaluate(
+        jaxtank.with_values(case.loop, {"controller.Tp": Tp}), case.clock, MEASURES
+    )
+    batch = jax.vmap(run)(horizons)
+    for i, Tp in enumerate(horizons):
+        for name, value in run(Tp).items():
+            np.testing.assert_allclose(batch[name][i], value, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_jit_equals_no_jit(gouta):
+    case = gouta(
+        "backstepping",
+        {"clock.dt": 0.1, "clock.duration": 4.0, "reference.ramp": 2.0, "reference.targets": 9.0},
+    )
+    compiled = jaxtank.evaluate(case.loop, case.clock, MEASURES)
+    outer = jax.jit(lambda loop: jaxtank.evaluate(loop, case.clock, MEASURES))(case.loop)
+    with jax.disable_jit():
+        plain = jaxtank.evaluate(case.loop, Clock(dt=0.1, duration=4.0), MEASURES)
+    for name in MEASURES:
+        np.testing.assert_allclose(outer[name], compiled[name], rtol=1e-12)
+        np.testing.assert_allclose(plain[name], compiled[name], rtol=1e-12)
+
+
+def test_a_run_repeats_bit_for_bit(gouta):
+    case = gouta("ngpc", {"sensor.noise": 0.02, "clock.duration": 100.0})
+    one, two = (
+        jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(5)) for _ in range(2)
+    )
+    other = jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(6))
+    assert all(np.array_equal(one[m], two[m]) for m in MEASURES)
+    assert one["rms_error_total"] != other["rms_error_total"]
+
+
+def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
+    case = gouta("backstepping", {"clock.duration": 400.0})
+    values = jaxtank.evaluate(
+        case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"]
+    )
+    run = jaxtank.simulate(case.loop, case.clock)
+    e, u = np.asarray(run.e), np.asarray(run.u)
+    np.testing.assert_allclose(values["rms_error"], np.sqrt((e**2).mean(axis=0)), rtol=1e-10)
+    np.testing.assert_allclose(values["iae"], np.abs(e).sum(axis=0) * 0.01, rtol=1e-10)
+    np.testing.assert_allclose(values["rms_input"], np.sqrt((u**2).mean(axis=0)), rtol=1e-10)
+    np.testing.assert_allclose(
+        values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9
+    )
+    np.testing.assert_allclose(values["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-12)
+    carried, _, _, broken = jaxtank.sensitivities(
+        case.loop, case.clock, ["rms_error", "max_level"], GAINS
+    )
+    assert not broken
+    for m in ("rms_error", "max_level"):
+        np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
+
+
+@pytest.mark.parametrize("save_every", [1, 7, 100, 5000])
+def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
+    case = gouta("ngpc", {"clock.duration": 30.0})
+    every = jaxtank.simulate(case.loop, case.clock)
+    some = jaxtank.simulate(case.loop, case.clock, save_every=save_every)
+    assert len(some.t) == (case.clock.samples - 1) // save_every + 1
+    for a, b in zip(some, every):
+        np.testing.assert_allclose(a, np.asarray(b)[::save_every], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "flags, expected",
+    [
+        ("", f"--xla_backend_extra_options={_xla.OPTION}"),
+        ("--xla_foo=1", f"--xla_foo=1 --xla_backend_extra_options={_xla.OPTION}"),
+        (
+            "--xla_backend_extra_options=a=1 --b",
+            f"--xla_backend_extra_options=a=1,{_xla.OPTION} --b",
+        ),
+        (
+            f"--xla_backend_extra_options={_xla.KEY}=5",
+            f"--xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED}",
+        ),
+        (
+            f"--xla_backend_extra_options={_xla.OPTION}",
+            f"--xla_backend_extra_options={_xla.OPTION}",
+        ),
+        (
+            '--xla_dump_to="/a  b" --xla_backend_extra_options=a',
+            f'--xla_dump_to="/a  b" --xla_backend_extra_options=a,{_xla.OPTION}',
+        ),
+        ("/a/file/of/flags", "/a/file/of/flags"),
+    ],
+)
+def test_the_option_joins_what_the_user_set(flags, expected):
+    assert _xla.append_option(flags) == expected
+
+
+def python(code, *words, **env):
+    """Run code in a fresh process; (stdout, stderr)."""
+    clean = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", _xla.SWITCH)}
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        capture_output=True,
+        text=True,
+        env={**clean, **env},
+        check=True,
+    )
+    return done.stdout.strip(), done.stderr
+
+
+def test_the_option_is_set_on_import_and_can_be_switched_off():
+    show = "import jaxtank, os; print(os.environ.get('XLA_FLAGS', ''))"
+    assert _xla.OPTION in python(show)[0]
+    assert python(show, JAXTANK_XLA_OPTION="0")[0] == ""
+
+
+def test_a_late_import_warns_once():
+    late = (
+        "import jax; jax.numpy.zeros(1).block_until_ready(); import jaxtank, jaxtank.loop.run,"
+        " tuning"
+    )
+    assert python(late)[1].count("jax had started before jaxtank") == 1
+    assert "jax had started" not in python("import jax; import jaxtank")[1]
+
+
+def test_the_option_off_gives_the_same_numbers():
+    code = (
+        "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import"
+        " presets, Clock\ncase ="
+        " presets.find('gouta2015/ngpc')\nprint(float(jaxtank.evaluate(case.loop, Clock(dt=0.1,"
+        " duration=300.0), 'rms_error_total')['rms_error_total']).hex())"
+    )
+    on, off = (float.fromhex(python(code, JAXTANK_XLA_OPTION=v)[0]) for v in "10")
+    np.testing.assert_allclose(on, off, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_float32_keeps_what_rounding_takes_and_says_what_is_lost():
+    """Levels, error and its slope of a run in float32 beside float64. Plain float32 sums are 5e-3
+    cm and 6e-5 off (methods 2.5).
+    """
+    code = (
+        "import jax, jaxtank, sys; jax.config.update('jax_enable_x64', sys.argv[1] == '64'); from"
+        " jaxtank import presets\ncase = presets.find('gouta2015/backstepping'); run ="
+        " jaxtank.simulate(case.loop, case.clock, save_every=10_000)\nloop = lambda k:"
+        " jaxtank.with_values(case.loop, {'controller.k1': k})\nerror = lambda k:"
+        " jaxtank.evaluate(loop(k), case.clock,"
+        " 'rms_error_total')['rms_error_total']\nprint(run.x.dtype, *map(float, run.x.ravel()),"
+        " float(error(0.088)), float(jax.jacfwd(error)(0.088)))"
+    )
+    (single, err), (double, quiet) = python(code, "32"), python(code, "64")
+    assert single.split()[0] == "float32" and double.split()[0] == "float64"
+    assert "float32" in err and "jax_enable_x64" in err and not quiet
+    (*levels, error, slope), (*exact, true_error, true_slope) = (
+        [float(v) for v in words.split()[1:]] for words in (single, double)
+    )
+    assert np.abs(np.subtract(levels, exact)).max() < 3e-5
+    assert error == pytest.approx(true_error, rel=3e-6)
+    assert slope == pytest.approx(true_slope, rel=1e-4)
+
+
+def operations_in_lanes(program, lanes):
+    """Arithmetic on all lanes in the fused parts of a compiled program's largest loop body, and how
+    many calls wall them off.
+    """
+    text = program.as_text()
+    parts = {piece.split()[0]: piece for piece in text.split("\n\n") if piece.startswith("%")}
+    body = max((parts[name] for name in re.findall(r"body=(%[\w.-]+)", text)), key=len)
+    fused = [parts[name] for name in re.findall(r"calls=(%[\w.-]+)", body)]
+    done = re.findall(
+        rf"= f64\[{lanes}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused)
+    )
+    return len(done), sum(
+        " call(" in line and 'inlineable="false"' in line for line in body.splitlines()
+    )
+
+
+def test_what_several_read_is_made_once(gouta):
+    """Without the walls the parts of this loop repeat most of the step: about 1000 operations on
+    every lane instead of 550.
+    """
+    case = gouta("backstepping", {"clock.duration": 2.0})
+    gains = {
+        "controller.k": np.full(64, 0.03),
+        "plant.drain": np.tile(case.loop.plant.drain, (64, 1)),
+    }
+    run = jax.vmap(
+        lambda v: evaluate_compiled(
+            jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False
+        )
+    )
+    count, walls = operations_in_lanes(jax.jit(run).lower(gains).compile(), 64)
+    assert walls == 4  # the voltages, and the rates of three Runge-Kutta stages
+    assert 250 < count < 650
+
+
+def test_materialised_values_pass_every_transformation():
+    f = lambda x: materialised({"a": jnp.sin(x), "b": (x * x,)})
+    g = lambda x: f(x)["a"] * f(x)["b"][0]
+    x = 0.7
+    slope = np.cos(x) * x * x + 2 * x * np.sin(x)
+    assert jax.jit(g)(x) == pytest.approx(np.sin(x) * x * x, rel=1e-15)
+    looped = lambda y: jax.lax.scan(lambda c, _: (g(c), None), y, None, 1)[0]
+    for found in (
+        jax.grad(g)(x),
+        jax.jacfwd(g)(x),
+        jax.vmap(jax.grad(g))(jnp.array([x]))[0],
+        jax.grad(looped)(x),
+        jax.jacfwd(looped)(x),
+    ):
+        assert found == pytest.approx(slope, rel=1e-14)
+
+
+def test_bench_says_why_a_loop_is_slow(gouta):
+    """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the
+    fault.
+    """
+
+    def program(body):
+        return (
+            jax.jit(lambda x: jax.lax.scan(lambda c, _: (body(c), None), x, None, length=50)[0])
+            .lower(jnp.eye(2))
+            .compile()
+            .as_text()
+        )
+
+    plain, solving = (
+        program(lambda c: 0.5 * c),
+        program(lambda c: jnp.linalg.solve(c + 3.0 * jnp.eye(2), c)),
+    )
+    assert bench.reasons(plain, 50, True, np.float64, 0) == []
+    assert "custom-call" in bench.reasons(solving, 50, True, np.float64, 0)[0]
+    assert "JAXTANK_XLA_OPTION" in bench.reasons(solving, 50, False, np.float64, 0)[0]
+    assert "no faster" in bench.reasons(plain, 50, True, np.float32, 0)[0]
+    assert "3 of 3" in bench.reasons(plain, 50, True, np.float64, 3)[0]
+    found = bench.measure_cases({"a": gouta("backstepping", {"clock.duration": 20.0})}, rounds=1)[
+        "a"
+    ]
+    assert found["one_function"] and found["reasons"] == []
+
+
+def test_compensated_sums_lose_nothing():
+    """A million terms of 1e-4 on 10 in float32: the plain sum is lost by a percent."""
+    term, count = jnp.float32(1e-4), 1_000_000
+    kept = jax.lax.fori_loop(
+        0,
+        count,
+        lambda _, s: plus(s, term),
+        nothing(jnp.float32(0.0))._replace(total=jnp.float32(10.0)),
+    )
+    plain = jax.lax.fori_loop(0, count, lambda _, s: s + term, jnp.float32(10.0))
+    exact = 10.0 + count * float(term)
+    assert abs(float(totals(kept)) - exact) < 1e-5
+    assert abs(float(plain) - exact) > 0.1
+    assert nothing(np.float64(0.0)) == 0.0
+
+
+def test_loops_over_lanes_stay_loops():
+    """LLVM would unroll sixteen lanes into sixteen single runs, 36 against 11 ns per step and lane:
+    the program is longer, and says so.
+    """
+    assert (
+        "xla_cpu_disable_loop_unrolling"
+        in python("import jaxtank, os; print(os.environ['XLA_FLAGS'])")[0]
+    )
+    code = (
+        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank"
+        " import presets, Clock\nfrom jaxtank.loop import run as loop\ncase ="
+        " presets.find('gouta2015/backstepping'); clock = Clock(duration=2.0)\nrun ="
+        " jax.vmap(lambda k: loop.evaluate_and_flag(jaxtank.with_values(case.loop,"
+        " {'controller.k1': k}), clock, ('ise',)))\nprint(len(jax.jit(run).lower(np.linspace(0.1,"
+        " 0.2, 16)).compile().runtime_executable().serialize()))"
+    )
+    without = f"--xla_backend_extra_options={_xla.KEY}=100000000000"
+    assert int(python(code)[0]) < int(python(code, XLA_FLAGS=without, JAXTANK_XLA_OPTION="0")[0])

@@ -1,0 +1,86 @@
+"""What the page of a tuning over several plants or scenarios says: whose numbers they are, and what
+was measured apart from what was expected.
+"""
+
+import numpy as np
+import pytest
+
+import jaxtank
+import tuning
+from jaxtank import presets, rig
+from jaxtank.presets import Scenario
+from tuning.report import tuning as report
+from tuning.search.robust import Certificate, _words
+
+SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}
+RESTS = "; the other rows: the case's own run, on its own plant"
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig.set_values(
+        presets.load("cascaded").cases["pi"], {"clock.dt": 4.0, "clock.duration": 400.0}
+    )
+
+
+def row(page, name):
+    """The cells of the first row of that name: unit, before, after."""
+    return next(line for line in page.splitlines() if line.startswith(f"{name} ")).split()[1:]
+
+
+def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case):
+    result = tuning.tune_robust(case, samples=3, fresh=4, **SEARCH)
+    page = repr(result)
+    assert f"objective: the mean of 3 plants{RESTS}" in page
+    costs = [s["objective"]["after"] for s in report.scenario_rows(result)]
+    assert float(row(page, "objective")[2]) == pytest.approx(np.mean(costs), rel=1e-4)
+    alone = jaxtank.evaluate(result.tuned.loop, result.tuned.clock, ["max_error"])["max_error"]
+    assert float(row(page, "max_error")[2]) == pytest.approx(float(alone[0]), rel=1e-3)
+
+
+@pytest.mark.slow_for("weights0-the mean of 2 scenarios")
+@pytest.mark.parametrize(
+    ("weights", "words"),
+    [((1.0, 1.0), "the mean of 2 scenarios"), ((1.0, 3.0), "the weighted mean of 2 scenarios")],
+)
+def test_scenarios_are_told_as_such(case, weights, words):
+    scenarios = tuple(
+        Scenario(f"s{i}", {"controller.Kc": 1.0 + i}, weight=w) for i, w in enumerate(weights)
+    )
+    page = repr(
+        tuning.tune(
+            case,
+            free={"controller.Ti": (20.0, 2000.0, "log")},
+            scenarios=scenarios,
+            validation=0,
+            **SEARCH,
+        )
+    )
+    assert f"objective: {words}{RESTS}" in page
+
+
+def test_a_single_run_needs_no_such_line(case):
+    assert "other rows" not in repr(tuning.tune(case, validation=0, **SEARCH))
+
+
+def test_what_was_expected_is_not_said_of_what_was_measured():
+    """One plant of 16 at a limit: 1/17 is expected before a fresh one is run, 2 of 256 is what was
+    found.
+    """
+    known = Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028])
+    measured, bound, expected = _words(known, "worst", 0.0).split("; ")
+    assert (
+        measured
+        == "on 256 fresh plants a limit was broken 2 times (95 % interval 0.00095 to 0.028)"
+    )
+    assert "bounds the probability by 0.8 (N 16, support 1, confidence 1 - 1e-6)" in bound
+    assert expected.startswith(
+        "1 of 16 plants holds the answer in place: before any fresh one was run up to about 5.9 %"
+        " of them were"
+    )
+    assert "leaves" not in expected and "--back-off 0.03" in expected
+
+
+def test_nothing_is_expected_where_nothing_was_broken_or_a_back_off_was_kept():
+    assert "expected" not in _words(Certificate(16, 1, 0.8, 256, 0, [0.0, 0.0143]), "mean", 0.0)
+    assert "expected" not in _words(Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028]), "mean", 0.03)

@@ -1,0 +1,616 @@
+"""Rig files: what is written is read back whole, and what cannot be used is told in one line that
+names the file and the thing.
+"""
+
+import dataclasses
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from jaxtank import presets, rig
+from jaxtank.case import Free
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.files import LARGEST_TEXT
+from jaxtank.core.tree import parameters
+from jaxtank.rig.schema import toml
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import ramps
+
+HEAD = 'case = "gouta2015/backstepping"\n'
+
+
+def assert_same(a, b):
+    assert (a.name, a.clock) == (b.name, b.clock)
+    # components, static fields, absent leaves
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)
+    assert parameters(a.loop).keys() == parameters(b.loop).keys()
+    for name, value in parameters(a.loop).items():
+        other = parameters(b.loop)[name]
+        assert np.shape(value) == np.shape(other) and np.array_equal(value, other), name
+    assert a.limits.keys() == b.limits.keys()
+    assert all(np.array_equal(limit, b.limits[measure]) for measure, limit in a.limits.items())
+    assert {n: Free(*s) for n, s in a.free.items()} == {n: Free(*s) for n, s in b.free.items()}
+    assert dict(a.objective) == dict(b.objective)
+
+
+def round_trip(case, folder):
+    path = folder / "rig.toml"
+    rig.save(case, path)
+    assert path.read_text(encoding="utf-8") == rig.dump(case)
+    return rig.load(path)
+
+
+@pytest.mark.slow_for(
+    "khalid/gpc-constrained",
+    "khalid/gpc-mimo-constrained",
+    "khalid/gpc-mimo",
+    "khalid/gpc-nc2-constrained",
+    "khalid/gpc-nc2",
+    "khalid/gpc-nc30-constrained",
+    "khalid/gpc-nc30",
+    "khalid/laguerre-constrained",
+    "khalid/laguerre-mimo",
+    "khalid/laguerre",
+)
+@pytest.mark.parametrize("name", presets.names())
+def test_every_case_is_read_back_as_it_was_written(name, tmp_path):
+    case = presets.find(name)
+    assert_same(round_trip(case, tmp_path), case)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"actuator.dead_zone": 3.0, "actuator.dead_zone_kind": "hysteresis"},
+        {
+            "actuator.dead_zone[1]": 2.5,
+            "actuator.dead_zone_kind": "pulse",
+            "actuator.lag": [0.5, 1 / 3],
+        },
+        {"plant.overflow": True, "plant.rim": [30.0, 31.0, 32.0, 33.0]},
+        {"reference.ramp": 0.0},
+        {"reference.ramp": 12.5, "reference.shape": "quintic", "reference.targets[0]": 7.0},
+        {
+            "clock.dt": 0.1,
+            "clock.duration": 500,
+            "clock.substeps": 3,
+            "clock.integrator": "midpoint",
+        },
+        {
+            "actuator.saturation": "boxqp",
+            "actuator.delay": 0.5,
+            "sensor.noise": 0.02,
+            "sensor.bits": 12,
+        },
+        {"controller.k1": 1 / 3, "plant.area[2]": 1e5, "plant.pump_gain": 1e22, "plant.knee": 0.02},
+    ],
+    ids=lambda values: next(iter(values)),
+)
+def test_overrides_are_read_back(gouta, values, tmp_path):
+    case = gouta("backstepping-ff", values)
+    assert_same(round_trip(case, tmp_path), case)
+
+
+def test_a_clock_finer_than_its_preset_allows_is_read_back(gouta, tmp_path):
+    # each of the two is out of range beside the preset's other one: only together do they describe
+    # a run
+    for clock in (
+        Clock(dt=1e-5, duration=1.0),
+        Clock(dt=20.0, duration=10_000.0),
+        Clock(dt=0.001, duration=0.005),
+    ):
+        case = gouta("ngpc").replace(clock=clock)
+        assert round_trip(case, tmp_path).clock == clock
+
+
+def test_another_reference_limits_free_and_objective_are_read_back(gouta, tmp_path):
+    case = gouta("backstepping")
+    start, changes = (4.0, 5.0), [(30.0, 1, 6.0), (10.0, 0, 5.0), (30.0, 0, 7.0)]
+    case = case.replace(
+        name="mine",
+        loop=dataclasses.replace(
+            case.loop, reference=ramps(start, changes, ramp=25.0, shape="quintic")
+        ),
+        limits={
+            "max_level": [20.0, 21.0, 22.0, 23.0],
+            "min_level": 0.5,
+            "overshoot_percent": np.array([5.0, 6.0]),
+        },
+        free={
+            "controller.k": Free(0.001, 2.0),
+            "plant.area[1]": Free(10.0, 30.0, "linear"),
+            "x0": (0, 10, "linear"),
+        },
+        objective={"iae": 1, "input_travel": 0.25},
+    )
+    again = round_trip(case, tmp_path)
+    assert_same(again, case)
+    assert again.limits["max_level"] == [20.0, 21.0, 22.0, 23.0]
+    assert again.loop.reference.changes == ((10.0, 0), (30.0, 1), (30.0, 0))
+
+
+@pytest.mark.parametrize("name", ['a "rig" \\ of mine', "r\u00e9servoir \U0001f600", ""])
+def test_a_name_of_any_text_is_read_back(gouta, name, tmp_path):
+    assert round_trip(gouta("ngpc").replace(name=name), tmp_path).name == name
+
+
+@pytest.mark.parametrize(
+    "name", ["of\tmine", "two\nlines", "\x1b[2J", "\x7f", "an unprintable \U000e0001 tag"]
+)
+def test_a_name_that_a_terminal_would_obey_is_refused(gouta, name):
+    for said in (f"name = {toml(name)}", f"[[scenario]]\nname = {toml(name)}"):
+        with pytest.raises(InputError, match="printable") as caught:
+            rig.loads(f'case = "gouta2015/ngpc"\n{said}\n')
+        assert str(caught.value).isprintable()
+    with pytest.raises(InputError, match="printable"):
+        rig.dump(gouta("ngpc").replace(name=name))
+
+
+def test_a_case_that_no_file_can_describe_is_not_written(gouta):
+    case = gouta("ngpc")
+    case = case.replace(
+        loop=dataclasses.replace(case.loop, reference=Constant(level=np.array([3.0, 3.0])))
+    )
+    # no preset has such a reference, and [reference] makes ramps
+    with pytest.raises(InputError, match="cannot be written"):
+        rig.dump(case)
+
+
+def test_nothing_is_limited_or_free_if_the_tables_are_empty(gouta, tmp_path):
+    again = round_trip(gouta("ngpc").replace(limits={}, free={}), tmp_path)
+    assert again.limits == {} and again.free == {}
+
+
+def test_numbers_of_numpy_are_written_as_numbers(gouta, tmp_path):
+    case = gouta("ngpc").replace(
+        clock=Clock(dt=np.float64(0.1), duration=np.float64(100.0)),
+        free={"controller.Tp": Free(*np.array([1.0, 9.0]))},
+    )
+    again = round_trip(case, tmp_path)
+    assert again.clock == Clock(dt=0.1, duration=100.0)
+    assert Free(*again.free["controller.Tp"]) == Free(1.0, 9.0)
+
+
+def test_a_file_that_names_a_case_alone_is_that_case(tmp_path):
+    (tmp_path / "rig.toml").write_text(HEAD, encoding="utf-8")
+    assert_same(rig.load(tmp_path / "rig.toml"), presets.find("gouta2015/backstepping"))
+    assert_same(rig.open_case(str(tmp_path / "rig.toml")), presets.find("gouta2015/backstepping"))
+
+
+def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
+    text = (
+        HEAD + 'name = "mine"\n[values]\n"plant.area[1]" = 20\n"reference.ramp" ='
+        " 30\n[reference]\nchanges = [[50, 2, 4.5]]\n"
+    )
+    (tmp_path / "rig.toml").write_text(text, encoding="utf-8")
+    case, old = rig.load(tmp_path / "rig.toml"), presets.find("gouta2015/backstepping")
+    assert case.name == "mine"
+    assert case.loop.reference.changes == ((50.0, 1),) and case.loop.reference.ramp == 30.0
+    np.testing.assert_array_equal(case.loop.reference.targets, [4.5])
+    changed = {
+        n
+        for n, v in parameters(case.loop).items()
+        if not np.array_equal(v, parameters(old.loop)[n])
+    }
+    # the model is the plant's
+    assert changed == {"plant.area", "controller.model.area", "reference.targets"}
+    assert (case.clock, case.limits, case.free) == (old.clock, old.limits, old.free)
+
+
+@pytest.mark.parametrize(
+    "name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"]
+)
+def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
+    """Controller and observer; entries too. A file written of a case with a wrong model has it."""
+    case = presets.find(name)
+    gain, drain = 1.3 * case.loop.plant.pump_gain, 1.01 * case.loop.plant.drain[-1]
+    last = case.loop.plant.tanks - 1
+    text = (
+        f'case = "{name}"\n[values]\n"plant.pump_gain" = {gain.tolist()}\n"plant.drain[{last}]" ='
+        f" {drain}\n"
+    )
+    loop = rig.loads(text).loop
+    models = [
+        m for m in (loop.controller.model, getattr(loop.observer, "model", None)) if m is not None
+    ]
+    for model in models:
+        assert np.array_equal(model.pump_gain, gain) and model.drain[-1] == drain
+        np.testing.assert_array_equal(model.drain, loop.plant.drain)
+    apart = rig.loads(text + f'"controller.model.drain[{last}]" = 0.125\n').loop
+    assert apart.controller.model.drain[-1] == 0.125 and apart.plant.drain[-1] == drain
+    assert "model." not in rig.dump(case)
+    wrong = rig.set_values(case, {"plant.pump_gain": gain.tolist()})
+    assert_same(rig.loads(rig.dump(wrong)), wrong)
+    assert len([s for s in rig.doubts(wrong) if "model.pump_gain" in s]) == len(models)
+
+
+def test_a_model_of_a_rig_of_ones_own_follows_what_is_set(tmp_path):
+    text = """
+[[tank]]
+area = 10.0
+rim = 20.0
+drain = 0.2
+[[pump]]
+gain = 3.0
+to = 1
+high = 10.0
+[law]
+kind = "pid"
+Kc = 1.0
+Ti = 50.0
+[values]
+"plant.drain" = 0.3
+"""
+    case = rig.loads(text)
+    assert (
+        case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3
+        and rig.doubts(case) == []
+    )
+    wrong = rig.set_values(case, {"controller.model.drain": 0.2})
+    assert_same(rig.loads(rig.dump(wrong)), wrong)
+    assert rig.doubts(wrong) == []  # PID reads its model for the feed-forward alone
+    assert len(rig.doubts(rig.set_values(wrong, {"controller.feed_forward": True}))) == 1
+
+
+def test_values_relative_to_the_case_are_written_as_they_are():
+    changes = {
+        "plant.pump_gain[0]": "x1.3",
+        "x0": "steady",
+        "sensor.noise": "0.05 if zero",
+        "plant.drain[0]": "by -0.01",
+    }
+    case = presets.find("mirakhorli/sfc")
+    case = case.replace(scenarios=(case.scenarios[1]._replace(values=changes),))
+    assert rig.loads(rig.dump(case)).scenarios == case.scenarios
+    assert rig.loads(rig.complete(case)).scenarios == case.scenarios
+
+
+def values(line):
+    return f"{HEAD}[values]\n{line}\n"
+
+
+def reference(line):
+    return f"{HEAD}[reference]\n{line}\n"
+
+
+def limits(line):
+    return f"{HEAD}[limits]\n{line}\n"
+
+
+def free(line):
+    return f"{HEAD}[free]\n{line}\n"
+
+
+def objective(line):
+    return f"{HEAD}[objective]\n{line}\n"
+
+
+BIG = "9" * 400  # a whole number that no float holds
+
+BAD = {  # text of a file: words its message must have
+    "case = = 3": ["not TOML", "line 1"],
+    HEAD + HEAD: ["not TOML"],
+    "\0": ["not TOML"],
+    f"case = {'9' * 5000}": ["more digits than can be read"],
+    "a = " + "[" * 90_000: ["nested too deeply"],
+    values('"controller.k" = ' + "{a = " * 45_000): ["nested too deeply"],
+    values('"plant.area" = ' + "[" * 400 + "1" + "]" * 400): [],
+    "": ["case"],
+    'name = "x"': ["case"],
+    "case = 3": ["case = 3"],
+    'case = "gouta2015/backsteping"': ["gouta2015/backsteping", "nearest: gouta2015/backstepping"],
+    'case = "a\\nb"': ["unknown case"],
+    HEAD + "[valeus]": ["valeus", "nearest: values"],
+    HEAD + "values = 3": ["values = 3", "table"],
+    values('"controller.kk" = 1'): ["controller.kk", "nearest: controller.k"],
+    # without its quotation marks TOML reads a table
+    values("controller.kk = 1"): ["controller.kk", "nearest: controller.k"],
+    values('controller.k = 1\n"controller.k" = 2'): ["[values] controller.k is given twice"],
+    values('"plant.area[9]" = 1'): ["plant.area[9]", "(4,)"],
+    values('"plant.area[x]" = 1'): ["plant.area[x]"],
+    values('"clock.dtt" = 1'): ["clock.dtt", "nearest: clock.dt"],
+    values('"plant.links" = [1]'): ["plant.links", "topology"],
+    values('"controller.k" = "a"'): ["controller.k = 'a'", "number"],
+    values('"controller.k" = true'): ["controller.k = True", "number"],
+    values('"controller.k" = 2020-01-01'): ["controller.k", "number"],
+    values('"controller.k" = {a = 1}'): ["controller.k", "number"],
+    values('"controller.k" = nan'): ["controller.k = nan", "finite"],
+    values('"controller.k" = 0'): ["controller.k = 0 1/s", "above 0"],
+    values('"controller.k" = -1'): ["controller.k = -1 1/s", "above 0"],
+    values(f'"controller.k" = {BIG}'): ["controller.k"],
+    HEAD + '[log]\nh1 = "level"\nh2 = ["level", "cm"]': ["log h2 = 'level'", "h1 already"],
+    values('"controller.k" = [1.0]'): ["controller.k", "(1,)"],
+    values('"plant.area" = [1, 2, 3]'): ["plant.area", "(3,)", "(4,)"],
+    values('"plant.area" = [[1, 2], [3]]'): ["plant.area"],
+    values('"plant.area" = [1, inf, 1, 1]'): ["plant.area[1] = inf cm^2", "finite"],
+    values('"plant.area" = [1, 1, -1, 1]'): ["plant.area[2] = -1 cm^2", "above 0"],
+    values('"actuator.low" = 13'): ["actuator.low[0] = 13 V", "actuator.high[0] = 12 V"],
+    values('"actuator.saturation" = "clipp"'): ["actuator.saturation = 'clipp'", "clip, boxqp"],
+    values('"actuator.saturation" = ["clip"]'): ["actuator.saturation", "clip, boxqp"],
+    values('"actuator.saturation[0]" = "clip"'): ["actuator.saturation[0]"],
+    values('"plant.overflow" = 1'): ["plant.overflow = 1", "true"],
+    values('"plant.knee" = 0'): ["plant.knee = 0 cm", "at least 1e-15 cm"],
+    values('"plant.knee" = 1e-300'): ["plant.knee = 1e-300 cm", "at least 1e-15 cm"],
+    values('"controller.model.knee" = 1e-300'): [
+        "controller.model.knee = 1e-300 cm",
+        "at least 1e-15 cm",
+    ],
+    values('"sensor.bits" = 2.5'): ["sensor.bits = 2.5", "whole"],
+    values('"sensor.bits" = nan'): ["sensor.bits = nan"],
+    values('"sensor.bits" = inf'): ["sensor.bits = inf"],
+    values('"reference.ramp" = inf'): ["reference.ramp = inf"],
+    values(f'"reference.ramp" = {BIG}'): ["reference.ramp"],
+    values('"clock.dt" = nan'): ["clock.dt = nan"],
+    values('"clock.dt" = "x"'): ["clock.dt = 'x'", "number"],
+    values('"clock.duration" = 0'): ["clock.duration = 0"],
+    values(f'"clock.duration" = {BIG}'): ["clock.duration"],
+    values('"clock.substeps" = nan'): ["clock.substeps = nan"],
+    values('"clock.substeps" = inf'): ["clock.substeps = inf"],
+    values('"clock.substeps" = true'): ["clock.substeps = True"],
+    values('"clock.integrator" = "euler"'): ["clock.integrator = 'euler'", "rk4"],
+    reference("inital = [3, 3]"): ["inital", "nearest: initial"],
+    reference("initial = 3"): ["reference.initial = 3"],
+    reference("initial = [3, 3, 3]"): ["reference.initial = [3, 3, 3]"],
+    reference("initial = [[3], [3, 4]]"): ["reference.initial"],
+    reference("initial = [-1.0, 3.0]"): ["reference.initial[0] = -1 cm", "above 0"],
+    reference("initial = [nan, 3.0]"): ["reference.initial = [nan, 3.0]", "finite"],
+    reference('changes = "x"'): ["reference.changes = 'x'"],
+    reference("changes = [[20.0, 1, 0.0]]"): ["reference.targets[0] = 0 cm", "above 0"],
+    reference("changes = [[20.0, 1, nan]]"): ["reference.changes has [20.0, 1, nan]", "finite"],
+    reference("changes = [[20.0, 3, 5.0]]"): ["[20.0, 3, 5.0]", "from 1 to 2"],
+    reference("changes = [[20.0, 0, 5.0]]"): ["[20.0, 0, 5.0]", "from 1 to 2"],
+    reference("changes = [[20.0, 1.0, 5.0]]"): ["[20.0, 1.0, 5.0]"],
+    reference("changes = [[20.0, 1]]"): ["[20.0, 1]"],
+    reference('changes = [["a", 1, 5]]'): ["'a'"],
+    reference("changes = [[[20.0], 1, 5.0]]"): ["reference.changes", "[[20.0], 1, 5.0]"],
+    reference("changes = [[20.0, [1], 5.0]]"): ["reference.changes", "[20.0, [1], 5.0]"],
+    reference("changes = [[-1.0, 1, 5.0]]"): ["-1", "0 s"],
+    reference("changes = [[nan, 1, 5.0]]"): ["nan"],
+    reference("changes = [[inf, 1, 5.0]]"): ["inf"],
+    reference(f"changes = [[20.0, 1, {BIG}]]"): ["reference"],
+    reference("changes = [[30.0, 1, 5.0], [20.0, 2, 5.0]]"): [
+        "[20.0, 2, 5.0] after [30.0, 1, 5.0]",
+        "order of time",
+    ],
+    reference("changes = [[30.0, 1, 5.0], [30.0, 1, 6.0]]"): ["two changes of output 1 at 30 s"],
+    reference("ramp = -1"): ["reference.ramp = -1 s"],
+    reference("ramp = nan"): ["reference.ramp = nan"],
+    reference('ramp = "x"'): ["reference.ramp = 'x'"],
+    reference('shape = "cubic"'): ["reference.shape = 'cubic'", "quintic"],
+    limits("max_levl = 3"): ["max_levl", "nearest: max_level"],
+    limits("max_level = nan"): ["max_level", "nan"],
+    limits("max_level = inf"): ["max_level", "inf"],
+    limits("max_level = -1.0"): ["limit max_level = -1.0 cm", "at least 0 cm"],
+    limits("max_level = true"): ["max_level"],
+    limits('max_level = "high"'): ["max_level", "high"],
+    limits('rms_error = "rim"'): ["rms_error", "rim"],
+    limits("max_level = [1, 2]"): ["max_level", "4"],
+    limits("max_level = [[1], [2, 3]]"): ["max_level"],
+    limits('max_level = ["a", "b", "c", "d"]'): ["max_level"],
+    limits("max_level = {a = 1}"): ["max_level"],
+    limits("max_level = 2020-01-01"): ["max_level"],
+    free('"controller.kk" = [1, 2]'): ["controller.kk", "nearest: controller.k"],
+    free('"controller.k" = "a"'): ["controller.k", "'a'"],
+    free('"controller.k" = [1]'): ["controller.k", "[low, high]"],
+    free('"controller.k" = [[1], [2]]'): ["controller.k", "[low, high]"],
+    free('"controller.k" = [0.1, 1.0, "cubic"]'): ["controller.k", "cubic"],
+    free('"controller.k" = [5.0, 1.0]'): ["controller.k"],
+    free('"controller.k" = [nan, 1.0]'): ["controller.k", "nan"],
+    free('"controller.k" = [0.01, inf]'): ["controller.k", "inf"],
+    free('"controller.k" = [-1.0, 1.0]'): ["controller.k", "-1"],
+    free('"reference.ramp" = [1.0, 90.0]'): ["reference.ramp"],
+    free('"plant.area[9]" = [1.0, 30.0]'): ["plant.area[9]"],
+    free('"plant.area[x]" = [1.0, 30.0]'): ["plant.area[x]"],
+    objective("rms = 1"): ["rms", "nearest: "],
+    objective('rms_error = "a"'): ["objective rms_error = 'a'", "weight"],
+    objective("rms_error = -1"): ["rms_error", "-1"],
+    objective("rms_error = nan"): ["rms_error", "nan"],
+    objective("rms_error = 0"): ["objective"],
+}
+
+
+def label(text):
+    return re.sub(r"\s+", " ", text.removeprefix(HEAD))[:50]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD.items(), ids=map(label, BAD))
+def test_a_bad_file_is_told_in_one_line_that_names_it(text, words, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        rig.load(path)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert repr(str(path)) in message
+    for word in words:
+        assert word in message
+
+
+def test_a_reference_without_a_steady_state_names_outputs_and_tank(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        reference("initial = [3.0, 3.0]\nchanges = [[20.0, 1, 16.0]]"), encoding="utf-8"
+    )
+    with pytest.raises(EquilibriumError) as caught:
+        rig.load(path)
+    message = str(caught.value)
+    # tank 3 feeds both lower tanks: what keeps tank 1 at 16 cm is already too much for tank 2 at 3
+    # cm, so tank 4 would have to take
+    assert all(word in message for word in (repr(str(path)), "reference", "(16, 3) cm", "tank 4"))
+    assert len(message.splitlines()) == 1
+
+
+def test_a_change_that_has_an_equilibrium_only_with_its_pair_is_read_if_both_come_at_once(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(reference("changes = [[20.0, 1, 16.0], [20.0, 2, 16.0]]"), encoding="utf-8")
+    np.testing.assert_array_equal(
+        rig.load(path).loop.reference.plateaus(), [[3.0, 3.0], [16.0, 16.0]]
+    )
+
+
+def unreadable(path, prepare):
+    prepare(path)
+    with pytest.raises(InputError) as caught:
+        rig.load(path)
+    assert len(str(caught.value).splitlines()) == 1
+    assert repr(str(path)) in str(caught.value)
+    return str(caught.value)
+
+
+def test_what_is_no_text_file_is_told(tmp_path):
+    assert "does not exist" in unreadable(tmp_path / "missing.toml", lambda p: None)
+    assert "does not exist" in unreadable(tmp_path / "nul\0.toml", lambda p: None)
+    assert "not a file" in unreadable(tmp_path / "folder.toml", lambda p: p.mkdir())
+    assert "UTF-8" in unreadable(
+        tmp_path / "binary.toml", lambda p: p.write_bytes(b"\x89PNG\r\n\x1a\n\x00\xff")
+    )
+
+
+def test_a_file_of_4_mib_is_read_and_a_longer_one_is_not(tmp_path):
+    path = tmp_path / "long.toml"
+    path.write_text(HEAD + "#" * (LARGEST_TEXT - len(HEAD)), encoding="utf-8")
+    assert rig.load(path).name == "gouta2015/backstepping"
+    message = unreadable(
+        path, lambda p: p.write_text(HEAD + "#" * (LARGEST_TEXT + 1 - len(HEAD)), encoding="utf-8")
+    )
+    assert str(LARGEST_TEXT) in message and str(4 * 2**20 + 1) in message
+
+
+def test_setting_names_the_value_that_is_wrong(gouta):
+    with pytest.raises(InputError, match=r"plant\.area\[3\] = -1 cm\^2: must be above 0 cm\^2"):
+        gouta("ngpc", {"plant.area[3]": -1.0})
+    with pytest.raises(InputError, match=r"unknown parameter 'controller\.k1'; nearest: "):
+        gouta("ngpc", {"controller.k1": 1.0})  # the predictive law has no such gain
+
+
+def test_a_file_is_replaced_whole_and_leaves_no_other(gouta, tmp_path):
+    path = tmp_path / "rig.toml"
+    rig.save(gouta("ngpc"), path)
+    rig.save(gouta("backstepping"), path)
+    assert path.read_text(encoding="utf-8") == rig.dump(gouta("backstepping"))
+    assert [p.name for p in tmp_path.iterdir()] == ["rig.toml"]
+
+
+def test_scenarios_and_what_is_uncertain_go_through_a_file(tmp_path):
+    for name in ("mirakhorli/sfc", "calofir/backstepping", "gouta2015/ngpc"):
+        case = presets.find(name)
+        back = round_trip(case, tmp_path)
+        assert back.scenarios == case.scenarios and dict(back.uncertain) == dict(case.uncertain)
+    case = presets.find("gouta2022/chadpc").replace(scenarios=(), uncertain={"plant.drain": 0.3})
+    back = round_trip(case, tmp_path)
+    assert back.scenarios == () and back.uncertain == {"plant.drain": 0.3}
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ('scenario = "x"', "scenario = 'x': must be a list of tables"),
+        ("scenario = [3]", "scenario 1 = 3: must be a table"),
+        ("[[scenario]]\nvalue = 3", "unknown key of [[scenario]] 'value'; nearest: values"),
+        (
+            '[[scenario]]\nvalues = { "plant.drian" = 1.0 }',
+            "unknown parameter 'plant.drian'; nearest: plant.drain",
+        ),
+        (
+            '[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }',
+            "scenario 'a': sensor.noise[0] = -1 cm",
+        ),
+        ("[[scenario]]\nseed = 1.5", "seed = 1.5 must be a whole number"),
+        ("[[scenario]]\nweight = 0.0", "weight = 0.0 must be a finite number above 0"),
+        (
+            '[uncertain]\n"plant.drain" = 2.0',
+            "uncertain plant.drain = 2.0: must be a share between 0 and 1",
+        ),
+        ('[uncertain]\n"plant.drian" = 0.1', "unknown parameter 'plant.drian'"),
+    ],
+)
+def test_scenarios_and_spreads_that_cannot_be_used(text, words, tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(HEAD + text + "\n", encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape(words)):
+        rig.load(path)
+
+
+LARGE = 10**20  # a whole number that a float holds and no integer of numpy does
+
+
+@pytest.mark.parametrize("big", [2**63, 2**64, LARGE])
+@pytest.mark.parametrize(
+    "line",
+    [
+        '[values]\n"plant.area" = [BIG, 20, 20, 20]',
+        "[limits]\nmax_level = BIG",
+        "[objective]\nrms_error = BIG",
+        '[free]\n"controller.k" = [0.1, BIG]',
+        '[[scenario]]\nweight = BIG\nvalues = { "sensor.noise" = BIG }',
+        "[[pour]]\ntime = 1\nduration = BIG\ntank = 1\nvolume = BIG",
+        "[disturbance]\ninflow = [0, 0, 0, BIG]",
+        '[[fault]]\nof = "drain[0]"\nstart = 1\nend = BIG\nextra = BIG',
+    ],
+)
+def test_a_large_whole_number_is_the_float_next_to_it(line, big):
+    whole, real = (
+        rig.loads(HEAD + line.replace("BIG", text)) for text in (str(big), repr(float(big)))
+    )
+    assert_same(whole, real)
+    assert [s.weight for s in whole.scenarios] == [s.weight for s in real.scenarios]
+
+
+def test_a_large_setpoint_is_told_as_the_float_next_to_it():
+    """No steady state has it: the answer is that, whole number or not."""
+    for form in ("initial = [BIG, 3.0]", "changes = [[20.0, 1, BIG]]"):
+        told = []
+        for text in (str(LARGE), repr(float(LARGE))):
+            with pytest.raises(EquilibriumError) as caught:
+                rig.loads(reference(form.replace("BIG", text)))
+            told.append(str(caught.value))
+        assert told[0] == told[1]
+
+
+def test_names_without_quotation_marks_are_dotted_names(gouta):
+    text = (
+        HEAD + "[values]\nclock.dt = 0.5\n[values.controller]\nk = 0.5\n[values.plant]\n'area[1]' ="
+        " 20.0\n"
+    )
+    text += (
+        "[free]\ncontroller.k = [0.1, 9.0]\n[uncertain.plant]\ndrain ="
+        " 0.1\n[[scenario]]\nvalues.sensor.noise = 0.1\n"
+    )
+    case = rig.loads(text)
+    assert_same(
+        case.replace(free={}),
+        gouta(
+            "backstepping",
+            {
+                "clock.dt": 0.5,
+                "controller.k": 0.5,
+                "plant.area[1]": 20.0,
+                "controller.model.area[1]": 20.0,
+            },
+        ).replace(free={}),
+    )
+    assert set(case.free) == {"controller.k"} and case.uncertain == {"plant.drain": 0.1}
+    assert dict(case.scenarios[0].values) == {"sensor.noise": 0.1}
+
+
+@pytest.mark.parametrize(
+    "lines, words", [('"clock.duration" = 1e308', "samples"), ('"clock.dt" = 5e-324', "samples")]
+)
+def test_a_run_longer_than_any_whole_number_is_refused(lines, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(f'case = "gouta2015/ngpc"\n[values]\n{lines}\n')
+
+
+def test_a_byte_order_mark_is_read_over():
+    assert rig.loads('\ufeffcase = "gouta2015/ngpc"\n').name == "gouta2015/ngpc"
+
+
+def test_more_tanks_than_a_loop_can_hold_are_refused_at_once():
+    with pytest.raises(InputError, match="at most 100"):
+        rig.loads(
+            "[[tank]]\narea = 1.0\nrim = 1.0\n" * 101
+            + "[[pump]]\ngain = 1.0\nto = 1\nlow = 0.0\nhigh = 1.0\n"
+        )

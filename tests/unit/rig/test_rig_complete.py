@@ -1,0 +1,629 @@
+"""The complete rig file of `init`: it is the case, every suggestion in it can be used, and a rig is
+described without Python.
+"""
+
+import json
+import pathlib
+import re
+import tomllib
+import types
+import warnings
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import parameters, presets, rig
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import walk
+from jaxtank.measures import MEASURES, times
+from tuning.cli import main, options
+
+HEAD = 'case = "gouta2015/backstepping"\n'
+# one case of each law, reference, disturbance and fault
+KINDS = list(
+    {
+        (
+            n.split("/")[0],
+            *(
+                type(getattr(presets.find(n).loop, f))
+                for f in ("controller", "observer", "reference", "disturbance", "faults")
+            ),
+        ): n
+        for n in reversed(presets.names())
+    }.values()
+)
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop) and a.clock == b.clock
+    for one, other in zip(jax.tree.leaves(a.loop), jax.tree.leaves(b.loop)):
+        np.testing.assert_array_equal(one, other)
+
+
+def used(text):
+    """A block of a rig file with its suggestions taken."""
+    return re.sub(r"(?m)^#(?=\S)", "", text)
+
+
+@pytest.mark.parametrize("name", presets.names())
+def test_the_complete_file_is_the_case(name):
+    case = presets.find(name)
+    text, terse = rig.complete(case), rig.dump(case)
+    # what is not a suggestion is what `dump` says
+    assert tomllib.loads(text) == tomllib.loads(terse)
+    again = rig.loads(text)
+    assert_same(again, case)
+    assert rig.dump(again) == terse and rig.complete(again) == text
+    assert dict(again.uncertain) == dict(case.uncertain) and len(again.scenarios) == len(
+        case.scenarios
+    )
+    assert again.reachable == case.reachable and (again.symmetry is None) == (case.symmetry is None)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_suggestion_can_be_used(name):
+    """Tables one by one; the lines of a table that is there, all of them at once."""
+    blocks, tried = rig.complete(presets.find(name)).split("\n\n"), []
+    for i, block in enumerate(blocks):
+        taken = used(block)
+        if taken != block:
+            rig.loads("\n\n".join([*blocks[:i], taken, *blocks[i + 1 :]]))
+            tried += re.findall(r"(?m)^#(\S.*)", block)
+    assert {"[observer]", "[[fault]]", "[covariance]", "[[scenario]]", "rms_error = 1.0"} <= {
+        *tried,
+        *"\n".join(blocks).splitlines(),
+    }
+    assert len(tried) > 60
+
+
+@pytest.mark.parametrize("tankwise", [False, True])
+def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwise):
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]}
+    )
+    text = rig.dump(case, tankwise)
+    again = rig.loads(text)
+    assert case.reachable and not again.reachable
+    assert f"reachable = false  # {rig.unreachable(case)}" in text.splitlines()
+    assert_same(again, case)
+
+
+@pytest.mark.parametrize(
+    ("name", "quiet", "told"),
+    [("rig.toml", False, True), ("rig.toml", True, False), ("fit.csv", False, False)],
+)
+def test_a_written_rig_that_says_unreachable_is_told(name, quiet, told, capsys):
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]}
+    )
+    args = types.SimpleNamespace(out="found/", quiet=quiet)
+    options.report_unreachable(case, [pathlib.Path("found") / name], args)
+    said = capsys.readouterr().err
+    assert (
+        said
+        == told
+        * f"jaxtank: found/rig.toml: note: {rig.unreachable(case)}; the file says reachable = false"
+        " for it\n"
+    )
+    options.report_unreachable(
+        presets.find("gouta2015/backstepping"), [pathlib.Path("found") / name], args
+    )
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_tank_by_tank_it_is_the_same_rig(name):
+    case = presets.find(name)
+    text = rig.complete(case, tankwise=True)
+    again = rig.loads(text)
+    assert (
+        "case" not in tomllib.loads(text)
+        and len(tomllib.loads(text)["tank"]) == case.loop.plant.tanks
+    )
+    assert_same(again, case)
+    assert again.reachable == case.reachable and dict(again.limits) == dict(case.limits)
+
+
+def test_the_cost_is_the_same_to_the_last_bit():
+    for name in ("gouta2015/backstepping", "gouta2022/chadpc"):
+        case = rig.set_values(presets.find(name), {"clock.dt": 0.1, "clock.duration": 600.0})
+        for text in (
+            rig.complete(case),
+            rig.dump(case),
+            rig.short(case),
+            rig.complete(case, tankwise=True),
+        ):
+            again = rig.loads(text)
+            ours, theirs = (
+                jaxtank.evaluate(c.loop, c.clock, ["rms_error_total", "input_travel"])
+                for c in (again, case)
+            )
+            for measure in ours:
+                np.testing.assert_array_equal(ours[measure], theirs[measure])
+
+
+def test_every_name_stands_in_the_file_with_its_unit_and_range():
+    case = presets.find("gouta2022/pid")
+    text = rig.complete(case)
+    for kind in ("leaf", "static"):
+        for name, value, meta in walk(case.loop, kind=kind):
+            if (
+                isinstance(value, tuple)
+                or np.size(value) == 0
+                or name.startswith(("reference.", "disturbance."))
+            ):
+                continue
+            above = re.search(rf'(?m)^(# .*)\n#?"{re.escape(name)}" = ', text)
+            assert above, name
+            shown = re.findall(rf'(?ms)((?:^# [^\n]*\n)+)#?"{re.escape(name)}" = ', text)[
+                0
+            ].replace("\n# ", " ")
+            assert meta["doc"] in shown and (meta["unit"] == "-" or f"[{meta['unit']}]" in shown)
+            if meta["low"] is not None:
+                assert f"{'above' if meta['strict'] else 'at least'} {meta['low']:g}" in shown
+    for measure in MEASURES:
+        # to limit, and to make small
+        assert measure in times() or len(re.findall(rf"(?m)^#?{measure} = ", text)) == 2
+
+
+def test_the_short_file_has_what_differs_and_what_is_tuned():
+    own = {"plant.area[1]": 20.0, "plant.overflow": True}
+    model = {"controller.model.area[1]": 20.0, "controller.model.overflow": True}
+    case = rig.set_values(presets.find("gouta2015/backstepping"), own | model)
+    text = rig.short(case)
+    table = tomllib.loads(text)
+    assert set(table["values"]) == {"plant.area", "plant.overflow"} and set(table) == {
+        "case",
+        "name",
+        "values",
+        "limits",
+        "free",
+        "objective",
+    }
+    assert_same(rig.loads(text), case)
+    rig.loads(used(text))
+    assert len(text.splitlines()) < 50
+
+
+def test_the_example_of_the_module_can_be_used():
+    again = rig.loads(rig.__doc__.partition("\n\n")[2])
+    assert type(again.loop.observer).__name__ == "ExtendedKalman" and again.loop.faults.windows == (
+        ("pump_gain[0]", 300.0, 400.0),
+    )
+    assert set(again.free) == {f"controller.values[1,{j}]" for j in range(3)}
+
+
+def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
+    from jaxtank.plants.faults import faults
+    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.setpoints import Sine
+
+    text = (
+        HEAD + "[reference.sine]\namplitude = 0.5\nperiod = 100.0\noutput = 2\nstart = 50.0\nend ="
+        " 150.0\n"
+        "[[pour]]\ntime = 30.0\nduration = 2.0\ntank = 2\nvolume = 40.0\n"
+        '[[fault]]\nof = "plant.pump_gain[1]"\nstart = 10.0\nend = 20.0\nfactor = 0.6\n'
+    )
+    loop = rig.loads(text).loop
+    old = presets.find("gouta2015/backstepping").loop
+    sine = Sine(
+        amplitude=0.5, offset=0.0, period=100.0, zero=0.0, start=50.0, end=150.0, channel=1, width=2
+    )
+    assert jax.tree.structure(loop.reference.second) == jax.tree.structure(sine)
+    np.testing.assert_array_equal(jax.tree.leaves(loop.reference.second), jax.tree.leaves(sine))
+    assert jax.tree.structure(loop.reference.first) == jax.tree.structure(old.reference)
+    for ours, theirs in (
+        (loop.disturbance, pours(4, [(30.0, 2.0, 1, 40.0)])),
+        (loop.faults, faults(old.plant, [("pump_gain[1]", 10, 20, 0.6, 0.0)])),
+    ):
+        assert jax.tree.structure(ours) == jax.tree.structure(theirs)
+        np.testing.assert_array_equal(jax.tree.leaves(ours), jax.tree.leaves(theirs))
+    # and are read back, over the preset and tank by tank
+    case = rig.loads(text)
+    for tankwise in (False, True):
+        again = rig.loads(rig.dump(case, tankwise))
+        assert_same(again, case)
+        assert rig.dump(again) == rig.dump(case)
+
+
+def test_what_a_preset_has_can_be_taken_away():
+    text = (
+        'case = "gouta2022/chadpc"\npour = []\nscenario = []\nreachable = false\n[reference]\nsine'
+        " = {}\n"
+    )
+    case = rig.loads(text)
+    assert (
+        case.loop.disturbance is None
+        and case.scenarios == ()
+        and type(case.loop.reference).__name__ == "Ramps"
+    )
+    assert_same(rig.loads(rig.dump(case)), case)
+    assert rig.loads('case = "calofir/backstepping-perturbed"\nfault = []\n').loop.faults is None
+
+
+def test_another_law_and_observer_over_a_preset():
+    text = (
+        'case = "gouta2022/pi"\n[law]\nkind = "enmpc"\nTp = 0.5\ncompensation ='
+        ' "single"\n[observer]\nkind = "disturbance"\nl = 2.0\n[values]\n"controller.Tp" ='
+        ' 0.4\n[free]\n"observer.l" = [0.1, 9.0]\n'
+    )
+    case, preset = rig.loads(text), presets.find("gouta2022/chadpc")
+    values = {"controller.Tp": 0.4, "observer.l": 2.0}
+    assert_same(case, rig.set_values(preset, values))  # the same loop, another way
+    kalman = rig.loads(
+        'case = "mirakhorli/sfc"\n[observer]\nkind = "kalman"\nprocess = 1e-3\nmeasurement ='
+        " 0.01\nmeasured = [1, 2]\n"
+    )
+    assert kalman.loop.observer.measured == (0, 1) and np.shape(kalman.loop.observer.process) == (
+        4,
+    )
+    assert_same(rig.loads(rig.dump(kalman)), kalman)
+
+
+def test_a_case_without_an_optional_part_of_its_preset_is_read_back():
+    """gouta2022's pumps have a dead zone: a rig without one is not written as that preset."""
+    import dataclasses
+
+    case = presets.find("gouta2022/pi")
+    case = case.replace(
+        uncertain={},
+        loop=dataclasses.replace(
+            case.loop, actuator=dataclasses.replace(case.loop.actuator, dead_zone=None)
+        ),
+    )
+    assert_same(rig.loads(rig.dump(case)), case)
+
+
+TANK = (
+    "[[tank]]\narea = 20.0\nrim = 30.0\ndrain = 1.0\nlevel = 3.0\n[[pump]]\ngain = 5.0\nto ="
+    " 1\nhigh = 12.0\n"
+)
+TANK += '[law]\nkind = "pid"\nKc = 1.0\nTi = 9.0\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 9\nvolume = 1.0\n",
+            r"pour 1: tank = 9: .* from 1 to 4",
+        ),
+        (
+            HEAD + "[[pour]]\ntime = 1.0\nduration = 0.0\ntank = 1\nvolume = 1.0\n",
+            "pour 1 into tank 1: duration = 0 s: must be above 0 s",
+        ),
+        (
+            HEAD + "[[pour]]\ntime = -1.0\nduration = 1.0\ntank = 1\nvolume = 1.0\n",
+            "pour 1 into tank 1: time = -1 s: must be at least",
+        ),
+        (
+            TANK.replace("[[tank]]", '[[tank]]\nname = "left"')
+            + '[[pour]]\ntime = 1.0\nduration = 0.0\ntank = "left"\nvolume = 1.0\n',
+            "pour 1 into tank 'left': duration = 0 s",
+        ),
+        (TANK + "[plant]\nknee = 1e-300\n", "plant: knee = 1e-300 cm: must be at least 1e-15 cm"),
+        (
+            'units = ["m", "V"]\n' + TANK + "[plant]\nknee = 1e-16\n",
+            "plant: knee = 1e-16 m: must be at least 1e-15 m",
+        ),
+        (
+            TANK.replace("high = 12.0", "high = 0.0"),
+            "pump 1: high = 0 V: must be above its low, 0 V",
+        ),
+        (
+            TANK.replace("high = 12.0", "low = 13.0\nhigh = 12.0"),
+            "pump 1: high = 12 V: must be above its low, 13 V",
+        ),
+        (
+            TANK.replace("high = 12.0", "high = 12.0\nlag = 2.0"),
+            r"pump 1: lag is not a key of \[\[pump\]\]: it is \"actuator.lag\" in \[values\]",
+        ),
+        (
+            TANK.replace("rim = 30.0", "rim = 30.0\nbits = 12"),
+            r'tank 1: bits .*"sensor.bits" in \[values\]',
+        ),
+        (
+            TANK.replace("to = 1", "to = 1\nsplit = 0.5"),
+            "pump 1: split is the share of the first of two tanks",
+        ),
+        (
+            TANK.replace("[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]").replace(
+                "to = 1", "to = [1, 2]"
+            ),
+            "pump 1: split is the share",
+        ),
+        (
+            HEAD + "[[pour]]\ntime = 1.0\nvolum = 1.0\n",
+            r"unknown key of \[\[pour\]\] 'volum'; nearest: volume",
+        ),
+        (HEAD + "[[pour]]\ntime = 1.0\nduration = 1.0\ntank = 1\n", "pour 1: volume is missing"),
+        (
+            HEAD + '[[fault]]\nof = "pump_gian[0]"\nstart = 1.0\nend = 2.0\n',
+            "fault 1: unknown parameter 'pump_gian.*nearest: pump_gain",
+        ),
+        (
+            HEAD + '[[fault]]\nof = "pump_gain"\nstart = 1.0\nend = 2.0\n',
+            r"fault 1: fault of pump_gain: name one entry",
+        ),
+        (
+            HEAD + '[[fault]]\nof = "gravity"\nstart = 1.0\nend = 2.0\n',
+            r"fault 1: fault of gravity: name one entry",
+        ),
+        (
+            HEAD + '[[fault]]\nof = "drain[0]"\nstart = 3.0\nend = 2.0\n',
+            "must start at or after 0 s and end later",
+        ),
+        (
+            HEAD + '[[fault]]\nof = "drain[0]"\nstart = 1.0\nend = 2.0\nfactor = -1.0\n',
+            "fault 1: factor = -1: must be at least 0",
+        ),
+        (
+            HEAD + "[disturbance]\ninflow = [1.0]\n",
+            "disturbance.inflow = .1.0.: must be a list of 4 finite flows",
+        ),
+        (
+            HEAD + "[disturbance]\ninflw = [1.0]\n",
+            r"unknown key of \[disturbance\] 'inflw'; nearest: inflow",
+        ),
+        (HEAD + "[disturbance]\nwindow = 3.0\n", "there is none"),
+        (HEAD + "[reference.sine]\nperiod = 3.0\n", r"\[reference.sine\] needs amplitude"),
+        (
+            HEAD + "[reference.sine]\namplitude = 1.0\nperiod = 0.0\noutput = 1\n",
+            "reference.sine.period = 0 s: must be above 0",
+        ),
+        (HEAD + "[reference.sine]\namplitude = 1.0\nperiod = 3.0\noutput = 3\n", "from 1 to 2"),
+        (HEAD + '[observer]\nkind = "kalmn"\n', "unknown observer kind 'kalmn'; nearest: kalman"),
+        (HEAD + '[observer]\nkind = "kalman"\nprocess = 1.0\n', r"needs measurement \[cm\^2\]"),
+        (
+            HEAD
+            + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = 1.0\nmeasured ='
+            " [0]\n",
+            "counted from 1 to 4",
+        ),
+        (
+            HEAD + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = -1.0\n',
+            r"observer.measurement\[0\] = -1 cm\^2",
+        ),
+        (
+            HEAD
+            + '[observer]\nkind = "extended-kalman"\nprocess = 1.0\nmeasurement = 1.0\nsubsteps ='
+            " 2.5\n",
+            "substeps = 2.5: must be a whole",
+        ),
+        (
+            HEAD + '[law]\nkind = "backstepping"\nk = 1.0\nk1 = 1.0\nreference_rates = 3\n',
+            "reference_rates = 3: must be one of false, true",
+        ),
+        (HEAD + "reachable = 1\n", "reachable = 1: must be true or false"),
+        (
+            TANK.replace("area = 20.0", "area = -20.0"),
+            r"tank 1: area = -20 cm\^2: must be above 0 cm\^2",
+        ),
+        (
+            TANK.replace("gain = 5.0", "gain = 0.0"),
+            r"pump 1: gain = 0 cm\^3/\(s V\): must be above 0",
+        ),
+        (
+            TANK.replace("drain = 1.0", "drian = 1.0"),
+            r"unknown key of \[\[tank\]\] 'drian'; nearest: drain",
+        ),
+        (TANK.replace("level = 3.0", "level = nan"), "tank 1: level = nan"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_unit_and_range(text, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(text)
+
+
+def test_init_of_the_command(tmp_path, capsys):
+    def said(*args):
+        code = main.main(["init", "gouta2015/backstepping", *args])
+        return code, capsys.readouterr().out
+
+    case = presets.find("gouta2015/backstepping")
+    assert said() == (0, rig.complete(case)) and said("--short") == (0, rig.short(case))
+    assert said("--tanks") == (0, rig.complete(case, tankwise=True))
+    assert main.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
+    assert parameters(case.loop)
+
+
+def test_what_a_preset_says_in_more_tables_does_not_come_back():
+    """A short file without [uncertain], or with one pour of two, would have the preset's."""
+    from jaxtank.signals.inflows import pours
+
+    case = presets.find("gouta2015/ngpc").replace(uncertain={})
+    assert rig.loads(rig.short(case)).uncertain == {}
+    assert rig.complete(rig.loads(rig.short(case))) == rig.complete(case)
+    case = presets.find("gouta2022/chadpc")
+    own = case.loop.disturbance
+    first = [(t, d, i, v) for (t, d, i), v in zip(own.events, np.asarray(own.volume).tolist())][:1]
+    assert len(own.events) > 1
+    case = case.replace(
+        loop=case.loop.__class__(**{**vars(case.loop), "disturbance": pours(own.width, first)})
+    )
+    assert rig.loads(rig.short(case)).loop.disturbance.events == own.events[:1]
+
+
+def test_names_of_tanks_and_pumps_are_kept():
+    text = TANK.replace("[[tank]]", '[[tank]]\nname = "left"').replace(
+        "[[pump]]", '[[pump]]\nname = "P-101"'
+    )
+    case = rig.loads(text)
+    assert case.names == {"tank": ("left",), "pump": ("P-101",)}
+    case = rig.set_values(case, {"plant.area": 21.0})
+    for written in (rig.dump(case), rig.complete(case), rig.short(case)):
+        table = tomllib.loads(written)
+        assert table["tank"][0]["name"] == "left" and table["pump"][0]["name"] == "P-101"
+        assert rig.loads(written).names == case.names
+    assert (
+        '#name = "tank 1"' in rig.complete(rig.loads(TANK))
+        and rig.loads(rig.dump(rig.loads(TANK))).names == {}
+    )
+    # the tanks of a preset's rig, called by names: the preset cannot say them
+    four = rig.complete(presets.find("gouta2015/ngpc"), tankwise=True).replace(
+        '#name = "tank 3"', 'name = "upper left"'
+    )
+    assert rig.loads(rig.dump(rig.loads(four))).names == {"tank": ("", "", "upper left", "")}
+
+
+def test_show_tells_what_tanks_and_pumps_are_called(tmp_path, capsys):
+    text = TANK.replace("[[tank]]", '[[tank]]\nname = "left"').replace(
+        "[[pump]]", '[[pump]]\nname = "P-101"'
+    )
+    (tmp_path / "rig.toml").write_text(text)
+    assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "controlled: h1 (left)" in said
+        and "The names of its file: tank 1 is 'left', pump 1 is 'P-101'." in said
+    )
+    assert main.main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["names"] == {"tank": ["left"], "pump": ["P-101"]}
+    assert main.main(["show", "gouta2015/ngpc"]) == 0
+    said = capsys.readouterr().out
+    assert "controlled: h1, h2\n" in said and "names of its file" not in said
+
+
+@pytest.mark.parametrize(
+    "line", ["area = 20.0", "rim = 30.0", "drain = 1.0", "level = 3.0", "gain = 5.0", "high = 12.0"]
+)
+def test_a_large_whole_number_of_a_tank_is_the_float_next_to_it(line):
+    key, big, told = line.split(" = ")[0], 10**20, []
+    for value in (str(big), repr(float(big))):
+        try:
+            told.append(rig.dump(rig.loads(TANK.replace(line, f"{key} = {value}"))))
+        except InputError as error:
+            told.append(str(error))
+    assert told[0] == told[1]
+
+
+@pytest.mark.parametrize("option", ["--dt", "--set", "--free"])
+def test_a_whole_number_that_no_float_holds_is_refused_in_one_line(option, capsys):
+    said = {"--dt": "", "--set": "controller.k=", "--free": "controller.k=0.1:"}[option] + "9" * 400
+    assert (
+        main.main(
+            ["tune" if option == "--free" else "show", "gouta2015/backstepping", option, said]
+        )
+        == 2
+    )
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_numpy_says_nothing_beside_a_refusal():
+    text = TANK.replace("area = 20.0", "area = 1e-300").replace(
+        "[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]"
+    )
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(InputError, match=r"runs empty in|no steady state"),
+    ):
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        rig.loads(text + "[[pipe]]\nbetween = [1, 2]\narea = 0.5\n")
+    with warnings.catch_warnings(), pytest.raises(InputError, match="no unique steady state"):
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        rig.loads(TANK + "[reference]\ninitial = [1e308]\n")
+
+
+def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
+    about = "limit on overflow_volume"
+    assert about in rig.complete(presets.find("cascaded/pi")).replace("\n# ", " ")
+    assert about not in rig.complete(presets.find("gouta2015/ngpc")).replace("\n# ", " ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            "[reference]\nchanges = [[100.0, 1, 4.0], [700.0, 1, 5.0]]\n",
+            "1 of 2 changes of the reference come after the end of the run at 600 s",
+        ),
+        (
+            "[[pour]]\ntime = 600.0\nduration = 1.0\ntank = 1\nvolume = 1.0\n",
+            "1 of 1 pours come after the end",
+        ),
+        (
+            "[reference]\nchanges = [[100.0, 1, 4.0], [150.0, 1, 5.0]]\nramp = 60.0\n",
+            (
+                "1 of 2 changes begin before the one before is over (ramp 60 s), the first of"
+                " output 1 at 150 s"
+            ),
+        ),
+        (
+            "[reference]\nchanges = [[100.0, 1, 31.0]]\n",
+            "asked for 31 cm, above the rim of tank 1 at 30 cm: rims are limits",
+        ),
+        ("[plant]\noverflow = true\n[reference]\ninitial = [31.0]\n", "a level cannot get there"),
+        (
+            '[values]\nx0 = 31.0\n"actuator.initial" = 3.0\n',
+            "tank 1 starts at 31 cm, above its rim at 30 cm",
+        ),
+        ("[values]\nclock.dt = 7.0\n", "of samples of clock.dt = 7 s: the run ends at 602 s"),
+        (
+            "[values]\nclock.dt = 6.0\nclock.duration = 10.0\n",
+            "clock.duration = 10 s is no whole number of samples of clock.dt = 6 s: the",
+        ),
+        (
+            '[values]\n"actuator.initial" = 13.0\n',
+            "pump 1 runs at 13 V before t = 0, outside its limits of 0 and 12 V",
+        ),
+    ],
+)
+def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_path, capsys):
+    text = TANK.replace("drain = 1.0", "drain = 0.2").replace("gain = 5.0", "gain = 50.0")
+    (tmp_path / "rig.toml").write_text(text + change, encoding="utf-8")
+    (sentence,) = rig.doubts(rig.load(tmp_path / "rig.toml"))
+    assert words in sentence
+    assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
+    # of steps: test_step_length.py
+    told = [line for line in capsys.readouterr().err.splitlines() if "runs empty" not in line]
+    assert told == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--set", "clock.dt=7", "--set", "clock.duration=300"],
+        ["--dt", "7", "--set", "clock.duration=300"],
+    ],
+)
+def test_a_run_of_another_length_than_asked_for_is_told(options, capsys, tmp_path):
+    assert (
+        main.main(["simulate", "mirakhorli/sfc", *options, "--json", "--out", str(tmp_path)]) == 0
+    )
+    said, told = capsys.readouterr()
+    note = (
+        "jaxtank: note: clock.duration = 300 s is no whole number of samples of clock.dt = 7 s: the"
+        " run ends at 301 s"
+    )
+    assert told.splitlines()[0] == note
+    assert (tmp_path / "trajectory.csv").read_text().splitlines()[-1].startswith("301,")
+    assert json.loads(said)["clock"]["duration"] == 300.0
+    assert main.main(["show", "mirakhorli/sfc", *options, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_whole_samples_in_floating_point_are_no_doubt():
+    for dt, duration in ((0.1, 0.3), (0.01, 1200.0), (1e-3, 9e4), (0.7, 0.7 * 3), (1 / 3, 100.0)):
+        assert rig.clock_doubts(Clock(dt=dt, duration=duration)) == []
+
+
+def test_a_doubt_calls_a_tank_by_its_name():
+    named = (
+        TANK.replace("[[tank]]", '[[tank]]\nname = "left"')
+        .replace("level = 3.0", "level = 31.0")
+        .replace("gain = 5.0", "gain = 90.0")
+    )
+    told = rig.doubts(rig.loads(named))
+    assert (
+        told[0].startswith("tank 1 ('left') starts at 31 cm")
+        and "above the rim of tank 1 ('left')" in told[1]
+    )
+
+
+def test_no_preset_is_doubted():
+    assert [n for n in presets.names() if rig.doubts(presets.find(n))] == []

@@ -1,0 +1,222 @@
+"""A plant and a law that somebody else wrote, with no more than their base classes ask: notebook
+10's cone.
+"""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxtank
+import tuning
+from jaxtank import presets
+from jaxtank.controllers.base import Controller
+from jaxtank.core import numerics
+from jaxtank.core.tree import component, leaf, number, static
+from jaxtank.export.source import export
+from jaxtank.plants.base import Plant
+
+
+@component
+class Cone(Plant):
+    """A(h) h' = k u - s sqrt(2 g h), A = pi (R/H)^2 (h + tip)^2."""
+
+    pump_gain: float = leaf("cm^3/(s V)", "flow per volt k", low=0.0, strict=True)
+    drain: float = leaf("cm^2", "outlet area s", low=0.0)
+    slope: float = leaf("-", "radius over level R/H", low=0.0, strict=True)
+    rim: np.ndarray = leaf("cm", "(1,) height", low=0.0, strict=True)
+    outputs: tuple = static(doc="controlled tanks", default=(0,))
+    tanks, pumps = 1, 1
+
+    def derivative(self, t, x, u, d):
+        width = self.slope * (x[0] + 0.5)
+        flow = self.pump_gain * u[0] - self.drain * jnp.sqrt(2.0 * 981.0) * numerics.smooth_sqrt(
+            x[0], 0.01
+        )
+        return (flow / (jnp.pi * width * width),)
+
+
+@component
+class Proportional(Controller):
+    """u = bias + Kc (r - h)."""
+
+    Kc: float = leaf("V/cm", "gain", low=0.0)
+    bias: float = leaf("V", "voltage at no error")
+
+    def step(self, state, tick, estimate):
+        return (self.bias + self.Kc * (tick.r[0] - estimate.x[0]),), state
+
+
+@pytest.fixture(scope="module")
+def case():
+    loop = jaxtank.ClosedLoop(
+        plant=Cone(
+            pump_gain=number(30.0), drain=number(1.2), slope=number(0.5), rim=number([30.0])
+        ),
+        sensor=jaxtank.instruments.LevelSensor(
+            gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)
+        ),
+        observer=jaxtank.observers.Direct(),
+        controller=Proportional(Kc=number(1.0), bias=number(5.0)),
+        actuator=jaxtank.instruments.PumpBank(
+            low=number([0.0]),
+            high=number([12.0]),
+            stop=number([0.0]),
+            pulse=number([12.0]),
+            initial=number([0.0]),
+        ),
+        reference=jaxtank.signals.ramps([5.0], [(5.0, 0, 12.0)], ramp=0.0),
+        x0=number([5.0]),
+    )
+    return presets.Case(
+        name="cone",
+        title="cone",
+        loop=loop,
+        clock=jaxtank.Clock(dt=0.1, duration=60.0, substeps=4),
+        limits={"max_level": "rim", "overflow_volume": 0.0},
+        free={"controller.Kc": presets.Free(0.05, 10.0)},
+        objective={"mean_square_error": 1.0, "input_travel": 0.01},
+        uncertain={"plant.drain": 0.1},
+    )
+
+
+def test_its_levels_are_those_of_another_integrator(case):
+    run = jaxtank.simulate(case.loop, case.clock)
+    assert np.ptp(np.asarray(run.u)) > 5.0  # it moves, and into its upper limit
+    level = [5.0]
+    for volts in np.asarray(run.u)[:-1, 0]:
+        rate = lambda _, h, volts=volts: (
+            (30.0 * volts - 1.2 * np.sqrt(1962.0 * h)) / (np.pi * 0.25 * (h + 0.5) ** 2)
+        )
+        level.append(solve_ivp(rate, (0.0, 0.1), [level[-1]], rtol=1e-9, atol=1e-11).y[0, -1])
+    # the smooth root: 1e-6 of it at 5 cm
+    np.testing.assert_allclose(np.asarray(run.x)[:, 0], level, atol=2e-6)
+
+
+def test_slopes_by_law_and_plant_are_those_of_differences(case):
+    names = ("controller.Kc", "plant.drain", "plant.slope")
+    point = np.array([1.0, 1.2, 0.5])
+
+    @jax.jit
+    def error(values):
+        loop = jaxtank.with_values(case.loop, dict(zip(names, values)))
+        return jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]
+
+    exact = jax.jacfwd(error)(point)
+    for i, step in enumerate(1e-6 * np.diag(point)):
+        assert exact[i] == pytest.approx(
+            float(error(point + step) - error(point - step)) / (2.0 * step[i]), rel=1e-6
+        )
+
+
+def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
+    result = tuning.tune(case, starts=1, screening=4, validation=4)
+    assert result.success and result.objective["after"] < 0.9 * result.objective["before"]
+    found = tuning.ensemble(result.tuned, samples=8, fan=False)
+    assert (
+        found.measures["rms_error_total"].shape == (8,)
+        and np.ptp(found.measures["rms_error_total"]) > 0
+    )
+    assert all(v["count"] == 0 for v in found.violations())
+    with pytest.raises(jaxtank.InputError, match=r"plant\.drain"):
+        jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
+
+
+def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
+    """Neither class has a name in a rig file; all but rig.toml is written."""
+    result = tuning.tune(case, starts=1, screening=4, validation=4)
+    (tmp_path / "rig.toml").write_text("of an earlier result")
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.warns(
+        UserWarning, match=r"rig\.toml is not written .*no name in a rig file.*controller\.Kc = "
+    ):
+        names = {path.name for path in result.save(tmp_path)}
+    assert {"result.json", "trajectory.csv", "before.csv", "report.html", "responses.png"} <= names
+    assert names == {path.name for path in tmp_path.iterdir()} and "rig.toml" not in names
+    saved = json.loads((tmp_path / "result.json").read_text())
+    assert (
+        saved["parameters"]["controller.Kc"]["after"] == result.parameters["controller.Kc"]["after"]
+    )
+    assert "rig.toml is not written" in saved["message"]
+    assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
+
+
+@component
+class Several(Controller):
+    """Returns `count` inputs, whatever the rig has; a bare number for 0."""
+
+    count: int = static(default=1)
+
+    def step(self, state, tick, estimate):
+        return (5.0 * tick.r[0],) * self.count if self.count else 5.0 * tick.r[0], state
+
+
+KINDS = {
+    "vectors": True,
+    "columns": True,
+    "texts": True,
+    "complex": True,
+    "array": False,
+    "switch": False,
+}
+"""What Odd returns: whether it is wrong."""
+
+
+@component
+class Odd(Controller):
+    """Returns two inputs, of a kind that a run may not take."""
+
+    kind: str = static(default="array", choices=tuple(KINDS))
+
+    def step(self, state, tick, estimate):
+        r = jnp.stack(tick.r)
+        on = tick.r[0] > 8.0
+        return {
+            "vectors": (r, r),
+            "columns": r[:, None],
+            "texts": ("on", "off"),
+            "complex": (1j * r[0], r[1]),
+            "array": r,
+            "switch": (on, on),
+        }[self.kind], state
+
+
+@pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
+def test_a_controller_returns_one_input_for_each_pump(count, words):
+    case = jaxtank.rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0}
+    )
+    case = case.replace(loop=dataclasses.replace(case.loop, controller=Several(count=count)))
+    wrong = f"controller Several: its step returns {words} for 2 pumps"
+    for run in (
+        lambda: jaxtank.simulate(case.loop, case.clock),
+        lambda: jaxtank.evaluate(case.loop, case.clock, ["rms_error"]),
+        lambda: jax.jit(lambda loop: jaxtank.evaluate(loop, case.clock, ["rms_error"]))(case.loop),
+        lambda: export(case),
+    ):
+        with pytest.raises(jaxtank.InputError, match=wrong):
+            run()
+    right = dataclasses.replace(case.loop, controller=Several(count=2))
+    assert np.asarray(jaxtank.simulate(right, case.clock).command).shape == (21, 2)
+
+
+@pytest.mark.parametrize(("kind", "wrong"), KINDS.items())
+def test_an_input_of_a_controller_is_one_real_number(kind, wrong):
+    case = jaxtank.rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 10.0}
+    )
+    loop = dataclasses.replace(case.loop, controller=Odd(kind=kind))
+    if not wrong:
+        assert np.isfinite(
+            jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]
+        )
+        return
+    with pytest.raises(
+        jaxtank.InputError,
+        match="controller Odd: its step returns an input that is no single real number",
+    ):
+        jaxtank.evaluate(loop, case.clock, ["rms_error"])

@@ -1,0 +1,165 @@
+"""What the pages show is run: Python as written, commands by the same parser or in full; links and
+folder maps hold.
+"""
+
+import re
+import shlex
+import tomllib
+
+import pytest
+from helpers import RANK, RIGS, ROOT
+
+import jaxtank
+import tuning as package
+from tuning.cli import main
+from tuning.cli.commands import identification, tuning
+from tuning.cli.parser import parser
+
+RIG = RIGS / "watertank.toml"
+PAGES = {
+    name: (ROOT / name).read_text() if (ROOT / name).exists() else ""
+    for name in (
+        "README.md",
+        "notebooks/README.md",
+        "jaxtank/README.md",
+        "tuning/README.md",
+        "tests/benchmarks/README.md",
+    )
+}
+pytestmark = pytest.mark.skipif(
+    not all(PAGES.values()), reason="the pages are not beside the tests"
+)
+
+
+def blocks(language, *pages):
+    """The code blocks of the pages, of all pages where none is named."""
+    return [
+        b
+        for p in pages or PAGES
+        for b in re.findall(rf"```{language}\n(.*?)```", PAGES[p], re.DOTALL)
+    ]
+
+
+def words(line):
+    return tuple(shlex.split(line, comments=True)[1:])
+
+
+COMMANDS = list(
+    dict.fromkeys(
+        words(part)
+        for block in blocks("sh")
+        for line in block.splitlines()
+        for part in line.split("&&")
+        if part.strip().startswith("jaxtank")
+    )
+)
+
+
+def anchors(page):
+    """The anchors of a page's headings, as GitHub makes them."""
+    text = re.sub(r"```.*?```", "", page, flags=re.DOTALL)
+    return {
+        re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-")
+        for h in re.findall(r"^#+ (.*)$", text, re.M)
+    }
+
+
+def test_the_front_page_is_at_most_10_kb():
+    assert len(PAGES["README.md"].encode()) <= 10_000
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_to_files_and_headings_that_exist(name):
+    text = re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith("http"):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (ROOT / name).parent / path if path else ROOT / name
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target.read_text()), link
+
+
+@pytest.mark.parametrize("package", ["jaxtank", "tuning"])
+def test_a_folder_map_names_every_folder_in_the_order_of_imports(package):
+    named = re.findall(r"^\| `(\w+)/` \|", PAGES[f"{package}/README.md"], re.M)
+    assert sorted(named) == sorted(p.parent.name for p in (ROOT / package).glob("*/__init__.py"))
+    ranks = [RANK[f"{package}.{name}"] for name in named]
+    assert ranks == sorted(ranks)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_paths_in_texts_exist(name):
+    """Paths of files or folders, and dotted names of modules, in code spans."""
+    for span in re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", PAGES[name], flags=re.DOTALL)):
+        for path in re.findall(r"\b(?:jaxtank|tuning|tests|notebooks)/[\w/]+\.\w+", span):
+            assert (ROOT / path).exists(), path
+
+
+def test_the_python_example_runs_and_is_short(capsys):
+    example, _ = blocks("python", "README.md")
+    assert len([line for line in example.splitlines() if line.strip()]) <= 8
+    exec(compile(example, "README", "exec"), {})
+    printed = capsys.readouterr().out
+    assert printed.startswith("0.0819")
+    assert "converged" in printed and "0.03987" in printed
+
+
+def own_controller():
+    """The front page's example of a controller of one's own; there are no other examples in Python
+    than its two.
+    """
+    _, example = blocks("python", "README.md")
+    assert len(blocks("python")) == 2
+    return compile(example, "README", "exec")
+
+
+def test_the_controller_of_ones_own_runs(capsys, monkeypatch):
+    """Its last line simulates once in place of a search."""
+    run = lambda case, free, **_: jaxtank.evaluate(case.loop, case.clock, ["rms_error_total"])
+    monkeypatch.setattr(package, "tune", run)
+    exec(own_controller(), {"__name__": "README"})
+    assert "0.809" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_controller_of_ones_own_is_tuned(capsys):
+    exec(own_controller(), {"__name__": "README"})
+    printed = capsys.readouterr().out
+    assert "controller.Kc" in printed and "converged" in printed
+
+
+def test_the_rigs_shown_are_the_one_that_is_tested():
+    (short,), (full,) = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
+    assert full == RIG.read_text()
+    assert tomllib.loads(short) == tomllib.loads(full)
+    assert len([line for line in short.splitlines() if line.strip()]) <= 15
+    assert blocks("toml") == [short, full]
+
+
+def test_commands_parse():
+    inline = [words(span) for span in re.findall(r"`(jaxtank [^`\n]+)`", PAGES["README.md"])]
+    assert len(COMMANDS) >= 30 and len(inline) >= 10
+    for given in [*COMMANDS, *inline]:
+        args, rest = parser().parse_known_args(given)
+        assert not rest and callable(args.run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", COMMANDS, ids=" ".join)
+def test_commands_run(given, tmp_path_factory, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path_factory.getbasetemp())
+    assert main.main(list(given)) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_pictures_are_small(name):
+    for picture in re.findall(r"!\[.*?\]\((.*?)\)", PAGES[name]):
+        assert ((ROOT / name).parent / picture).stat().st_size < 300_000
+
+
+def test_every_exit_code_is_explained():
+    """Those of a search, of an identification, of refused input and of refused data."""
+    text = re.search(r"Exit codes: (.*?)\. Results", PAGES["notebooks/README.md"], re.DOTALL)[1]
+    codes = {int(code) for code in re.findall(r"(?:^|, )(\d+) ", text.replace("\n", " "))}
+    assert codes == {*tuning.EXIT.values(), *identification.STATUS.values(), 2, 143}

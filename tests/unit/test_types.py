@@ -1,0 +1,68 @@
+"""What an editor sees: names, keywords and types of user code, checked by pyright."""
+
+import ast
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers import DATA
+
+import jaxtank
+import tuning
+
+CODE = DATA / "type_checks"
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    """{file: lines of it with an error} of pyright's basic mode."""
+    pyright = shutil.which("pyright", path=str(Path(sys.executable).parent)) or shutil.which(
+        "pyright"
+    )
+    if pyright is None:
+        pytest.skip("pyright is not installed: pip install pyright")
+    started = subprocess.run([pyright, "--version"], capture_output=True, text=True)
+    # the package of PyPI fetches the program itself when it is first run
+    if started.returncode != 0:
+        pytest.skip(f"pyright cannot run here: {started.stderr[-200:]}")
+    folder = tmp_path_factory.mktemp("types")
+    (folder / "pyrightconfig.json").write_text('{"typeCheckingMode": "basic"}')
+    files = sorted(shutil.copy(path, folder) for path in CODE.glob("*.py"))
+    words = [pyright, "--pythonpath", sys.executable, "--project", str(folder), "--outputjson"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=folder)
+    found = {Path(file).name: {} for file in files}
+    for one in json.loads(done.stdout)["generalDiagnostics"]:
+        if one["severity"] == "error":
+            found[Path(one["file"]).name][one["range"]["start"]["line"]] = one["message"]
+    return found
+
+
+def test_typical_user_code_is_accepted(reported):
+    assert reported["user.py"] == {}
+
+
+def test_mistyped_names_and_keywords_are_reported(reported):
+    lines = (CODE / "wrong.py").read_text().splitlines()
+    wrong = {i for i, line in enumerate(lines) if line.endswith("# wrong")}
+    assert len(wrong) == 6 and set(reported["wrong.py"]) == wrong
+
+
+@pytest.mark.parametrize("package", [jaxtank, tuning])
+def test_a_type_checker_is_given_every_public_name_from_where_it_is(package):
+    tree = ast.parse(Path(package.__file__).read_text())
+    (block,) = (
+        n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"
+    )
+    given = {
+        a.asname: (n.module, a.name)
+        for n in block.body
+        if isinstance(n, ast.ImportFrom)
+        for a in n.names
+    }
+    assert set(package.__all__) <= set(given)
+    table = {name: (module, name) for name, module in package._NAMES.items()}
+    assert {name: given[name] for name in table} == table
+    assert (Path(package.__file__).parent / "py.typed").exists()

@@ -1,0 +1,634 @@
+"""Which parameter moves which measure: closed forms, SALib, differences, and what the command says."""
+
+import contextlib
+import csv
+import io
+import json
+import re
+import subprocess
+import sys
+
+import jax
+import matplotlib.image
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, with_values
+from jaxtank.plots import responses
+from tuning.cli import main
+from tuning.problem.scenarios import Lane, groups_of, values_of
+from tuning.report import sensitivity_tables
+from tuning.uncertainty import distributions, indices, local
+from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
+from tuning.uncertainty.sensitivity_study import sensitivity, what_varies
+
+VARIED = {"plant.drain": Uniform(relative=0.05), "plant.pump_gain": LogUniform(factor=1.2)}
+D = 4
+CUBE = {"num_vars": D, "names": list("abcd"), "bounds": [[0.0, 1.0]] * D}
+ISHIGAMI = {"num_vars": 3, "names": list("abc"), "bounds": [[0.0, 1.0]] * 3}
+
+
+def ishigami(p):
+    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 with x uniform in (-pi, pi); Ishigami and Homma 1990."""
+    x = np.pi * (2.0 * np.asarray(p) - 1.0)
+    return (
+        np.sin(x[..., 0]) + 7.0 * np.sin(x[..., 1]) ** 2 + 0.1 * x[..., 2] ** 4 * np.sin(x[..., 0])
+    )
+
+
+def ishigami_shares(a=7.0, b=0.1):
+    """First and total shares in closed form: the variances V1, V2, V13."""
+    v1, v2, v13 = 0.5 * (1 + b * np.pi**4 / 5) ** 2, a * a / 8, b * b * np.pi**8 * (1 / 18 - 1 / 50)
+    whole = v1 + v2 + v13
+    return np.array([v1, v2, 0.0]) / whole, np.array([v1 + v13, v2, v13]) / whole
+
+
+@pytest.fixture(scope="module")
+def case():
+    """A short run of gouta2015 in which both setpoints move and the loop is never at rest."""
+    return rig.set_values(
+        presets.load("gouta2015").cases["backstepping"], {"clock.duration": 100.0, "clock.dt": 0.5}
+    )
+
+
+@pytest.fixture(scope="module")
+def at_cube(case):
+    """f(p (n, 4)) -> (n,) rms_error_total by runs one at a time: what the study does in batches."""
+    draws = distributions.Draws(case.loop, VARIED)
+    assert draws.dimensions == D
+
+    def f(p):
+        values = draws.values(np.asarray(p))
+        rows = [{n: v[i] for n, v in values.items()} for i in range(len(p))]
+        return np.array(
+            [
+                float(
+                    jaxtank.evaluate(with_values(case.loop, r), case.clock, "rms_error_total")[
+                        "rms_error_total"
+                    ]
+                )
+                for r in rows
+            ]
+        )
+
+    return f
+
+
+def test_ishigami_in_closed_form():
+    found = indices.sobol_indices(ishigami(indices.sobol_points(3, 8192, seed=0)))
+    first, total = ishigami_shares()
+    np.testing.assert_allclose(first, [0.314, 0.442, 0.0], atol=5e-4)
+    np.testing.assert_allclose(total, [0.558, 0.442, 0.244], atol=5e-4)
+    for name, exact in (("first", first), ("total", total)):
+        low, high = found[f"{name}_interval95"].T
+        assert ((low <= exact) & (exact <= high)).all()
+        # a random sample of 8192 would have 2 sd of 0.02
+        np.testing.assert_allclose(found[name], exact, atol=0.01)
+        # 3.92 sd, one sd of a total share of 0.56 being 1.3 / sqrt(N)
+        assert (high - low).max() < 0.07
+    assert found["sd"] == pytest.approx(np.sqrt(13.8446), rel=0.01)
+
+
+def test_intervals_cover_the_closed_form():
+    """Of 60 random studies about 57 should; fewer than 50 has a chance of 1 in 2000."""
+    first, total = ishigami_shares()
+    rng, hits = np.random.default_rng(5), np.zeros(6)
+    for k in range(60):
+        a, b = rng.random((2, 256, 3))
+        points = np.repeat(a[:, None], 5, axis=1)
+        points[:, 4] = b
+        for j in range(3):
+            points[:, j + 1, j] = b[:, j]
+        found = indices.sobol_indices(ishigami(points), seed=k)
+        ends = np.concatenate([found["first_interval95"], found["total_interval95"]])
+        exact = np.concatenate([first, total])
+        hits += (ends[:, 0] <= exact) & (exact <= ends[:, 1])
+    assert (hits >= 50).all()
+
+
+def test_additive_linear_model():
+    """y = sum c p: shares c^2 / sum c^2, first and total alike; elementary effects c, without
+    spread.
+    """
+    c = np.array([3.0, -2.0, 1.0, 0.0])
+    found = indices.sobol_indices(indices.sobol_points(4, 4096, seed=1) @ c)
+    np.testing.assert_allclose(found["first"], c**2 / 14, atol=0.005)
+    np.testing.assert_allclose(found["total"], c**2 / 14, atol=0.005)
+    assert found["total"][3] == 0.0
+    points = indices.morris_points(4, 20, seed=1)
+    found = indices.morris_indices(indices.morris_effects(points, points @ c + 7.0))
+    np.testing.assert_allclose(found["mu"], c, atol=1e-12)
+    np.testing.assert_allclose(found["mu_star"], np.abs(c), atol=1e-12)
+    np.testing.assert_allclose(found["sigma"], 0.0, atol=1e-12)
+
+
+def test_morris_points():
+    points = indices.morris_points(5, 200, seed=3)
+    assert points.min() == 0.0 and points.max() == 1.0
+    moved = np.abs(np.diff(points, axis=1))
+    assert (np.isclose(moved, 2 / 3).sum(axis=2) == 1).all() and np.isclose(
+        moved.sum(axis=(1, 2)), 5 * 2 / 3
+    ).all()
+    levels = np.round(points[:, 0] * 3)
+    np.testing.assert_allclose(points[:, 0] * 3, levels, atol=1e-12)
+    # 4 sd of a binomial
+    assert [int((levels == k).sum()) for k in range(4)] == pytest.approx([250] * 4, abs=55)
+
+
+def test_sobol_agrees_with_salib():
+    sampler, analysis = (
+        pytest.importorskip("SALib.sample.sobol"),
+        pytest.importorskip("SALib.analyze.sobol"),
+    )
+    theirs = sampler.sample(ISHIGAMI, 512, calc_second_order=False, seed=np.random.default_rng(4))
+    np.testing.assert_array_equal(theirs.reshape(512, 5, 3), indices.sobol_points(3, 512, seed=4))
+    y = ishigami(theirs)
+    other = analysis.analyze(ISHIGAMI, y, calc_second_order=False, num_resamples=1000, seed=7)
+    found = indices.sobol_indices(y.reshape(512, 5))
+    np.testing.assert_allclose(found["first"], other["S1"], atol=1e-12)
+    np.testing.assert_allclose(found["total"], other["ST"], atol=1e-12)
+    for name, theirs in (("first", other["S1_conf"]), ("total", other["ST_conf"])):
+        half = 0.5 * np.diff(found[f"{name}_interval95"], axis=1)[:, 0]
+        # quantiles against 1.96 sd, 1000 resamples each: 4 % of noise on both
+        np.testing.assert_allclose(half, theirs, rtol=0.15)
+
+
+def test_morris_agrees_with_salib():
+    sampler, analysis = (
+        pytest.importorskip("SALib.sample.morris"),
+        pytest.importorskip("SALib.analyze.morris"),
+    )
+    theirs = sampler.sample(ISHIGAMI, 40, num_levels=4, seed=2)
+    for points in (theirs.reshape(40, 4, 3), indices.morris_points(3, 40, seed=2)):
+        y = ishigami(points)
+        other = analysis.analyze(
+            ISHIGAMI, points.reshape(-1, 3), y.ravel(), num_levels=4, num_resamples=1000, seed=1
+        )
+        found = indices.morris_indices(indices.morris_effects(points, y))
+        for mine, his in (("mu", "mu"), ("mu_star", "mu_star"), ("sigma", "sigma")):
+            np.testing.assert_allclose(found[mine], np.array(other[his], dtype=float), atol=1e-11)
+        half = 0.5 * np.diff(found["mu_star_interval95"], axis=1)[:, 0]
+        # Student's 2.02 for 1.96, n - 1 for n: 5 %; the bootstrap's own noise 2 sd of 5 %
+        np.testing.assert_allclose(
+            half, np.array(other["mu_star_conf"], dtype=float), rtol=0.15, atol=1e-9
+        )
+
+
+def test_a_closed_loop_agrees_with_salib(case, at_cube):
+    analyse_sobol, analyse_morris = (
+        pytest.importorskip("SALib.analyze.sobol"),
+        pytest.importorskip("SALib.analyze.morris"),
+    )
+    sampler = pytest.importorskip("SALib.sample.sobol")
+    x = sampler.sample(CUBE, 32, calc_second_order=False, seed=np.random.default_rng(9))
+    other = analyse_sobol.analyze(CUBE, at_cube(x), calc_second_order=False, seed=1)
+    study = sensitivity(
+        case, VARIED, method="sobol", samples=32, seed=9, measures="rms_error_total"
+    )
+    (column,) = study.columns
+    assert study.runs == len(x) == 32 * (D + 2)
+    np.testing.assert_allclose(column.effects["first"], other["S1"], atol=1e-9)
+    np.testing.assert_allclose(column.effects["total"], other["ST"], atol=1e-9)
+
+    points = indices.morris_points(D, 8, seed=9)
+    y = at_cube(points.reshape(-1, D))
+    other = analyse_morris.analyze(CUBE, points.reshape(-1, D), y, num_levels=4, seed=1)
+    (column,) = sensitivity(
+        case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
+    ).columns
+    for name in ("mu", "mu_star", "sigma"):
+        np.testing.assert_allclose(column.effects[name], np.array(other[name], dtype=float), atol=1e-9)
+    own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
+    assert column.nominal == pytest.approx(own, rel=1e-12)
+
+
+def test_local_against_central_differences(case, monkeypatch):
+    """In chunks of 4 numbers; with tied entries, absolute, normal and discrete distributions. A
+    step of 1e-5 of the half-width leaves 1e-9 of third derivatives and 1e-11 of rounding over a
+    slope of 1e-2 or more.
+    """
+    monkeypatch.setattr(local, "CHUNK", 4)
+    loop, names = case.loop, ("rms_error_total", "max_level", "rms_input")
+    varied = {
+        "plant.drain": Uniform(relative=0.05),
+        "plant.pump_gain": Normal(relative=0.02, tied=True),
+        "plant.orifice[0]": LogUniform(factor=1.3),
+        "x0[1]": Discrete(values=(5.0, 2.0, 4.0)),
+        "controller.k": Normal(mean=1.0, sd=0.004),
+    }
+    study = sensitivity(case, varied, measures=names)
+    drain, gain, orifice = (
+        np.asarray(get_value(loop, n))
+        for n in ("plant.drain", "plant.pump_gain", "plant.orifice[0]")
+    )
+    assert study.parameters == [
+        "plant.drain[0]",
+        "plant.drain[1]",
+        "plant.pump_gain",
+        "plant.orifice[0]",
+        "x0[1]",
+        "controller.k",
+    ]
+    moves = [
+        {"plant.drain[0]": 0.05 * drain[0]},
+        {"plant.drain[1]": 0.05 * drain[1]},
+        {"plant.pump_gain": 0.04 * gain},
+        {"plant.orifice[0]": orifice * (1.3 - 1 / 1.3) / 2},
+        {"x0[1]": 1.5},
+        {"controller.k": 0.008},
+    ]
+    step, seen = 1e-5, 0
+    for i, move in enumerate(moves):
+        ends = [
+            jaxtank.evaluate(
+                with_values(loop, {n: get_value(loop, n) + s * w for n, w in move.items()}),
+                case.clock,
+                names,
+            )
+            for s in (step, -step)
+        ]
+        want = np.concatenate([np.ravel(ends[0][m] - ends[1][m]) / (2 * step) for m in names])
+        got = np.array([c.effects["effect"][i] for c in study.columns])
+        np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-7)
+        seen += int((np.abs(got) > 1e-3).sum())
+    assert seen > 15
+    column = study.columns[0]
+    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.effects["effect"][0])
+    assert column.effects["elasticity"][0] == pytest.approx(
+        column.effects["effect"][0] / 0.05 / column.nominal
+    )
+    assert np.isnan(column.effects["derivative"][2])
+    sizes = np.abs(column.effects["effect"])[study.order(column)]
+    assert (np.diff(sizes) <= 0).all()
+    shown = study.to_json()["parameters"]
+    assert (
+        shown["plant.pump_gain"]["half_width_is"] == "2 standard deviations"
+        and shown["x0[1]"]["half_width"] == 1.5
+    )
+
+
+def test_batches_and_seeds(case):
+    """A run is the same in any batch, but for the last bits; the same seed gives the same bits,
+    another one others.
+    """
+    options = {"method": "sobol", "samples": 16, "measures": ("rms_error", "max_level")}
+    told = []
+    first = sensitivity(
+        case, VARIED, seed=3, progress=lambda done, total: told.append((done, total)), **options
+    )
+    assert told[-1] == (96, 96)
+    other = sensitivity(case, VARIED, seed=3, batch=7, **options)
+    for a, b in zip(first.columns, other.columns):
+        np.testing.assert_allclose(a.effects["total"], b.effects["total"], rtol=1e-9, atol=1e-12)
+    again, different = (
+        sensitivity(case, VARIED, seed=3, **options),
+        sensitivity(case, VARIED, seed=4, **options),
+    )
+    assert [c.label for c in first.columns][:3] == [
+        "rms_error of output 1",
+        "rms_error of output 2",
+        "max_level of tank 1",
+    ]
+    for a, b, c in zip(first.columns, again.columns, different.columns):
+        for name, value in a.effects.items():
+            np.testing.assert_array_equal(value, b.effects[name])
+        assert not np.array_equal(a.effects["total"], c.effects["total"])
+
+
+def test_noise_is_the_same_in_every_run(case):
+    """That of `evaluate` with the key of the seed. A parameter that does nothing has no effect at
+    all, although every run is noisy.
+    """
+    noisy = rig.set_values(case, {"sensor.noise": 0.1})
+    varied = {"plant.rim": Uniform(relative=0.01), "plant.drain": Uniform(relative=0.05, tied=True)}
+    (column,) = sensitivity(
+        noisy, varied, method="morris", samples=4, seed=6, measures="rms_error_total"
+    ).columns
+    assert not column.effects["mu_star"][:4].any() and column.effects["mu_star"][4] > 0
+    own = jaxtank.evaluate(noisy.loop, noisy.clock, "rms_error_total", jax.random.key(6))[
+        "rms_error_total"
+    ]
+    assert column.nominal == pytest.approx(float(own), rel=1e-12)
+
+
+def test_noise_may_vary_from_none(case):
+    """Travel of the pumps grows with the noise, which the case itself has none of."""
+    varied = {"sensor.noise": Uniform(low=0.0, high=0.2, tied=True)}
+    for column in sensitivity(
+        case, varied, method="morris", samples=4, measures="input_travel"
+    ).columns:
+        assert column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
+
+
+def test_runs_that_fail_are_counted_and_told(case):
+    study = sensitivity(
+        case,
+        {
+            "plant.drain[0]": LogUniform(low=1e-3, high=1e300),
+            "plant.pump_gain": Uniform(relative=0.05),
+        },
+        method="sobol",
+        samples=32,
+        measures="max_level",
+    )
+    draws = distributions.Draws(case.loop, study.distributions)
+    points = indices.sobol_points(3, 32, 0)
+    (group,) = groups_of([Lane("", case, None, 1.0)])
+    _, broken = values_of(group, ("max_level",), draws.values(points.reshape(-1, 3)))
+    count = int(np.sum(broken))
+    assert 0 < count < study.runs and study.failed == count
+    said = study.to_json()
+    assert said[
+        "failed"
+    ] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
+    assert all(c.not_finite >= count for c in study.columns)
+    whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
+    assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
+    json.dumps(said, allow_nan=False)
+
+
+def test_estimators_leave_out_what_is_not_finite():
+    y = ishigami(indices.sobol_points(3, 64, seed=0))
+    holed = y.copy()
+    holed[5, 2], holed[9, 0] = np.nan, np.inf
+    found, rest = indices.sobol_indices(holed), indices.sobol_indices(np.delete(y, [5, 9], axis=0))
+    np.testing.assert_array_equal(found["total"], rest["total"])
+    assert found["kept"] == 62
+    assert np.isnan(indices.sobol_indices(np.full((8, 5), 0.1))["first"]).all()  # does not vary
+    assert np.isnan(indices.sobol_indices(np.full((8, 5), np.nan))["total_interval95"]).all()
+    points = indices.morris_points(3, 6, seed=0)
+    y = ishigami(points)
+    y[2, 1] = np.inf
+    steps = indices.morris_effects(points, y)
+    assert np.isnan(steps[2]).sum() == 2 and np.isfinite(np.delete(steps, 2, axis=0)).all()
+    found = indices.morris_indices(steps)
+    assert sorted(found["kept"]) == [5, 5, 6]
+    np.testing.assert_allclose(found["mu"], np.nanmean(steps, axis=0))
+    np.testing.assert_allclose(
+        1e300 * indices.sobol_indices(holed)["sd"], indices.sobol_indices(1e300 * holed)["sd"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"method": "moris"}, "nearest: morris"),
+        ({"method": "morris", "samples": 1}, "samples = 1"),
+        ({"method": "sobol", "samples": True}, "samples = True"),
+        ({"measures": "rms_eror"}, "nearest: rms_error"),
+        ({"measures": "settling_time"}, "has no derivative"),
+        ({"measures": "recovery_time", "method": "sobol"}, "is undefined for"),
+        ({"spread": 1.5}, "spread = 1.5"),
+        ({"spread": float("nan")}, "spread = nan"),
+        ({"spread": 0.1, "distributions": VARIED}, "give one of them"),
+        ({"distributions": {}}, "nothing is uncertain"),
+        ({"distributions": {"plant.drian": Uniform(relative=0.1)}}, "nearest: plant.drain"),
+        ({"distributions": {"clock.dt": Uniform(relative=0.1)}}, "clock.dt"),
+        ({"distributions": {"plant.drain": Normal(mean=0.0, sd=1.0)}}, "at least 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"batch": 0}, "batch = 0"),
+    ],
+)
+def test_bad_input(case, options, words):
+    with pytest.raises(InputError) as error:
+        sensitivity(case, **options)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_correlated_parameters_have_local_effects_only(case):
+    names = ("plant.drain[0]", "plant.drain[1]")
+    joint = {"fit": distributions.Correlated(names=names, covariance=((4e-4, 3e-4), (3e-4, 9e-4)))}
+    assert local.half_widths(distributions.Draws(case.loop, joint)) == [
+        {names[0]: 0.04},
+        {names[1]: pytest.approx(0.06)},
+    ]
+    with pytest.raises(InputError, match="vary together"):
+        sensitivity(case, joint, method="sobol")
+
+
+def test_defaults_are_the_cases_own(case):
+    study = sensitivity(case, method="morris", samples=4)
+    assert {n: d.relative for n, d in study.distributions.items()} == dict(case.uncertain)
+    assert {c.measure for c in study.columns} == {*case.objective, "rms_error_total", "max_level"}
+    assert {d.relative for d in what_varies(case, spread=0.02).values()} == {0.02}
+    with pytest.raises(InputError, match="names nothing uncertain"):
+        sensitivity(case.replace(uncertain={}))
+
+
+def say(*args):
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.main(["sensitivity", *args])
+    return code, out.getvalue(), err.getvalue()
+
+
+SHORT = ("cascaded/pi", "--set", "clock.duration=400")
+
+
+@pytest.mark.parametrize(
+    ("method", "samples", "picture"),
+    [("local", "5", "tornado"), ("morris", "4", "tornado"), ("sobol", "20", "sobol")],
+)
+def test_command(tmp_path, method, samples, picture):
+    code, out, err = say(
+        *SHORT, "--method", method, "--samples", samples, "--vary", "plant.drain=uniform:5%", "--vary", "plant.pump_gain=normal:2%:tied",
+        "--measure", "max_level", "--measure", "ise", "--json", "--out", str(tmp_path / "found"),
+    )  # fmt: skip
+    assert code == 0
+    said = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert said["case"] == "cascaded/pi" and said["method"] == method and said["failed"] == 0
+    assert list(said["parameters"]) == ["plant.drain[1]", "plant.pump_gain"]
+    assert said["runs"] == {"local": 1, "morris": 4 * 3, "sobol": 32 * 4}[method]
+    assert {m: v["unit"] for m, v in said["measures"].items()} == {
+        "max_level of tank 1": "V",
+        "max_level of tank 2": "V",
+        "ise of output 1": "V^2 s",
+    }
+    for measure in said["measures"].values():
+        assert set(measure["parameters"]) == {"plant.drain[1]", "plant.pump_gain"}
+    assert any("rounded up to 32" in n for n in said["notes"]) == (method == "sobol")
+    assert json.loads((tmp_path / "found" / "result.json").read_text()) == said
+    rows = list(csv.DictReader((tmp_path / "found" / "sensitivity.csv").open()))
+    assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
+    index = sensitivity_tables.HEADS[method]
+    (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
+    for row in rows:
+        value = said["measures"][row["measure"]]["parameters"][row["parameter"]][key]
+        assert float(row[key] or "nan") == pytest.approx(
+            np.nan if value is None else value, rel=1e-9, nan_ok=True
+        )
+    assert matplotlib.image.imread(tmp_path / "found" / f"{picture}.png").shape[0] > 100
+    assert {p.name for p in (tmp_path / "found").iterdir()} == {
+        "result.json",
+        "sensitivity.csv",
+        "report.html",
+        f"{picture}.png",
+    }
+    assert ("run " in err) and "written to" in err
+
+
+def test_command_prints_tables():
+    code, out, err = say(
+        *SHORT, "--method", "sobol", "--samples", "16", "--spread", "0.02", "--quiet"
+    )
+    assert code == 0 and err == ""
+    assert (
+        "rms_error_total [V]" in out and "max_level of tank 2 [V]" in out and "relative 0.02" in out
+    )
+    assert "plant.pump_gain[0]" in out and "16 base points, 80 runs, 0 not finite" in out
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("cascaded/pid",),
+        (*SHORT, "--method", "sobel"),
+        (*SHORT, "--samples", "many"),
+        (*SHORT, "--method", "morris", "--samples", "0"),
+        (*SHORT, "--spread", "5%"),
+        (*SHORT, "--spread", "-0.1"),
+        (*SHORT, "--vary", "plant.drain"),
+        (*SHORT, "--vary", "plant.drain=gauss:5%"),
+        (*SHORT, "--vary", "plant.drain=uniform:5%", "--vary", "plant.drain=uniform:6%"),
+        (*SHORT, "--vary", "plant.drain=uniform:5%", "--spread", "0.1"),
+        (*SHORT, "--measure", "height"),
+        (*SHORT, "--seed", "x"),
+    ],
+    ids=" ".join,
+)
+def test_bad_command(args, tmp_path):
+    code, out, err = say(*args, "--out", str(tmp_path / "none"))
+    assert code == 2 and out == "" and not (tmp_path / "none").exists()
+    assert err.startswith("jaxtank: ") and err.count("\n") == 1 and "Traceback" not in err
+
+
+DEVICES = """
+import sys, jax, numpy as np
+import jaxtank, tuning
+from jaxtank import presets, rig
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", 3)
+case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0})
+for devices in (1, 3):
+    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, devices=devices, progress=lambda *done: print(*done))
+    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")])
+"""
+
+
+@pytest.mark.slow
+def test_three_devices_give_the_bits_of_one():
+    ran = subprocess.run([sys.executable, "-c", DEVICES], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    lines = ran.stdout.splitlines()
+    half = len([line for line in lines if line.startswith("[")])
+    numbers = [line for line in lines if line.startswith("[")]
+    assert half == 2 and numbers[0] == numbers[1] and "nan" not in numbers[0]
+    done = [int(line.split()[0]) for line in lines if not line.startswith("[")]
+    # 55 runs in batches of 8: seven, or three groups of three
+    assert done.count(54) == 2 and len(done) == 7 + 3
+    with pytest.raises(InputError, match="devices = 2: this process has 1"):
+        sensitivity(presets.find("cascaded/pi"), method="morris", devices=2)
+
+
+def test_a_cloud_shows_who_broke_a_limit_and_when():
+    pairs = np.array([[1.0, 0.5], [2.0, 1.0], [3.0, 3.5], [2.5, 1.5]])
+    held = np.array([[True, True], [False, True], [False, False], [False, True]])
+    ax = responses.cloud(plt.subplots()[1], pairs, held, "highest level", "cm", 3.2)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "highest level before [cm]",
+        "highest level after [cm]",
+    )
+    drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
+    assert drawn == {
+        "broke a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
+        "holds every limit, before and after (1 of 4)": [[1.0, 0.5]],
+        # it broke one before, too: the counts are of runs, each in one place
+        "breaks a limit after (1 of 4)": [[3.0, 3.5]],
+    }
+    labels = [line.get_label() for line in ax.lines]
+    assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()
+    far = responses.cloud(plt.subplots()[1], pairs * [1.0, 20.0], held, "cost", "-", 1e3)
+    assert far.get_xscale() == "log" and not any("limit" in line.get_label() for line in far.lines)
+    plt.close("all")
+
+
+def test_pictures():
+    figure, axes = plt.subplots(1, 3)
+    names = [f"p{i}" for i in range(20)]
+    effect = np.linspace(1.0, 0.05, 20) * (-1.0) ** np.arange(20)
+    ends = np.stack([np.abs(effect) - 0.1, np.abs(effect) + 0.1], axis=1)
+    ax = responses.tornado(axes[0], names, effect, "cm", "x")
+    assert (
+        ax.get_xlabel() == "change [cm]"
+        and len(ax.patches) == 2 * responses.BARS
+        and "6 smaller ones not shown" in ax.get_title()
+    )
+    assert [p.get_width() for p in ax.patches[:2]] == list(effect[:2]) and ax.yaxis_inverted()
+    ax = responses.elementary(
+        axes[1], names[:3], np.abs(effect[:3]), ends[:3], np.ones(3), "cm", "x"
+    )
+    assert (
+        ax.get_xlabel() == "change over the range [cm]"
+        and [t.get_text() for t in ax.get_yticklabels()] == names[:3]
+    )
+    ax = responses.shares(axes[2], names[:3], np.ones(3), np.ones(3), ends[:3], ends[:3], "x")
+    assert "[-]" in ax.get_xlabel() and len(ax.patches) == 6
+    segments = np.array(ax.collections[0].get_segments())
+    np.testing.assert_allclose(
+        np.sort(segments[:, :, 0], axis=1),
+        np.stack([np.minimum(ends[:3, 0], 1), np.maximum(ends[:3, 1], 1)], axis=1),
+    )
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("unit", "of", "words"),
+    [
+        ("cm", "cm^2", "cm per cm^2"),
+        ("cm", "-", "cm"),
+        ("-", "V", "1 per V"),
+        ("-", "-", "-"),
+        ("V^2 s", "cm^3/(s V)", "V^2 s per cm^3/(s V)"),
+    ],
+)
+def test_the_unit_of_a_derivative(unit, of, words):
+    assert sensitivity_tables.per(unit, of) == words
+
+
+def test_numbers_with_a_unit_say_it(tmp_path):
+    """Centimetres of error for a square centimetre of an outlet, or for a volt and second of a
+    pump: in table, JSON and CSV.
+    """
+    words = (
+        "mirakhorli/sfc",
+        "--vary",
+        "plant.drain=uniform:5%",
+        "--vary",
+        "plant.split=uniform:5%:tied",
+    )
+    words += ("--set", "clock.duration=20", "--measure", "max_level", "--measure", "ise")
+    code, out, err = say(*words, "--method", "local", "--out", str(tmp_path))
+    assert code == 0, err
+    assert (
+        "effect [cm]" in out
+        and "effect [cm^2 s]" in out
+        and re.search(r"\d cm per cm\^2\b", out)
+        and "cm^2 s per cm^2" in out
+    )
+    said = json.loads((tmp_path / "result.json").read_text())["measures"]
+    assert (
+        said["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"]
+        == "cm per cm^2"
+    )
+    assert said["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
+    rows = list(csv.DictReader((tmp_path / "sensitivity.csv").open()))
+    assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {
+        "cm^2 s per cm^2",
+        "cm^2 s",
+    }
+    code, out, _ = say(*words, "--method", "morris", "--samples", "4", "--quiet")
+    assert code == 0 and "mu* [cm]" in out and "sigma [cm^2 s]" in out

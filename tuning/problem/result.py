@@ -1,0 +1,65 @@
+"""What every result offers: text, HTML for a notebook, JSON, pictures and files.
+
+The base classes of the results of `tuning`; their reports are opened when they are asked for.
+"""
+
+import importlib
+from pathlib import Path
+from typing import Any, ClassVar
+
+
+class Shown:
+    """A result that a notebook displays as HTML: what `str` reports, all of it escaped."""
+
+    def _repr_html_(self) -> str:
+        """Return the lines and tables of the result as a fragment of HTML."""
+        from tuning.report.html import fragment
+
+        return fragment(self._lines())
+
+    def _lines(self) -> list[Any]:
+        """Return what `str` reports: lines of text and tables."""
+        return str(self).splitlines()
+
+
+class Result(Shown):
+    """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`.
+
+    `REPORT` names the module with its `lines`, `json_of`, `figures` and `save`.
+    """
+
+    REPORT: ClassVar[str]
+
+    def _report(self) -> Any:
+        return importlib.import_module(self.REPORT)
+
+    def _lines(self) -> list[Any]:
+        return self._report().lines(self)
+
+    def __repr__(self) -> str:
+        return "\n".join(map(str, self._lines()))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON object that the command prints with --json: plain numbers, no NaN."""
+        return self._report().json_of(self)
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {name: Figure} of what there is to show."""
+        return self._report().figures(self)
+
+    def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
+        """Write result.json, tables, pictures and report.html to `folder`; return their paths.
+
+        Parameters
+        ----------
+        folder
+            Where to write; made if need be.
+        command
+            The command line that made the result, printed in the report.
+
+        Raises
+        ------
+        InputError
+            `folder` cannot be written to.
+        """
+        return self._report().save(self, folder, command)

@@ -1,0 +1,266 @@
+"""Tables of a tuning result, as text and for its page; imported by the report of that result."""
+
+import numpy as np
+
+from jaxtank import measures as ms
+from tuning.problem.problem import TAIL
+from tuning.report.tables import clean, number, numbers, objective_unit, table
+
+COSTLIEST, MANY = 5, 12
+"""Scenarios in a table that would have more than MANY rows."""
+
+
+def parts_of(result):
+    """Return what is printed of a TuningResult but for its message: lines and Tables."""
+    problem, evaluations = result.problem, result.evaluations
+    parts = [
+        f"{result.tuned.name}: {result.status} ({result.method},"
+        f" {evaluations['simulations']} simulations, {evaluations['gradients']} of them with"
+        f" gradients, {result.wall_s:.1f} s)",
+        "",
+        _parameter_table(result),
+        "",
+        *_measure_table(result),
+        "",
+    ]
+    parts += _limit_table(result) + _scenario_table(result) + _validation_table(result)
+    parts += _choice_table(result) + _tradeoff_table(result)
+    if result.bound is not None:
+        parts += [str(result.bound), ""]
+    if result.tuned.loop.plant.overflow:
+        rims = "rims are physics: liquid above them overflows"
+    elif any(limit.measure == "max_level" for limit in problem.limits):
+        rims = "rims are limits: a level may rise above one"
+    else:
+        rims = "rims are neither physics nor limits here: a level may rise above one unnoticed"
+    return [*parts, f"{rims}; evaluated at dt = {result.tuned.clock.dt:g} s"]
+
+
+def _parameter_table(result):
+    """Every free parameter before and after, its range, and how sensitive the objective is to it."""
+    rows = []
+    for name, p in result.parameters.items():
+        remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
+        rows.append(
+            [
+                name,
+                p["unit"],
+                number(p["before"]),
+                number(p["after"]),
+                f"{number(p['lower'])} : {number(p['upper'])}",
+                "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
+                remark if p["exercised"] else "without effect, kept",
+            ]
+        )
+    heads = ["parameter", "unit", "before", "after", "range"]
+    return table(rows, [*heads, "10 % of it changes the objective by", ""])
+
+
+def _measure_table(result):
+    """The objective and the measures of the case's own run, and a line on which run they are of."""
+    units = result.tuned.loop.units
+    objective, measures = result.objective, result.measures
+    unit = objective_unit(objective["terms"], units)
+    rows = [["objective", unit, number(objective["before"]), number(objective["after"])]]
+    alone = set(objective["terms"])
+    for m in ms.placed("shown"):
+        if m not in measures["after"] or (m == "rms_error_total" and alone == {m}):
+            continue
+        before = numbers(measures["before"][m], 4)
+        after = numbers(measures["after"][m], 5 if "level" in m else 4)
+        rows.append([m, ms.unit(m, units), before, after])
+    heads = ["measure", "unit", "before", "after"]
+    return [table(rows, heads), *_runs_of(result, len(rows) > 1)]
+
+
+def _limit_table(result):
+    """Every limit in its worst scenario: value, margin, and when it was reached."""
+    if not result.constraints:
+        return []
+    rows = [
+        [
+            c["name"],
+            c["unit"],
+            (">= " if ms.MEASURES[c["measure"]].sense < 0 else "<= ") + number(c["limit"], 7),
+            number(c["value"], 7),
+            number(c["margin"], 3) if c["reason"] is None else "undefined",
+            f"{c['time_s']:.2f} s" if c["time_s"] is not None else "-",
+        ]
+        for c in worst_of_scenarios(result.constraints)
+    ]
+    return [table(rows, ["limit", "unit", "limit", "value", "margin", "reached at"]), ""]
+
+
+def _runs_of(result, others):
+    """Return a line on the runs that the objective is of, where these are scenarios.
+
+    others: whether the table of measures has other rows.
+    """
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    what = "plants" if result.certificate is not None else "scenarios"
+    weighted = len({lane.weight for lane in problem.lanes}) > 1
+    of = {
+        "mean": "the weighted mean" if weighted else "the mean",
+        "cvar": f"the mean of the worst {100 * TAIL:g} %",
+        "worst": "the worst",
+    }
+    rest = "; the other rows: the case's own run, on its own plant" if others else ""
+    return [f"objective: {of[problem.risk]} of {len(problem.lanes)} {what}{rest}"]
+
+
+def worst_of_scenarios(constraints):
+    """Return of the rows of `constraints` that differ by their scenario alone the worst ones.
+
+    Parameters
+    ----------
+    constraints : list of dict
+        Rows of `TuningResult.constraints`.
+
+    Returns
+    -------
+    list of dict
+        For each limit, the row with the least margin.
+
+    Examples
+    --------
+    >>> row = {"measure": "max_level", "tank": 1, "name": "max_level tank 1", "scenario": None}
+    >>> [r["margin"] for r in worst_of_scenarios([row | {"margin": m} for m in (2.0, 0.5)])]
+    [0.5]
+    """
+    worst = {}
+    for c in constraints:
+        same = (c["measure"], c["tank"], c["name"].removesuffix(f" in {c['scenario']}"))
+        if same not in worst or c["margin"] < worst[same]["margin"]:
+            worst[same] = c
+    return list(worst.values())
+
+
+def scenario_rows(result):
+    """Return one dict for each scenario of a TuningResult, [] for the case's own run alone.
+
+    Its keys: name, weight, objective {before, after}, limits_held {before, after}.
+    """
+    problem = result.problem
+    if not problem.scenarios:
+        return []
+    rows = []
+    for i, lane in enumerate(problem.lanes):
+        limits = [limit for limit in problem.limits if limit.lane == i]
+        sides = {side: tables[i] for side, tables in result.tables.items()}
+        held = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
+        costs = clean({side: problem.cost(table) for side, table in sides.items()})
+        rows.append(
+            {"name": lane.name, "weight": lane.weight, "objective": costs, "limits_held": held}
+        )
+    return rows
+
+
+def _scenario_table(result):
+    """Every scenario, or of more than MANY the costliest."""
+    scenarios, limited = scenario_rows(result), bool(result.problem.limits)
+    if not scenarios:
+        return []
+
+    def cost(scenario, side="after"):
+        value = scenario["objective"][side]
+        return np.inf if value is None else value
+
+    many = len(scenarios) > MANY
+    shown = sorted(scenarios, key=lambda s: -cost(s))[:COSTLIEST] if many else scenarios
+    rows = [
+        [
+            s["name"],
+            number(s["weight"], 3),
+            *(number(cost(s, side)) for side in ("before", "after")),
+            ("yes" if s["limits_held"]["after"] else "no") if limited else "-",
+        ]
+        for s in shown
+    ]
+    found = [table(rows, ["scenario", "weight", "objective before", "after", "limits held after"])]
+    if many:
+        held = sum(s["limits_held"]["after"] for s in scenarios)
+        kept = f"; limits held after in {held}" if limited else ""
+        found.append(f"the {COSTLIEST} costliest of {len(scenarios)} scenarios{kept}")
+    return [*found, ""]
+
+
+def _validation_table(result):
+    """The objective and the limits on the validation set, before and after."""
+    found = result.validation
+    if not found:
+        return []
+    rows = [
+        [
+            side,
+            *(number(found["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")),
+            f"{100 * found['limits_held'][side]:.0f} %",
+        ]
+        for side in ("before", "after")
+        if found["limits_held"][side] is not None
+    ]
+    if not rows:
+        return [f"validation runs: all {found['samples']} failed", ""]
+    heads = [f"on {found['samples']} validation runs", "mean objective", "5 %", "median", "95 %"]
+    if result.problem.limits:
+        heads.append("all limits held in")
+    else:
+        rows = [row[:-1] for row in rows]
+    perturbed = (
+        n if share is None else f"{n} +-{100 * share:g} %" for n, share in found["spread"].items()
+    )
+    perturbed = ", ".join(perturbed) or "nothing of the plant"
+    noise = ", new sensor noise" if found["noise"] else ""
+    failed = f"; {found['failed']} runs failed and are left out" if found["failed"] else ""
+    return [table(rows, heads), f"{_improved(found)}; perturbed: {perturbed}{noise}{failed}", ""]
+
+
+def _improved(found):
+    """Return in how many validation runs tuning improved the objective, in words.
+
+    Runs are compared where both hold every limit: to break one may lower the objective.
+    """
+    if found["comparable"] == 1.0:
+        return f"tuning improved the objective in {100 * found['better_share']:.0f} % of them"
+    part = f"every limit holds both before and after in {100 * found['comparable']:.3g} % of them"
+    share = found["better_share_of_comparable"]
+    if share is None:
+        return f"{part}, so the objectives cannot be compared"
+    return f"{part}, and tuning improved the objective in {100 * share:.0f} % of those"
+
+
+def _choice_table(result):
+    if not result.choices:
+        return []
+    rows = [
+        [
+            ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
+            c["status"],
+            number(c["objective"]["before"]),
+            number(c["objective"]["after"]),
+        ]
+        for c in result.choices
+    ]
+    return [table(rows, ["choice", "status", "objective before", "after"]), ""]
+
+
+def _tradeoff_table(result):
+    if not result.tradeoff:
+        return []
+    unit = ms.unit(result.tradeoff["measure"], result.tuned.loop.units)
+    rows = [
+        [
+            number(p["limit"]),
+            p["status"],
+            number(p["objective"]),
+            ", ".join(f"{n} {number(v, 4)}" for n, v in p["parameters"].items()),
+        ]
+        for p in result.tradeoff["points"]
+    ]
+    return [
+        table(
+            rows, [f"limit of {result.tradeoff['measure']} [{unit}]", "status", "objective", "at"]
+        ),
+        "",
+    ]

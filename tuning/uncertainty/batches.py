@@ -1,0 +1,209 @@
+"""Batches of runs of one case on drawn parameters, on one device or many; used by the studies."""
+
+import functools
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, with_values
+from jaxtank.loop import run as lp
+from jaxtank.xla.flags import WIDE
+from tuning.problem import scenarios as sc
+from tuning.uncertainty.sampling import check_whole
+
+BATCH = 256
+"""Draws in a batch, on each device: enough to fill the vector units, few enough for the cache."""
+
+POINTS, SAMPLES = 64, 1 << 22
+"""Runs in a batch of `Runs`, and most samples of all of them: each holds its signals."""
+
+NOISE = 1 << 27
+"""Bytes of sensor noise that a batch may hold: long noisy runs have smaller batches."""
+
+FAN_BATCH, FAN_ROWS = 64, 240
+"""Draws simulated at once, and time stamps, of a fan chart."""
+
+CUTS = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of a fan chart [-]."""
+
+
+def check_devices(devices):
+    """Raise InputError unless this process has so many devices."""
+    check_whole("devices", devices, 1)
+    if devices > jax.local_device_count():
+        raise InputError(
+            f"devices = {devices}: this process has {jax.local_device_count()} (jax_num_cpu_devices"
+            " before jax starts)"
+        )
+
+
+def batch_size(case, noisy, samples):
+    """Return the draws of a batch: a power of 2 that memory and the number of samples allow."""
+    size = case.clock.samples * case.loop.plant.tanks * 8 if noisy else 1
+    most = max(1, min(BATCH, NOISE // size))
+    return 1 << (min(most, max(1, samples)).bit_length() - 1)
+
+
+class Runner:
+    """Runs a batch on each of `devices` at once, each by the program of a single device.
+
+    Each device has a thread. One program partitioned over the devices (shard_map) rounds the last
+    bit differently from the program of a single device; this does not.
+    """
+
+    def __init__(self, case, names, seed, devices):
+        self.case, self.names, self.seed = case, names, seed
+        self.devices = jax.local_devices()[:devices]
+        self.pool = ThreadPoolExecutor(devices)
+
+    def __call__(self, rows, indices):
+        """Return [{measure: (batch, ...), "failed": (batch,)}], at most one for each device."""
+        return list(self.pool.map(self._one, self.devices, rows, indices))
+
+    def _one(self, device, rows, indices):
+        values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
+        found = _run(self.case.loop, values, indices, self.seed, self.case.clock, self.names)
+        return {n: np.asarray(v) for n, v in found.items()}
+
+
+@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"), compiler_options=WIDE)
+def _run(loop, values, indices, seed, clock, names):
+    def one(values, index):
+        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
+        measures, diverged = lp.evaluate_and_flag(with_values(loop, values), clock, names, noise)
+        return {**measures, "failed": diverged.astype(jnp.result_type(float))}
+
+    return jax.vmap(one)(values, indices)
+
+
+def gather(batches, count):
+    """Return {number: batch} of all processes."""
+    from jax.experimental import multihost_utils
+
+    most = -(-count // jax.process_count())
+    template = next(iter(batches.values()))
+    padded = {
+        n: np.stack([batches.get(k, template)[n] for k in _share(count, most)]) for n in template
+    }
+    everywhere = multihost_utils.process_allgather(padded)
+    return {
+        k: {n: v[k % jax.process_count(), k // jax.process_count()] for n, v in everywhere.items()}
+        for k in range(count)
+    }
+
+
+def _share(count, most):
+    return [i * jax.process_count() + jax.process_index() for i in range(most)]
+
+
+class Runs:
+    """A case as a function of (n, D) probabilities; returns (n, K) entries of measures.
+
+    An entry is NaN where its run is not finite.
+
+    Batches have one size, so that one compiled program serves; the case's own run goes first. After
+    a call `nominal` (K,) holds its values and `failed` the number of other runs that stopped being
+    finite.
+    """
+
+    def __init__(self, case, draws, names, key, batch=None, progress=None, devices=1):
+        (self.group,) = sc.groups_of([sc.Lane("", case, key, 1.0)])
+        self.own = {
+            name: np.asarray(get_value(case.loop, name))[None]
+            for name in draws.values(np.zeros((0, draws.dimensions)))
+        }
+        self.draws, self.names, self.progress = draws, names, progress
+        self.batch = batch or max(
+            8, min(POINTS, 1 << (max(1, SAMPLES // case.clock.samples).bit_length() - 1))
+        )
+        self.nominal: Any = None
+        self.failed = 0
+        self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
+
+    def _batch(self, device, values):
+        measures, broken = sc.values_of(self.group, self.names, jax.device_put(values, device))
+        flat = np.concatenate(
+            [np.asarray(measures[m])[:, 0].reshape(len(broken), -1) for m in self.names], axis=1
+        )
+        return np.where(np.asarray(broken), np.nan, flat), np.asarray(broken)[:, 0]
+
+    def __call__(self, p):
+        values = {
+            name: np.concatenate([self.own[name], v]) for name, v in self.draws.values(p).items()
+        }
+        total, found = len(p) + 1, []
+        size = min(self.batch, total)
+        starts = range(0, total, size)
+        for group in (
+            starts[i : i + len(self.devices)] for i in range(0, len(starts), len(self.devices))
+        ):
+            rows = [
+                np.minimum(np.arange(start, start + size), total - 1) for start in group
+            ]  # the last run repeated to fill the batch
+            done = self.pool.map(
+                self._batch,
+                self.devices,
+                [{name: v[r] for name, v in values.items()} for r in rows],
+            )
+            for start, (flat, diverged) in zip(group, done):
+                found.append(flat[: total - start])
+                # the case's own run, the very first, is not counted
+                self.failed += int(diverged[int(start == 0) : total - start].sum())
+            if self.progress is not None:
+                self.progress(min(group[-1] + size, total) - 1, len(p))
+        found = np.concatenate(found)
+        self.nominal = found[0]
+        return found[1:]
+
+
+def fan_of(case, values, seed):
+    """Return the quantiles CUTS of the trajectories of drawn parameters at fixed times.
+
+    Parameters
+    ----------
+    case : Case
+    values : dict
+        {name: (draws, ...)}.
+    seed : int or None
+        Of the sensor noise; None without.
+
+    Returns
+    -------
+    dict or None
+        {"t" (rows,), "r" (rows, outputs), "x" (5, rows, tanks), "u" (5, rows, pumps), "draws" that
+        are finite, "of" how many}; None where no draw is finite.
+    """
+    every = max(1, (case.clock.samples - 1) // FAN_ROWS)
+    size, found = len(next(iter(values.values()))), []
+    for start in range(0, size, FAN_BATCH):
+        index = np.minimum(np.arange(start, start + FAN_BATCH), size - 1)
+        rows = {n: v[index] for n, v in values.items()}
+        run = _trajectories(case.loop, rows, index.astype(np.uint32), seed, case.clock, every)
+        t, r, x, u = map(np.asarray, run)
+        found.append((x[: size - start], u[: size - start]))
+    x, u = (np.concatenate(column) for column in zip(*found))
+    finite = np.isfinite(x).all(axis=(1, 2))
+    if not finite.any():
+        return None
+    return {
+        "t": t[0],
+        "r": r[0],
+        "x": np.quantile(x[finite], CUTS, axis=0),
+        "u": np.quantile(u[finite], CUTS, axis=0),
+        "draws": int(finite.sum()),
+        "of": size,
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("seed", "clock", "every"))
+def _trajectories(loop, values, indices, seed, clock, every):
+    def one(values, index):
+        noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
+        run = lp.simulate_compiled(with_values(loop, values), clock, noise, every)[0]
+        return run.t, run.r, run.x, run.u
+
+    return jax.vmap(one)(values, indices)
