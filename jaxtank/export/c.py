@@ -47,7 +47,7 @@ class C(Printer):
     real = "R({0})"
     truths = ("0", "1")
     constant, variable = "const {kind} {name} = {value};", "{kind} {name} = {value};"
-    open_array, close_array = "const real {name}[{size}] = {{", "}};"
+    open_array, close_array = "const real {name}[{size}] = {{", "};"
     matrix_call = "real {name}[{size}];\n{op}({arguments}, {name});"
     counted, endless, end = "for (int i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
     until = "if (!({0})) break;"

@@ -107,9 +107,7 @@ def _check_sizes(loop: ClosedLoop) -> None:
 
 
 def _check_saturation(loop: ClosedLoop) -> None:
-    if loop.actuator.allocates and (
-        loop.plant.pumps != 2 or not loop.controller.allocates
-    ):
+    if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
         raise InputError(
             "actuator.saturation = 'boxqp': needs two pumps and a controller with a cost to"
             " allocate by (its input_metric)"

@@ -222,7 +222,9 @@ def _past(run, sample, context):
     step.
     """
     return tuple(
-        lower_clip(jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0)
+        lower_clip(
+            jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0
+        )
         for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
     )
 

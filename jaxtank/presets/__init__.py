@@ -1,10 +1,11 @@
-"""The papers, one file each: rigs, cases, published numbers, what may be tuned, what is uncertain,
-departures.
+"""The papers, one file each: rigs, cases, published numbers, tunable parameters, departures.
+
+A paper is a module of this folder with a function `preset`, found by its name; `register` adds one
+from outside. Where one file would be too long, the closed loops are in `loops/<paper>.py`. May be
+imported by every folder above `jaxtank.case`.
 
 preset = presets.load("gouta2015")
 case = preset.cases["backstepping"]     # .loop .clock .limits
-
-A paper is a module of this folder with a function `preset`; to add one, add its file.
 """
 
 import dataclasses
@@ -17,19 +18,73 @@ from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.presets.paper import Claim, Preset, Published
 
-PAPERS = tuple(
-    sorted(
-        m.name
-        for m in pkgutil.iter_modules(__path__)
-        if m.name != "paper" and not m.name.startswith("_")
-    )
+PAPERS = sorted(
+    m.name
+    for m in pkgutil.iter_modules(__path__)
+    if m.name != "paper" and not m.ispkg and not m.name.startswith("_")
 )
+"""Names of the papers: the modules of this folder, then those that were added by `register`."""
+
+_ADDED: dict[str, Preset] = {}
+
+
+def register(preset: Preset) -> Preset:
+    """Add a paper from outside this package.
+
+    Its cases are then found by `find` and by the command line as "paper/case", and are printed by
+    `jaxtank list`, `show` and `compare`.
+
+    Parameters
+    ----------
+    preset : Preset
+
+    Returns
+    -------
+    The preset.
+
+    Raises
+    ------
+    InputError
+        For a name that is taken by another paper, and for a case whose name does not begin with the
+        paper's.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> preset = presets.load("cascaded")
+    >>> case = preset.cases["pi"].replace(name="tutorial/pi", title="the first example")
+    >>> own = dataclasses.replace(preset, paper="tutorial", cases={"pi": case})
+    >>> _ = presets.register(own)
+    >>> presets.find("tutorial/pi").title
+    'the first example'
+    """
+    paper = preset.paper
+    if _ADDED.get(paper) is preset:
+        return preset
+    if paper in PAPERS:
+        raise InputError(f"paper {paper!r} is taken: choose another name")
+    for name, case in preset.cases.items():
+        if case.name != f"{paper}/{name}":
+            raise InputError(f"case {case.name!r}: must be named {paper}/{name}")
+    _ADDED[paper] = preset
+    PAPERS.append(paper)
+    return preset
 
 
 def load(paper: str) -> Preset:
-    """The Preset of `paper`, one of PAPERS; the Case of "paper/case", as `find`. Raises InputError
-    for another name.
+    """Return the Preset of a paper, or the Case of "paper/case" as `find` does.
 
+    Parameters
+    ----------
+    paper : one of PAPERS
+
+    Raises
+    ------
+    InputError
+        For an unknown paper or case, with the nearest names.
+
+    Examples
+    --------
     >>> load("gouta2015/ngpc") is find("gouta2015/ngpc")
     True
     """
@@ -42,15 +97,21 @@ def load(paper: str) -> Preset:
 
 @functools.cache
 def _load(paper):
-    preset = importlib.import_module(f"jaxtank.presets.{paper}").preset()
+    preset = _ADDED.get(paper) or importlib.import_module(f"jaxtank.presets.{paper}").preset()
     spread = {name: share for name, (share, _) in preset.uncertain.items()}
     cases = Cases({name: case.replace(uncertain=spread) for name, case in preset.cases.items()})
     return dataclasses.replace(preset, cases=cases)
 
 
 class Cases(dict):
-    """The cases of a paper by name; `cases[name]` raises InputError for an unknown one, with the
-    nearest.
+    """The cases of a paper by name; an unknown one raises InputError.
+
+    Examples
+    --------
+    >>> load("calofir").cases["rest"]
+    Traceback (most recent call last):
+    ...
+    jaxtank.core.errors.InputError: unknown case 'rest'...
     """
 
     def __missing__(self, name):
@@ -58,12 +119,33 @@ class Cases(dict):
 
 
 def names() -> list[str]:
-    """Every case as "paper/case", in the order of the papers."""
+    """Return every case as "paper/case", in the order of the papers.
+
+    Examples
+    --------
+    >>> "khalid/gpc" in names()
+    True
+    """
     return [f"{paper}/{case}" for paper in PAPERS for case in load(paper).cases]
 
 
 def find(name: str) -> Case:
-    """The Case of "paper/case". Raises InputError for an unknown one, with the nearest names."""
+    """Return the Case of "paper/case".
+
+    Parameters
+    ----------
+    name : "paper/case", as `names` lists them
+
+    Raises
+    ------
+    InputError
+        For an unknown one, with the nearest names.
+
+    Examples
+    --------
+    >>> find("mirakhorli/sfc").clock.duration
+    400.0
+    """
     if not isinstance(name, str):
         raise InputError(f"case {name!r}: must be a text, as 'gouta2015/ngpc'")
     paper, _, case = name.partition("/")
@@ -87,4 +169,5 @@ __all__ = [
     "find",
     "load",
     "names",
+    "register",
 ]

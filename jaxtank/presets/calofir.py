@@ -1,5 +1,6 @@
-"""Calofir and others: two coupled tanks in metres, backstepping. Derivation and labels:
-notes/calofir.md.
+"""Calofir and others: two coupled tanks in metres, backstepping.
+
+The derivation is in `notes/calofir.md`.
 """
 
 import dataclasses
@@ -19,13 +20,13 @@ from jaxtank.loop.run import simulate
 from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, Published, verdict
 from jaxtank.signals.setpoints import ramps
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
 Q0, H0 = 1e-4, 0.6  # sec. 3.1: largest flow [m^3/s] and level [m]
 GRAVITY = 9.81  # not printed; only c = (effective area) sqrt(2 g) matters [m/s^2]
-KAPPA = C1**2 / (C1**2 + C2**2)  # h3/h1 at rest (notes S2.2)
+KAPPA = C1**2 / (C1**2 + C2**2)  # h3/h1 in the steady state (notes S2.2)
 SPEED = (2 * GRAVITY) ** 0.5
 START = 0.05  # h1 at t = 0 [m] (notes A2)
 
@@ -35,29 +36,30 @@ KS = tuple(TUNABLE)
 
 DEPARTURES = (
     (
-        "Equations: the errata of the paper are mended (notes S5): signs of (12a), (14) and of the"
-        " first term of f_a in (16); d phi/d z in (4); (20) is v, not phi; in (21) a/z0 for z/z0,"
-        " and the denominators of v_i and v_ii. As printed, the law does not rest at the reference."
+        "Equations: the errata of the paper are corrected (notes S5): signs of (12a), (14) and of"
+        " the first term of f_a in (16); d phi/d z in (4); (20) is v, not phi; in (21) a/z0 for"
+        " z/z0, and the denominators of v_i and v_ii. As printed, the controller does not settle at"
+        " the reference."
     ),
     (
-        "The law is computed in physical units (notes S4.2): z0 and Q0 cancel exactly, as long as"
-        " z0 is one number."
+        "The controller computes in physical units (notes S4.2): z0 and Q0 cancel exactly, as long"
+        " as z0 is one number."
     ),
     (
         "Gains: none are printed. K_phi = 0.02 1/s, K_y = 0.1 1/s: no overshoot, because K_phi is"
         " below b/(2 sqrt(h3r)) + a/(2 z3r) (notes S4.3)."
     ),
     (
-        "Scenario: Figs. 2 and 3 are lost. 0.48 m for 600 s, then 0.30 m for 600 s, from h = (0.05,"
-        " 0.05 kappa) m (notes A2)."
+        "Scenario: Figs. 2 and 3 are missing in our copy. 0.48 m for 600 s, then 0.30 m for 600 s,"
+        " from h = (0.05, 0.05 kappa) m (notes A2)."
     ),
     (
         "Perturbed: c2 at 75 % for 300-450 s and a leak 0.2 c1 sqrt(h1) out of the first tank for"
         " 900-1050 s; the paper does not say what its faults were (notes A3)."
     ),
     (
-        "Floors in the law only: h3 and h1 - h3 are taken as at least 1e-4 m, without which it"
-        " never starts from empty tanks (notes A4, H1)."
+        "Lower clips in the controller only: h3 and h1 - h3 are taken as at least 1e-4 m, without"
+        " which it never starts from empty tanks (notes A4, H1)."
     ),
     (
         "Gravity: only the products c1, c2 are printed; orifice areas are c/sqrt(2 g) with g = 9.81"
@@ -96,8 +98,9 @@ PUBLISHED = {
 
 
 def rig():
-    """The paper's tanks T1, T3 in m and m^3/s: T1 is pumped and its level is the output; T3 drains
-    to the basin.
+    """Return the paper's tanks T1 and T3 in m and m^3/s.
+
+    T1 is pumped and its level is the output; T3 drains to the basin.
     """
     return coupled_tanks(
         area=A,
@@ -116,7 +119,7 @@ def rig():
 
 
 def build(perturbed=False):
-    """The closed loop, with the faults of notes S3 if `perturbed`."""
+    """Return the closed loop, with the faults of notes S3 if `perturbed`."""
     plant = rig()
     events = [("drain[1]", 300, 450, 0.75, 0.0), ("drain[0]", 900, 1050, 1.0, 0.2 * C1 / SPEED)]
     return ClosedLoop(
@@ -151,23 +154,19 @@ STEP = (0.10, 0.40)
 ACCURATE, SAME = 1e-3, 0.05
 
 
-def verdict(holds):
-    """The verdict of a claim that was measured to hold, or not to."""
-    return "reproduced" if holds else "not reproduced"
-
-
 def constant_flow(case):
-    """Error of h1 [m] (samples,) with the flow at which each setpoint rests in the law's place (u_s
-    alone, notes S7.1).
+    """Return the error of h1 (samples,) [m] with the steady flow of each setpoint instead of the
+    controller (u_s alone, notes S7.1).
     """
     up, down = (C1 * (h * (1 - KAPPA)) ** 0.5 for h in (0.8 * H0, 0.5 * H0))
-    law = OpenLoop(signal=ramps([up], [(600.0, 0, down)], ramp=0.0))
-    return np.asarray(simulate(dataclasses.replace(case.loop, controller=law), case.clock).e[:, 0])
+    flow = OpenLoop(signal=ramps([up], [(600.0, 0, down)], ramp=0.0))
+    return np.asarray(simulate(dataclasses.replace(case.loop, controller=flow), case.clock).e[:, 0])
 
 
 def same_everywhere(run, values):
-    """Largest difference between the decays of h3 - h3r after steps of h1r by 0.1 m from the levels
-    STEP, as a share of the step.
+    """Return the largest difference between two decays of h3 - h3r, as a share of the step.
+
+    They follow steps of h1r by 0.1 m from the levels STEP.
     """
     shares = []
     for level in STEP:
@@ -182,22 +181,20 @@ def same_everywhere(run, values):
 
 
 def measured(run):
-    """What can be measured of PUBLISHED (see presets.base.Preset). Verdicts follow from the numbers
-    in their texts.
-    """
+    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
     case, plain = run("backstepping")
     hurt_case, hurt = run("backstepping-perturbed")
     plant, ends, e = case.loop.plant, [449, 1049], plain.e[:, 0]
     w = float(np.sqrt(2 * plant.gravity))
-    rest = np.abs(e[[599, 1199]]).max()
-    # what the faults do to h1 by their ends, with the law and with a constant flow; and what the
-    # law does to the flow
+    steady = np.abs(e[[599, 1199]]).max()
+    # the effect of the faults on h1 at their ends, with the controller and with a constant flow,
+    # and the change of the flow by the controller
     shift, push = (hurt.e - plain.e)[ends, 0], (hurt.u - plain.u)[ends, 0]
     left = constant_flow(hurt_case)
     open_shift = (left - constant_flow(case))[ends]
     reacts = np.all(np.abs(shift) < 0.5 * np.abs(open_shift)) and np.all(push * open_shift < 0.0)
     offsets = hurt.e[ends, 0]
-    free, held = (
+    unlimited, limited = (
         same_everywhere(run, {"actuator.low": -1.0, "actuator.high": 1.0}),
         same_everywhere(run, {}),
     )
@@ -207,16 +204,16 @@ def measured(run):
         "c2": float(plant.drain[1]) * w,
         "setpoints, share of h0": (plain.r[0, 0] / H0, plain.r[-1, 0] / H0),
         "steady state follows very accurately": Claim(
-            verdict(rest < ACCURATE),
-            f"error at the end of each plateau at most {rest:.1e} m (counts if below"
+            verdict(steady < ACCURATE),
+            f"error at the end of each plateau at most {steady:.1e} m (counts if below"
             f" {ACCURATE:g} m)",
         ),
         "reacts rapidly to faults": Claim(
             verdict(reacts),
             f"by its end, the partly closed outlet has moved h1 by {shift[0]:.5f} m and the leak by"
             f" {shift[1]:.5f} m; with a constant flow {open_shift[0]:.4f} and {open_shift[1]:.4f}"
-            f" m. The law has changed the flow by {push[0]:.1e} and {push[1]:.1e} m^3/s (counts if"
-            " against the shift, and less than half of it is left)",
+            f" m. The controller has changed the flow by {push[0]:.1e} and {push[1]:.1e} m^3/s"
+            " (counts if against the shift, and less than half of it is left)",
         ),
         "some steady state errors": Claim(
             verdict(np.abs(offsets).max() > ACCURATE),
@@ -224,14 +221,14 @@ def measured(run):
             f" {left[449]:.4f} and {left[1049]:.4f} m)",
         ),
         "same performance in any operating point": Claim(
-            "partly" if free < SAME <= held else verdict(max(free, held) < SAME),
+            "partly" if unlimited < SAME <= limited else verdict(max(unlimited, limited) < SAME),
             f"steps of 0.1 m from {STEP[0]:g} and {STEP[1]:g} m: the decays of h3 differ by"
-            f" {100 * free:.2g} % of the step without limits of the pump, by {100 * held:.2g} %"
-            f" with them (the same: below {100 * SAME:g} %)",
+            f" {100 * unlimited:.2g} % of the step without limits of the pump, by"
+            f" {100 * limited:.2g} % with them (the same: below {100 * SAME:g} %)",
         ),
         "globally asymptotically stabilises": Claim(
             verdict(np.abs(dry.e[[599, 1199], 0]).max() < ACCURATE),
-            "from empty tanks, without a floor under h1 - h3, h1"
+            "from empty tanks, without a lower clip of h1 - h3, h1"
             f" {f'stays below {top:.0e}' if (top := dry.x[:, 0].max()) else 'stays at 0'} m",
         ),
     }
@@ -239,8 +236,8 @@ def measured(run):
 
 @functools.cache
 def preset():
-    """The Preset of this paper."""
-    words = {
+    """Return the Preset of this paper."""
+    titles = {
         "backstepping": "backstepping",
         "backstepping-perturbed": "backstepping; outlet partly closed, then a leak",
     }
@@ -252,9 +249,9 @@ def preset():
             clock=Clock(dt=1.0, duration=1199.0, substeps=4),
             limits={"max_level": "rim"},
             free=TUNABLE,
-            # the error alone ranks nothing, the pump's limit sets it (notes S10): overshoot counts
-            # a hundredfold, and 1e-6 m^3/s from
-            # sample to sample, which noise of 1 mm makes felt, as 0.3 mm
+            # the error alone is set by the limit of the pump (notes S10): overshoot counts a
+            # hundredfold, and changes of 1e-6 m^3/s from sample to sample, which noise of 1 mm
+            # causes, as 0.3 mm
             objective={
                 "mean_square_error": 1.0,
                 "mean_square_overshoot": 100.0,
@@ -266,7 +263,7 @@ def preset():
                 lambda v: {KS[0]: v[KS[1]], KS[1]: v[KS[0]]} if set(KS) <= set(v) else {},
             ),
         )
-        for name, title in words.items()
+        for name, title in titles.items()
     }
     return Preset(
         paper="calofir",

@@ -1,5 +1,6 @@
-"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016): two
-tanks, one pump, all in volts.
+"""The public benchmark "Cascaded tanks with overflow" (Schoukens, Mattsson, Wigren, Noel 2016).
+
+Two tanks, one pump, all in volts. The derivation is in `notes/cascaded.md`.
 """
 
 import functools
@@ -21,11 +22,9 @@ RIM = 10.0  # level sensor's volts at which either tank overflows
 PERIOD = 4.0  # of the record [s]
 
 # Fitted to the 1,024 samples of the estimation record by nonlinear least squares on the simulated
-# lower level (RK4, four substeps of
-# 1 s, input held), all seven numbers below at once: RMS error 0.2536 V. Fitted again by another
-# code from 12 random starts
-# (k from 0.01 to 0.2, share 0 to 1, offset -2 to 2 V, levels 1 to 9 V): ten end here, to all digits
-# printed, and two in a worse
+# lower level (RK4, four substeps of 1 s, input held), all seven numbers below at once: RMS error
+# 0.2536 V. Fitted again by another code from 12 random starts (k from 0.01 to 0.2, share 0 to 1,
+# offset -2 to 2 V, levels 1 to 9 V): ten end here, to all digits printed, and two in a worse
 # optimum at 0.503 V. Without the offset of the pump the best fit leaves 0.450 V.
 # x1' = -k1 sqrt(x1) + k4 u, x2' = k2 sqrt(x1) - k3 sqrt(x2); k2 = k1
 K_UPPER, K_LOWER, K_PUMP = 0.038642, 0.040808, 0.046202
@@ -63,8 +62,8 @@ DEPARTURES = (
         " one of identification."
     ),
     (
-        "Level sensors of both tanks, as far as the laws go; in the record only that of the lower"
-        " tank is kept."
+        "Level sensors of both tanks, as far as the controllers go; in the record only that of the"
+        " lower tank is kept."
     ),
 )
 
@@ -85,9 +84,7 @@ PUBLISHED = {
 
 
 def rig():
-    """The two tanks: the upper one (0) is pumped and drains into the lower one (1), whose level is
-    the output.
-    """
+    """Return the two tanks: the upper (0) is pumped and drains into the lower (1), the output."""
     return network(
         area=1.0,
         drain=[0.0, K_LOWER],
@@ -107,7 +104,7 @@ def rig():
 
 
 def loop(controller, reference, x0, u0=0.0):
-    """The closed loop with `controller`; x0: (2,) levels [V], u0: pump before t = 0 [V]."""
+    """Return the closed loop of a controller; x0: (2,) levels [V], u0: pump before t = 0 [V]."""
     return ClosedLoop(
         plant=rig(),
         sensor=LevelSensor(
@@ -129,26 +126,42 @@ def loop(controller, reference, x0, u0=0.0):
 
 
 def playback(pump, level):
-    """(loop, clock) that runs the rig with a recorded pump voltage against the recorded lower
-    level, both (samples,) every 4 s [V].
+    """Return (loop, clock) that apply a recorded pump voltage to the rig.
 
-    The tracking error is then the simulation error of the model.
+    The recorded level is the reference, so that the tracking error is the simulation error.
+
+    Parameters
+    ----------
+    pump, level : (samples,) pump voltage and lower level every 4 s [V]
+
+    Examples
+    --------
+    >>> loop, clock = playback([2.0, 2.0, 3.0], [5.0, 5.1, 5.2])
+    >>> clock.duration
+    8.0
     """
-    law = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
+    controller = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
     reference = Table(values=number([level]), period=PERIOD)
-    return loop(law, reference, START), Clock(
+    return loop(controller, reference, START), Clock(
         dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4
     )
 
 
-def at_rest(level):
-    """((upper, lower) levels, pump) at which the lower level rests at `level` [V]."""
+def steady_state(level):
+    """Return ((upper, lower) levels, pump) of the steady state with the lower level at `level` [V].
+
+    Examples
+    --------
+    >>> (upper, lower), pump = steady_state(4.0)
+    >>> round(upper, 3), lower, round(pump, 3)
+    (4.461, 4.0, 2.5)
+    """
     flow = K_LOWER * level**0.5
     return ((flow / K_UPPER) ** 2, level), flow / K_PUMP - OFFSET
 
 
 def measured(run):
-    """What can be measured of PUBLISHED without a record (see presets.base.Preset).
+    """Return what can be measured of PUBLISHED without a record (see `paper.Preset`).
 
     The rim, by flooding both tanks; the period at which a record is played. The simulation error
     needs a record (`playback`), and none is shipped.
@@ -161,18 +174,22 @@ def measured(run):
 
 @functools.cache
 def preset():
-    """The Preset of this rig."""
-    x0, u0 = at_rest(4.0)
+    """Return the Preset of this rig."""
+    x0, u0 = steady_state(4.0)
     reference = ramps([4.0], [(400.0, 0, 7.0), (1200.0, 0, 3.0), (2000.0, 0, 5.0)], ramp=0.0)
     pi = PID(
         model=rig(), Kc=number([1.0]), Ti=number([200.0]), Tt=number([100.0]), bias=number([u0])
     )
     pump = ramps(
         [u0],
-        [(400.0, 0, at_rest(7.0)[1]), (1200.0, 0, at_rest(3.0)[1]), (2000.0, 0, at_rest(5.0)[1])],
+        [
+            (400.0, 0, steady_state(7.0)[1]),
+            (1200.0, 0, steady_state(3.0)[1]),
+            (2000.0, 0, steady_state(5.0)[1]),
+        ],
         ramp=0.0,
     )
-    laws = {
+    controllers = {
         "pi": ("PI", pi, ("controller.Kc", "controller.Ti")),
         "open-loop": (
             "the voltage of each setpoint played",
@@ -183,15 +200,15 @@ def preset():
     cases = {
         name: Case(
             name=f"cascaded/{name}",
-            title=f"two tanks in cascade, {words}",
-            loop=loop(law, reference, x0, u0),
+            title=f"two tanks in cascade, {title}",
+            loop=loop(controller, reference, x0, u0),
             clock=Clock(dt=PERIOD, duration=2800.0, substeps=4),
             limits={"max_level": "rim"},
             free={p: TUNABLE[p] for p in free},
             objective={"rms_error_total": 1.0},
             log={"t": "t_s", "pump1": "pump_V", "h2": "lower_tank_V"},
         )
-        for name, (words, law, free) in laws.items()
+        for name, (title, controller, free) in controllers.items()
     }
     return Preset(
         paper="cascaded",

@@ -1,6 +1,10 @@
-"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank, NGPC and backstepping."""
+"""Gouta, Hadj Said, M'sahli (2015): state-coupled four-tank, NGPC and backstepping.
+
+The derivation is in `notes/gouta2015.md`.
+"""
 
 import functools
+import itertools
 
 import numpy as np
 
@@ -15,13 +19,13 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
-from jaxtank.presets.paper import Claim, Preset, Published
+from jaxtank.presets.paper import Claim, Preset, Published, verdict
 from jaxtank.signals.setpoints import ramps
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
 FAST_AREA = 15 * 2**0.5  # the same figure read as an area (notes A1) [cm^2]
 
-# Fig. 5 as told in sec. 5.3: (time [s], output counted from 0, setpoint [cm])
+# Fig. 5 as described in sec. 5.3: (time [s], output counted from 0, setpoint [cm])
 BENCHMARK = (
     (20.0, 0, 8.0),
     (20.0, 1, 8.0),
@@ -38,7 +42,7 @@ TUNABLE = {
     "controller.k1": Free(1e-3, 5.0),
 }
 
-LAWS = {
+CONTROLLERS = {
     "ngpc": ("nonlinear predictive control", ("controller.Tp",)),
     "backstepping": ("backstepping as printed", ("controller.k", "controller.k1")),
     "backstepping-ff": (
@@ -59,22 +63,22 @@ DEPARTURES = (
         " which reproduces most of the text; '-table1' keeps the printed one (notes S1, E13)."
     ),
     (
-        "Reference: Fig. 5 is lost. Each change is a ramp that starts at the stated time and lasts"
-        " 60 s; its second derivative is 0 (notes A2, A3)."
+        "Reference: Fig. 5 is missing in our copy. Each change is a ramp that starts at the stated"
+        " time and lasts 60 s; its second derivative is 0 (notes A2, A3)."
     ),
     "Start: all tanks at the steady state of r(0) = (3, 3) cm (notes A4).",
     (
         "Dead zone: the benchmark's steady voltages go down to 1.05 V, below the 3 V of Remark 4;"
-        " it is off by default, and on with actuator.dead_zone = 3 the run fails as Remark 4 tells"
+        " it is off by default, and on with actuator.dead_zone = 3 the run fails as Remark 4 states"
         " (notes S8.1)."
     ),
     (
-        "Level floor in the laws: 0.01 cm, so that roots and gradients stay finite when a tank runs"
-        " dry (notes A7)."
+        "Lower clip of levels in the controllers: 0.01 cm, so that roots and gradients stay finite"
+        " when a tank runs dry (notes A7)."
     ),
     (
-        "Rims: levels may rise past 30 cm, so that the limit on max_level is felt; plant.overflow ="
-        " true makes them physics."
+        "Rims: levels may rise past 30 cm, so that the limit on max_level has an effect;"
+        " plant.overflow = true makes them physics."
     ),
     (
         "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46)"
@@ -119,8 +123,8 @@ UNCERTAIN = {
 }
 
 
-def law(kind, model):
-    """The law `kind` of LAWS with the gains of sec. 5.1, inverting `model`."""
+def controller_of(kind, model):
+    """Return a controller with the gains of sec. 5.1 and `model` as its model of the plant."""
     if kind == "ngpc":
         return NGPC(model=model, Tp=number(11.0), level_floor=number(0.01))
     return Backstepping(
@@ -133,7 +137,7 @@ def law(kind, model):
 
 
 def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
-    """The closed loop of law `kind` on tanks of `area` [cm^2], with ramps of `ramp` [s]."""
+    """Return the closed loop of a controller; area of the tanks [cm^2], ramp [s]."""
     plant = state_coupled_four_tank(area)
     x0, u0 = _steady(area)
     return ClosedLoop(
@@ -144,7 +148,7 @@ def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
             full_scale=number(3.3),  # of the STM32 board's converter; not in the paper
         ),
         observer=Direct(),
-        controller=law(kind, plant),
+        controller=controller_of(kind, plant),
         actuator=PumpBank(
             low=number([0.0, 0.0]),
             high=number([12.0, 12.0]),
@@ -164,29 +168,26 @@ def _steady(area):
 
 
 def measured(run):
-    """What can be measured of PUBLISHED (see presets.base.Preset)."""
+    """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
 
     def total(name, values=None):
         trajectory = run(name, values)[1]
         return float(np.sqrt((trajectory.e**2).mean(axis=0).sum())), trajectory
 
-    (near, a), (far, b), (slow, _), (stuck, d) = (
-        total("ngpc"), total("backstepping"), total("ngpc-table1"), total("ngpc", {"actuator.dead_zone": 3.0})
-    )  # fmt: skip
+    (near, a), (far, b), (slow, _) = map(total, ("ngpc", "backstepping", "ngpc-table1"))
+    stuck, d = total("ngpc", {"actuator.dead_zone": 3.0})
     highest = max(a.x.max(), b.x.max())
     return {
         "tracking error": Claim(
-            "reproduced" if near < 0.1 < far else "not reproduced",
+            verdict(near < 0.1 < far),
             f"total RMS error {near:.4f} cm (NGPC), {far:.3f} cm (backstepping)",
         ),
         "levels below the rims": Claim(
-            "reproduced" if highest <= 30 else "not reproduced",
+            verdict(highest <= 30),
             f"tank 4 rises to {a.x[:, 3].max():.1f} cm (NGPC), {b.x[:, 3].max():.1f} cm"
             " (backstepping)",
         ),
-        "areas as printed": Claim(
-            "reproduced" if slow < 1 else "not reproduced", f"total RMS error {slow:.1f} cm (NGPC)"
-        ),
+        "areas as printed": Claim(verdict(slow < 1), f"total RMS error {slow:.1f} cm (NGPC)"),
         "dead zone of 3 V": Claim(
             "reproduced" if stuck > 10 * near and d.u.max() == 0 else "partly",
             f"total RMS error {stuck:.1f} cm: the pumps never start",
@@ -196,28 +197,27 @@ def measured(run):
 
 @functools.cache
 def preset():
-    """The Preset of this paper."""
+    """Return the Preset of this paper."""
+    suffixes = itertools.product(("", "-table1"), ("", "-boxqp"), ("", "-slow"))
     cases = {}
-    for kind, (law_title, free) in LAWS.items():
-        for table1 in ("", "-table1"):
-            for boxqp in ("", "-boxqp"):
-                for slow in ("", "-slow"):
-                    name = f"{kind}{table1}{boxqp}{slow}"
-                    notes = [VARIANTS[v] for v in (table1, boxqp, slow) if v]
-                    cases[name] = Case(
-                        name=f"gouta2015/{name}",
-                        title="; ".join([f"state-coupled four-tank, {law_title}", *notes]),
-                        loop=build(
-                            kind,
-                            area=PRINTED_AREA if table1 else FAST_AREA,
-                            saturation="boxqp" if boxqp else "clip",
-                            ramp=200.0 if slow else 60.0,
-                        ),
-                        clock=Clock(dt=0.01, duration=1200.0),
-                        limits={"max_level": "rim"},
-                        free={p: TUNABLE[p] for p in free},
-                        objective={"rms_error_total": 1.0},
-                    )
+    for kind, (table1, boxqp, slow) in itertools.product(CONTROLLERS, list(suffixes)):
+        title, free = CONTROLLERS[kind]
+        name = f"{kind}{table1}{boxqp}{slow}"
+        variants = [VARIANTS[v] for v in (table1, boxqp, slow) if v]
+        cases[name] = Case(
+            name=f"gouta2015/{name}",
+            title="; ".join([f"state-coupled four-tank, {title}", *variants]),
+            loop=build(
+                kind,
+                area=PRINTED_AREA if table1 else FAST_AREA,
+                saturation="boxqp" if boxqp else "clip",
+                ramp=200.0 if slow else 60.0,
+            ),
+            clock=Clock(dt=0.01, duration=1200.0),
+            limits={"max_level": "rim"},
+            free={p: TUNABLE[p] for p in free},
+            objective={"rms_error_total": 1.0},
+        )
     return Preset(
         paper="gouta2015",
         citation=(

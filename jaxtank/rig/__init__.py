@@ -23,58 +23,64 @@ kind = "extended-kalman"
 process = 1e-4
 measurement = 1e-4
 
-[[pour]]                     # what disturbs: volumes poured, or [disturbance] inflow = [one per
-tank] time = 500.0 duration = 1.0 tank = 2 volume = 500.0
+[[pour]]                     # inflow pulses, or [disturbance] inflow = [one per tank]
+time = 500.0
+duration = 1.0
+tank = 2
+volume = 500.0
 
-[[fault]]                    # what breaks, untold to the law
+[[fault]]                    # faults of the plant, unknown to the controller
 of = "pump_gain[0]"
 start = 300.0
 end = 400.0
 factor = 0.6
 
 [schedule]                   # gains that follow a setpoint (r1, r2 ..) or a level (h1, h2 ..);
-their values are "controller.values" gains = ["controller.k", "controller.k1"] variable = "r1" knots
-= [5.0, 10.0, 15.0]
+                             # their values are "controller.values"
+gains = ["controller.k", "controller.k1"]
+variable = "r1"
+knots = [5.0, 10.0, 15.0]
 
 [limits]                     # hard limits of `tune`
 max_level = "rim"
 
-[free]                       # what `tune` may change: [low, high] or [low, high, "log" or "linear"]
+[free]                       # what `tune` may change: [low, high], or with "log" or "linear"
 "controller.k1" = [0.001, 5.0]
 
-[objective]                  # what it makes small: measure = weight
+[objective]                  # what is minimised: measure = weight
 rms_error_total = 1.0
 
-[uncertain]                  # spread of the plant's parameters, as a share: what answers are
-validated on "plant.drain" = 0.05
+[uncertain]                  # spread of the plant's parameters, as a share, for validation
+"plant.drain" = 0.05
 
 [covariance]                 # of parameters that vary together, as `identify` writes it
 names = ["plant.drain[0]", "plant.drain[1]"]
 matrix = [[1e-6, 0.0], [0.0, 1e-6]]
 
-[log]                        # columns of a log of this rig, with their units: a header, or [header,
-unit] pump1 = ["pump speed", "V"] h1 = "level 1 [mm]"
+[log]                        # columns of experiment data: a header, or [header, unit]
+pump1 = ["pump speed", "V"]
+h1 = "level 1 [mm]"
 
-[[scenario]]                 # runs that `tune` judges by, instead of the case's own; scenario = []
-at the top: none name = "noisy" seed = 1 weight = 2.0
-# numbers, or relative to the case: also "by -0.5" (less), and "steady" for a start from rest: x0,
-# actuator.initial and reference.initial
+[[scenario]]                 # runs that `tune` judges by, instead of the case's own;
+                             # scenario = [] at the top: none
+name = "noisy"
+seed = 1
+weight = 2.0
+# numbers, or relative to the case: also "by -0.5" (less), and "steady" for a start from a steady
+# state: x0, actuator.initial and reference.initial
 values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [5, 4, 3, 2] }
 """
 
 from jaxtank.case import Case
 from jaxtank.rig.components import register
+from jaxtank.rig.lines import toml
 from jaxtank.rig.read import from_table, load, loads, open_case
-from jaxtank.rig.schema import toml
 from jaxtank.rig.validate import (
     check,
     check_free,
     check_limits,
     check_objective,
     check_uncertain,
-    clock_doubts,
-    doubts,
-    model_doubts,
     uncovered,
     unreachable,
 )
@@ -87,25 +93,26 @@ from jaxtank.rig.values import (
     set_scenario,
     set_values,
 )
+from jaxtank.rig.warnings import case_warnings, clock_warnings, model_warnings
 from jaxtank.rig.write import complete, dump, save, short
 
 __all__ = [
     "Case",
+    "case_warnings",
     "check",
     "check_free",
     "check_limits",
     "check_objective",
     "check_uncertain",
-    "clock_doubts",
+    "clock_warnings",
     "complete",
-    "doubts",
     "dump",
     "from_table",
     "has",
     "is_change",
     "load",
     "loads",
-    "model_doubts",
+    "model_warnings",
     "open_case",
     "overlap",
     "overridden",

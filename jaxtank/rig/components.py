@@ -1,11 +1,11 @@
 """[law], [observer], [sensor] and [actuator] of a rig file: a component by its kind, and its fields
-by their names.
+by their names.  Imported by the readers and writers of `rig`.
 """
 
 import dataclasses
 import inspect
 import re
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,15 +14,16 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
-from jaxtank.core.units import local
+from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.schema import is_numeric, static_value
-from jaxtank.rig.signals import RAMP_KEYS, changes_of, meta_of, ramps_of
+from jaxtank.rig.entry import read_entry, sizes_of
+from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
+from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
-LAWS = {
+LAWS: dict[str, type] = {
     "pid": controllers.PID,
     "state-feedback": controllers.StateFeedback,
     "lqi": controllers.LQI,
@@ -36,31 +37,49 @@ LAWS = {
     "laguerre": controllers.Laguerre,
     "open-loop": controllers.OpenLoop,
 }
-OBSERVERS = {
+OBSERVERS: dict[str, type] = {
     "direct": Direct,
     "disturbance": DisturbanceObserver,
     "kalman": Kalman,
     "extended-kalman": ExtendedKalman,
 }
-SENSORS = {"level": LevelSensor}
-ACTUATORS = {"pumps": PumpBank}
-REGISTERED = set()
+SENSORS: dict[str, type] = {"level": LevelSensor}
+ACTUATORS: dict[str, type] = {"pumps": PumpBank}
+REGISTERED: set[str] = set()
 """Kinds that were added by `register`."""
 
-INSTRUMENTS = {"sensor": ("noise",), "actuator": ("low", "high", "initial")}
-"""Tables of instruments: what is the case's own where a file leaves it out."""
+
+class Role(NamedTuple):
+    """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
+    fields that are the case's own where a file leaves them out, and the class that needs no
+    section, for [values] set its fields.
+    """
+
+    field: str
+    base: type
+    classes: dict
+    kept: tuple = ()
+    default: type | None = None
+
+
+ROLES = {
+    "law": Role("controller", controllers.Controller, LAWS),
+    "observer": Role("observer", Observer, OBSERVERS),
+    "sensor": Role("sensor", Sensor, SENSORS, ("noise",), LevelSensor),
+    "actuator": Role("actuator", Actuator, ACTUATORS, ("low", "high", "initial"), PumpBank),
+}
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
-_TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
+_FIELDS = (bool, int, float, str, tuple)
 
 
-def register(kind, cls):
+def register(kind: str, cls: type) -> type:
     """Give a controller, observer, sensor or actuator of one's own a name in rig files.
 
     `kind = "..."` of [law] (a controller), [observer], [sensor] or [actuator] then makes a
-    component of the class. Its leaves and static fields are keys of the table; a field `model` is the plant of
-    the rig. A static field of type tuple holds tanks, which a file counts from 1. `rig.dump`,
-    `rig.complete` and `result.save` write such a case.
+    component of the class. Its leaves and static fields are keys of the table; a field `model` is
+    the plant of the rig. A static field of type tuple holds tanks, which a file counts from 1.
+    `rig.dump`, `rig.complete` and `result.save` write such a case.
 
     Parameters
     ----------
@@ -112,7 +131,7 @@ def register(kind, cls):
         why = _unwritable(field)
         if why:
             raise InputError(f"{name}.{field.name}: {why}")
-    taken = next((table[kind] for _, table in _roles() if kind in table), None)
+    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
     if taken not in (None, cls):
         raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
     other = next((k for k, c in known.items() if c is cls and k != kind), None)
@@ -124,21 +143,11 @@ def register(kind, cls):
     return cls
 
 
-def _roles():
-    """(abstract class, {kind: class}) of every role that a rig file can fill."""
-    return (
-        (controllers.Controller, LAWS),
-        (Observer, OBSERVERS),
-        (Sensor, SENSORS),
-        (Actuator, ACTUATORS),
-    )
-
-
 def _table_of(cls):
-    """The registry of the role of `cls`; None of what has no role."""
+    """The {kind: class} of the role of `cls`; None of what has no role."""
     if not isinstance(cls, type):
         return None
-    return next((table for role, table in _roles() if issubclass(cls, role)), None)
+    return next((r.classes for r in ROLES.values() if issubclass(cls, r.base)), None)
 
 
 def _unwritable(field):
@@ -146,141 +155,122 @@ def _unwritable(field):
     kind = field.metadata.get("kind")
     if field.name == "kind":
         return "a rig file has this key for the name of the class: give the field another name"
-    if kind == "static" and _type_of(field) not in _TYPES.values():
-        return f"a static field must be one of {', '.join(_TYPES)} to be set by a rig file"
+    if kind == "static" and type_of(field) not in _FIELDS:
+        types = ", ".join(kind.__name__ for kind in _FIELDS)
+        return f"a static field must be one of {types} to be set by a rig file"
     if kind is None and field.name != "model":
         return "a rig file sets fields made by leaf(...) and static(...), and `model`"
     return ""
 
 
-def _type_of(field):
-    """The type of a field, also where `from __future__ import annotations` makes it a text."""
-    return _TYPES.get(field.type, field.type)
-
-
-# what a law or an observer needs and a file may leave out: by field
 USUAL = {"Tt": 30.0, "spread": 0.0}
-FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}  # [cm]
-SIZES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
+"""Defaults of fields that a rig file may leave out."""
+
+FLOORS = {"level_floor": 0.01, "difference_floor": 0.01}
+"""Defaults in centimetres [cm], converted to the rig's unit of length."""
+
+
+def section_of(name, kind, units=DEFAULT):
+    """Return the Section of a kind of component: the leaves and static fields of its class.
+
+    Parameters
+    ----------
+    name : "law", "observer", "sensor" or "actuator"
+    kind : name of one of its classes
+    units : (length, pump input), in which defaults are
+    """
+    known = ROLES[name].classes
+    first = dataclasses.replace(KIND, doc=f"one of {', '.join(known)}")
+    if known[kind] is controllers.OpenLoop:
+        return Section(name, (first, *OPEN_LOOP[1:]))
+    keys = [_key(known[kind], f, kind in REGISTERED, units) for f in _settable(known[kind])]
+    return Section(name, (first, *keys))
+
+
+def _settable(cls):
+    return [f for f in dataclasses.fields(cls) if f.metadata.get("kind") in ("leaf", "static")]
+
+
+def _key(cls, field, own, units):
+    """The Key of a field; own: a class of the user's, without defaults of ours."""
+    default = NEEDED if field.default is dataclasses.MISSING else None
+    if field.name in USUAL and not own:
+        default = USUAL[field.name]
+    if field.name in FLOORS and not own:
+        default = in_unit(FLOORS[field.name], units[0])
+    changes = {}
+    if field.metadata["kind"] == "leaf":
+        changes["kind"] = "scalar" if type_of(field) is float else "array"
+    doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
+    return Key.of(cls, field.name, doc, default=default, **changes)
 
 
 def law_of(table, plant, levels, initial):
-    """The law of a [law] table on `plant`; levels: outputs at t = 0, initial: (m,) inputs before
-    it, what `bias` is where it is left out.
+    """Return the controller of a [law] table.
+
+    Parameters
+    ----------
+    table : {key: value} as in the file
+    plant : the rig, which is the controller's model
+    levels : (outputs,) levels of the controlled tanks at t = 0 [cm]
+    initial : (m,) inputs before t = 0 [V], what `bias` is where the rig has no steady state
     """
     if isinstance(table, dict) and table.get("kind") == "open-loop":
-        return _open_loop(table, plant, initial)
-    return component("law", table, LAWS, plant, {"bias": _resting(plant, levels, initial)})
+        start = ramps(np.asarray(initial).tolist(), [], ramp=0.0)
+        section = section_of("law", "open-loop")
+        return controllers.OpenLoop(
+            signal=ramps_of(section, table, start, ("pump", "input"), sizes_of(plant))
+        )
+    return component("law", table, plant, {"bias": _steady_input(plant, levels, initial)})
 
 
 def observer_of(table, plant, levels, initial):
-    """The observer of an [observer] table on `plant`."""
+    """Return the observer of an [observer] table; arguments as in `law_of`, levels of all tanks."""
     offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
-    return component("observer", table, OBSERVERS, plant, offered)
+    return component("observer", table, plant, offered)
 
 
-def instrument_of(word, table, loop):
-    """The sensor or actuator (`word`) of a [sensor] or [actuator] table in `loop`; noise and limits
-    that are left out are those of the loop's own.
+def instrument_of(name, table, loop):
+    """Return the sensor or actuator of a table; noise and limits that it leaves out are those of
+    the loop's own. name: "sensor" or "actuator".
     """
-    known = {"sensor": SENSORS, "actuator": ACTUATORS}[word]
-    offered = {name: getattr(getattr(loop, word), name) for name in INSTRUMENTS[word]}
-    return component(word, table, known, loop.plant, offered)
+    role = ROLES[name]
+    own = {key: getattr(getattr(loop, role.field), key) for key in role.kept}
+    return component(name, table, loop.plant, own)
 
 
-def component(kind, table, known, plant, offered):
-    """The component of a table: kind, then the fields of the component by their names."""
+def component(name, table, plant, offered):
+    """Return the component of a table: kind, then the fields of its class.
+
+    Parameters
+    ----------
+    name : "law", "observer", "sensor" or "actuator"
+    table : {key: value} as in the file
+    plant : the rig, its field `model`
+    offered : {key: value} that a table may leave out; of a controller or observer for classes of
+        ours only
+    """
+    role = ROLES[name]
     if not isinstance(table, dict):
-        raise InputError(f"[{kind}]: must be a table")
+        raise InputError(f"[{name}]: must be a table")
     if "kind" not in table:
-        raise InputError(f"[{kind}] needs kind = one of {', '.join(known)}")
-    if not isinstance(table["kind"], str) or table["kind"] not in known:
-        raise unknown(f"{kind} kind", str(table["kind"]), known)
-    cls, values, own = known[table["kind"]], {}, table["kind"] in REGISTERED
-    fields = {f.name: f for f in dataclasses.fields(cls)}
-    settable = {n: f for n, f in fields.items() if n != "model"}
-    for key in table:
-        if key != "kind" and key not in settable:
-            raise unknown(f"key of [{kind}]", key, ["kind", *settable])
-    if "model" in fields:
+        raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
+    kind = table["kind"]
+    if not isinstance(kind, str) or kind not in role.classes:
+        raise unknown(f"{name} kind", str(kind), role.classes)
+    section = section_of(name, kind, plant.units)
+    offered = {} if kind in REGISTERED and not role.kept else offered
+    usual = {key: value for key, value in offered.items() if key in section.names}
+    title = f"{section.title} {kind}"
+    values = read_entry(section, {**usual, **table}, sizes_of(plant), title=title)
+    del values["kind"]
+    if "model" in {field.name for field in dataclasses.fields(role.classes[kind])}:
         values["model"] = plant
-    for name, field in settable.items():
-        meta = field.metadata
-        if name in table:
-            value = table[name]
-        elif name in offered and (not own or kind in INSTRUMENTS):
-            value = offered[name]
-        elif name in USUAL and not own:
-            value = USUAL[name]
-        elif name in FLOORS and not own:
-            value = in_unit(FLOORS[name], plant.units[0])
-        elif field.default is not dataclasses.MISSING:
-            continue
-        else:
-            unit = "" if meta.get("unit", "-") == "-" else f" [{local(meta['unit'], plant.units)}]"
-            raise InputError(f"[{kind}] {table['kind']} needs {name}{unit}: {meta.get('doc', '')}")
-        values[name] = _value(f"{kind}.{name}", value, field, plant)
-    return cls(**values)
+    return role.classes[kind](**values)
 
 
-def _value(name, value, field, plant):
-    if field.metadata.get("kind") == "leaf":
-        array = _shaped(name, value, field.metadata, plant)
-        if _type_of(field) is float and array.ndim:
-            raise InputError(f"{name} = {shortened(value)}: must be one number")
-        return array
-    if _type_of(field) is tuple:  # tanks, counted from 1 in a file
-        if not (
-            isinstance(value, list)
-            and all(isinstance(i, int) and not isinstance(i, bool) for i in value)
-        ):
-            raise InputError(
-                f"{name} = {shortened(value)}: must be a list of tanks, counted from 1"
-            )
-        if not all(1 <= i <= plant.tanks for i in value):
-            raise InputError(
-                f"{name} = {shortened(value)}: tanks are counted from 1 to {plant.tanks}"
-            )
-        return tuple(i - 1 for i in value)
-    return static_value(name, value, field.metadata, _type_of(field))
-
-
-def _shaped(name, value, meta, plant):
-    """A leaf's value as an array; one number for an array of one entry per pump, tank or output
-    fills it.
-    """
-    if not is_numeric(value):
-        raise InputError(f"{name} = {shortened(value)}: must be a number or a list of numbers")
-    array = number(value)
-    size = size_of(meta, plant)
-    return np.full(size, array) if size is not None and array.ndim == 0 else array
-
-
-def size_of(meta, plant):
-    """Number of entries of a leaf that has one per pump, tank or output, by the shape its metadata
-    begins with; None of another.
-    """
-    n, m, outputs = plant.tanks, plant.pumps, len(plant.outputs)
-    sizes = dict(zip(SIZES, (m, n, outputs, m, 2, n + outputs)))
-    return next(
-        (size for start, size in sizes.items() if meta["doc"].split(")")[0].startswith(start)), None
-    )
-
-
-def _open_loop(table, plant, initial):
-    keys = RAMP_KEYS[:-1]
-    for key in table:
-        if key != "kind" and key not in keys:
-            raise unknown("key of [law]", key, ["kind", *keys])
-    return controllers.OpenLoop(
-        signal=ramps_of(
-            "law", table, ramps(np.asarray(initial).tolist(), [], ramp=0.0), ("pump", "input")
-        )
-    )
-
-
-def _resting(plant, levels, initial):
-    """(pumps,) inputs at which the outputs rest where they start; `initial` where they cannot."""
+def _steady_input(plant, levels, initial):
+    """(m,) inputs that hold the outputs where they start; `initial` where none do."""
     if len(levels) != plant.pumps:
         return initial
     try:
@@ -289,58 +279,38 @@ def _resting(plant, levels, initial):
         return initial
 
 
-def kind_of(part, known):
-    """The name of a law or observer in a rig file, None where it has none."""
-    return next((name for name, cls in known.items() if cls is type(part)), None)
+def kind_of(name, part):
+    """The kind of a component in a section of a rig file, None where it has none."""
+    return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
 
 
-def is_written(word, part):
-    """Whether a table `word` of a rig file can describe `part`."""
-    known = {"law": LAWS, "observer": OBSERVERS, "sensor": SENSORS, "actuator": ACTUATORS}[word]
-    return has_table(word, part) and kind_of(part, known) is not None
-
-
-def has_table(word, part):
-    """Whether a file has a table `word` for a part that is not the preset's: [values] set the fields
+def has_section(name, part):
+    """Whether a file has the section for a part that is not the preset's: [values] set the fields
     of LevelSensor and PumpBank.
     """
-    return word not in INSTRUMENTS or type(part) not in (LevelSensor, PumpBank)
+    return ROLES[name].default is None or type(part) is not ROLES[name].default
 
 
-def keys_of(part, known):
-    """[(key, metadata, value)] of a [law] or [observer]; value None of an optional one that is not
-    in use. InputError where it has no name.
+def is_written(name, part):
+    """Whether a section of a rig file can describe a part of the loop."""
+    return has_section(name, part) and kind_of(name, part) is not None
+
+
+def values_of(name, part):
+    """Return (section, {key: value}) of a component, None of an optional leaf that is not in use.
+    InputError where no rig file describes it.
     """
-    kind = kind_of(part, known)
+    kind, cls = kind_of(name, part), type(part).__name__
     if kind is None:
-        raise InputError(f"its {type(part).__name__} has no name in a rig file")
-    found: list[tuple[str, Any, Any]] = [
-        ("kind", {"unit": "-", "doc": f"one of {', '.join(known)}"}, kind)
-    ]
+        raise InputError(f"its {cls} has no name in a rig file")
+    section = section_of(name, kind)
     if isinstance(part, controllers.OpenLoop):
         if not isinstance(part.signal, Ramps):
             raise InputError("its OpenLoop plays a signal that no rig file describes")
-        values = {
-            k: np.asarray(getattr(part.signal, k)).tolist() for k in ("initial", "ramp", "shape")
-        }
-        values["changes"] = changes_of(part.signal)
-        docs = {
-            "initial": PUMPS,
-            "changes": {"unit": "-", "doc": "[time [s], pump (from 1), input] of each change"},
-        }
-        return found + [(k, docs.get(k) or meta_of(Ramps, k), values[k]) for k in RAMP_KEYS[:-1]]
-    for field in dataclasses.fields(part):
-        value, meta = getattr(part, field.name), field.metadata
-        if meta.get("kind") == "leaf":
-            found.append((field.name, meta, None if value is None else np.asarray(value).tolist()))
-        elif meta.get("kind") == "static":
-            if isinstance(value, tuple) and not all(type(i) is int for i in value):
-                named = f"its {type(part).__name__}.{field.name}"
-                raise InputError(f"{named} = {shortened(value)} is no list of tanks")
-            found.append(
-                (field.name, meta, [i + 1 for i in value] if isinstance(value, tuple) else value)
-            )
-    return found
-
-
-PUMPS = {"unit": "V", "doc": "(m,) input of each pump before the first change"}
+        return section, {"kind": kind, **ramp_values(part.signal)}
+    values = {key.name: getattr(part, key.name) for key in section.keys[1:]}
+    for key in section.keys:
+        value = values.get(key.name)
+        if key.kind == "tanks" and not all(type(i) is int for i in value or ()):
+            raise InputError(f"its {cls}.{key.name} = {shortened(value)} is no list of tanks")
+    return section, {"kind": kind, **values}

@@ -1,125 +1,33 @@
-"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]],
-[plant]; no Python.
+"""A rig described tank by tank in a rig file: [[tank]], [[orifice]], [[pipe]], [[spill]], [[pump]]
+and [plant]; read to a Case and written from a loop.  Imported by `read` and `sections`.
 """
 
-import dataclasses
+from typing import Any
 
 import numpy as np
 
 from jaxtank.case import Case
-from jaxtank.core.checks import check_value
 from jaxtank.core.clock import Clock
-from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
-from jaxtank.core.units import DEFAULT, check_unit, local
+from jaxtank.core.units import DEFAULT, check_unit
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
 from jaxtank.rig.components import law_of, observer_of
-from jaxtank.rig.schema import is_numeric, name_of
-from jaxtank.rig.signals import INFLOW, meta_of
+from jaxtank.rig.entry import Sizes, different, name_of, read_entries, read_entry
+from jaxtank.rig.schema import SECTIONS
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
-TABLES = ("units", "tank", "orifice", "pipe", "spill", "pump", "plant")
-TANK = {
-    "name": "",
-    "area": None,
-    "rim": None,
-    "drain": 0.0,
-    "level": 0.0,
-    "inflow": 0.0,
-    "noise": 0.0,
-}
-PUMP = {
-    "name": "",
-    "gain": None,
-    "to": None,
-    "split": 1.0,
-    "low": 0.0,
-    "high": None,
-    "initial": 0.0,
-}
-LINK = {"from": None, "to": None, "area": None}
-PIPE = {"between": None, "area": None}
-SPILL = {"from": None, "to": None, "caught": 1.0}
-PLANT = {"gravity": None, "overflow": False, "bottom": False, "knee": None, "outputs": None}
-
-
-def _says(doc):
-    return {"unit": "-", "doc": doc}
-
-
-def _like(cls, field, doc=None):
-    return {**meta_of(cls, field), **({} if doc is None else {"doc": doc})}
-
-
-# what each key is, its unit and its range
-METAS = {
-    "tank": {
-        "name": _says("what other tables may call it, instead of its number from 1"),
-        "area": _like(TankNetwork, "area", "cross-section A"),
-        "rim": _like(TankNetwork, "rim", "height"),
-        "drain": _like(TankNetwork, "drain", "effective orifice area to the basin; 0: closed"),
-        "level": _like(ClosedLoop, "x0", "level at t = 0"),
-        "inflow": {**INFLOW, "doc": "steady inflow that no pump brings; negative: a leak"},
-        "noise": _like(LevelSensor, "noise", "standard deviation of the noise of its sensor"),
-    },
-    "pump": {
-        "name": _says("a note; nothing refers to it"),
-        "gain": _like(TankNetwork, "pump_gain", "flow per unit of the pump's input (Kp)"),
-        "to": _says("the tank that it fills, or [first, second]"),
-        "split": _like(TankNetwork, "split", "share that goes to the first of two tanks"),
-        "low": _like(PumpBank, "low", "lower limit"),
-        "high": _like(PumpBank, "high", "upper limit"),
-        "initial": _like(PumpBank, "initial", "input at which it ran before t = 0"),
-    },
-    "orifice": {
-        "from": _says("the tank that it leaves, by name or number from 1"),
-        "to": _says("the tank that it pours into"),
-        "area": _like(TankNetwork, "orifice", "effective area"),
-    },
-    "pipe": {
-        "between": _says("the two tanks that it joins, below the surface"),
-        "area": _like(TankNetwork, "pipe", "effective area"),
-    },
-    "spill": {
-        "from": _says("the tank whose rim is passed"),
-        "to": _says("the tank that it falls into"),
-        "caught": _like(TankNetwork, "caught", "share that falls into it"),
-    },
-    "plant": {
-        "outputs": _says(
-            "the tanks whose levels are controlled; left out: those that the pumps fill first"
-        ),
-        **{k: meta_of(TankNetwork, k) for k in ("gravity", "overflow", "bottom", "knee")},
-    },
-}
-# parts of the loop whose other fields one looks for in a table
-ELSEWHERE = {"pump": ("actuator", PumpBank), "tank": ("sensor", LevelSensor)}
-
-
-def tank_index(value, where, named, count):
-    """Index of a tank given by its name or its number from 1; InputError, naming `where`, for
-    another. named: {name: index}.
-    """
-    if isinstance(value, str):
-        if value not in named:
-            raise unknown(f"tank of {where}", value, named or ["1"])
-        return named[value]
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= count:
-        raise InputError(
-            f"{where} = {shortened(value)}: must be a tank, by its name or its number from 1 to"
-            f" {count}"
-        )
-    return value - 1
-
-
 MOST = 100
 """Tanks that a rig file may have; as many pumps, orifices, pipes and spills."""
+
+LISTS = tuple(name for name, section in SECTIONS.items() if section.per)
+"""Sections with a table for each tank, orifice, pipe, spill and pump."""
 
 
 def names_in(table):
@@ -127,127 +35,95 @@ def names_in(table):
     return {
         t["name"]: i
         for i, t in enumerate(table.get("tank", []))
-        if isinstance(t, dict) and t.get("name")
+        if isinstance(t, dict) and isinstance(t.get("name"), str) and t["name"]
     }
 
 
 def build(table):
-    """The Case of a table of a rig file that has [[tank]]; reference, values, limits and the rest
-    come after (`rig.from_table`).
+    """Return the Case of a table of a rig file that has [[tank]].
+
+    Reference, values, limits and the rest come after (`rig.from_table`).
+
+    Parameters
+    ----------
+    table : {section: table or list of tables}
+
+    Raises
+    ------
+    InputError for a key, a value or a topology that makes no rig.
     """
-    units = length, drive = _units(table.get("units", list(DEFAULT)))
-    tanks = [
-        _entry("tank", i, e, TANK, units) for i, e in enumerate(_list(table, "tank", at_least=1))
-    ]
-    pumps = [
-        _entry("pump", i, e, PUMP, units) for i, e in enumerate(_list(table, "pump", at_least=1))
-    ]
-    links = [_entry("orifice", i, e, LINK, units) for i, e in enumerate(_list(table, "orifice"))]
-    pipes = [_entry("pipe", i, e, PIPE, units) for i, e in enumerate(_list(table, "pipe"))]
-    spills = [_entry("spill", i, e, SPILL, units) for i, e in enumerate(_list(table, "spill"))]
-    more = _entry("plant", None, table.get("plant", {}), PLANT, units)
-    named = names_in(table)
-    if len(named) < sum(bool(t["name"]) for t in tanks):
-        raise InputError("two tanks have the same name")
-
-    def tank(value, where):
-        return tank_index(value, where, named, len(tanks))
-
-    def pair(value, where, short=False):
-        entries = value if isinstance(value, list) else [value]
-        if not 1 + (not short) <= len(entries) <= 2:
-            raise InputError(
-                f"{where} = {shortened(value)}: must name"
-                f" {'one tank, or two' if short else 'two tanks'}"
-            )
-        found = [tank(v, where) for v in entries]
-        if len(set(found)) < len(found):
-            raise InputError(f"{where} = {shortened(value)}: must be two different tanks")
-        return (*found, None) if len(found) == 1 else tuple(found)
-
-    for i, (p, written) in enumerate(zip(pumps, table["pump"])):
-        if not p["high"] > p["low"]:
-            raise InputError(
-                f"pump {i + 1}: high = {p['high']:g} {drive}: must be above its low, {p['low']:g}"
-                f" {drive}"
-            )
-        if ("split" in written) != (isinstance(p["to"], list) and len(p["to"]) > 1):
-            raise InputError(
-                f"pump {i + 1}: split is the share of the first of two tanks: give it where to ="
-                " [first, second], and only there"
-            )
-    feeds = [pair(p["to"], f"pump {i + 1}: to", short=True) for i, p in enumerate(pumps)]
-    outputs = more["outputs"] if more["outputs"] is not None else [first + 1 for first, _ in feeds]
-    if not isinstance(outputs, list) or not outputs:
-        raise InputError(f"plant.outputs = {shortened(outputs)}: must be a list of tanks")
-    overflows = [pair([e["from"], e["to"]], f"spill {i + 1}") for i, e in enumerate(spills)]
-    _check_shares(overflows, table.get("spill", []), spills)
-    plant = network(
-        area=[t["area"] for t in tanks],
-        rim=[t["rim"] for t in tanks],
-        drain=[t["drain"] for t in tanks],
-        links=[pair([e["from"], e["to"]], f"orifice {i + 1}") for i, e in enumerate(links)],
-        orifice=[e["area"] for e in links],
-        pipes=[pair(e["between"], f"pipe {i + 1}: between") for i, e in enumerate(pipes)],
-        pipe=[e["area"] for e in pipes],
-        spills=overflows,
-        caught=[e["caught"] for e in spills],
-        pump_gain=[p["gain"] for p in pumps],
-        split=[p["split"] if feeds[j][1] is not None else 1.0 for j, p in enumerate(pumps)],
-        feeds=feeds,
-        outputs=[tank(v, "plant.outputs") for v in outputs],
-        gravity=more["gravity"],
-        overflow=bool(more["overflow"]),
-        bottom=bool(more["bottom"]),
-        units=(length, drive),
-        knee=more["knee"],
+    table = {**table, **{name: _list(table, name) for name in LISTS}}
+    sizes = Sizes(
+        len(table["tank"]), units=_units(table.get("units", list(DEFAULT))), names=names_in(table)
     )
-    levels = number([t["level"] for t in tanks])
-    initial = number([p["initial"] for p in pumps])
-    start = [float(levels[i]) for i in plant.outputs]
-    inflow = [t["inflow"] for t in tanks]
-    loop = ClosedLoop(
-        plant=plant,
-        sensor=LevelSensor(
-            gain=number(np.ones(len(tanks))),
-            noise=number([t["noise"] for t in tanks]),
-            full_scale=number(np.max(plant.rim)),
-        ),
-        observer=(
-            observer_of(table["observer"], plant, levels, initial)
-            if "observer" in table
-            else Direct()
-        ),
-        controller=law_of(table.get("law", {}), plant, start, initial),
-        actuator=PumpBank(
-            low=number([p["low"] for p in pumps]),
-            high=number([p["high"] for p in pumps]),
-            stop=number(np.zeros(len(pumps))),
-            # of use only above 0, beside a dead zone
-            pulse=number([p["high"] if p["high"] > 0 else 1.0 for p in pumps]),
-            initial=initial,
-        ),
-        reference=ramps(start, [], ramp=0.0),
-        disturbance=Constant(level=number(inflow)) if any(inflow) else None,
-        x0=levels,
-    )
+    entries = {name: read_entries(SECTIONS[name], table, sizes) for name in LISTS}
+    more = read_entry(SECTIONS["plant"], table.get("plant", {}), sizes)
+    _check_names(entries["tank"])
+    _check_links(table, entries)
+    _check_pumps(table["pump"], entries["pump"], sizes.units[1])
+    columns = _columns(entries)
+    outputs = more.pop("outputs", tuple(first for first, _ in columns["plant.feeds"]))
+    if not outputs:
+        raise InputError("plant.outputs = []: must be a list of at least one tank")
+    plant = network(**_fields(columns, "plant"), **more, outputs=outputs, units=sizes.units)
+    law = table.get("law", {})
     return Case(
         name="my rig",
-        title=(
-            f"{len(tanks)} tank{'s' if len(tanks) > 1 else ''},"
-            f" {table.get('law', {}).get('kind', '')}"
-        ),
-        loop=loop,
+        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {law.get('kind', '')}",
+        loop=_loop(plant, columns, law, table.get("observer")),
         clock=Clock(dt=1.0, duration=600.0),
         limits={"max_level": "rim"},
         free={},
         objective={"rms_error_total": 1.0},
         names={
             kind: found
-            for kind, own in (("tank", tanks), ("pump", pumps))
-            if any(found := tuple(e["name"] for e in own))
+            for kind in ("tank", "pump")
+            if any(found := tuple(entry["name"] for entry in entries[kind]))
         },
     )
+
+
+def _columns(entries) -> dict[str, Any]:
+    """{target: [value of each table]} of the lists of a rig; of parts of an entry, pairs."""
+    found = {}
+    for name in LISTS:
+        for key in SECTIONS[name].keys:
+            if key.target:
+                found[key.target] = [entry[key.name] for entry in entries[name]]
+    for name in ("plant.links", "plant.spills"):
+        found[name] = list(zip(found.pop(f"{name}.0"), found.pop(f"{name}.1")))
+    return found
+
+
+def _fields(columns, part):
+    """{field: [value of each table]} of a part of the loop."""
+    start = f"{part}."
+    return {k.removeprefix(start): v for k, v in columns.items() if k.startswith(start)}
+
+
+def _loop(plant, columns, law, observer):
+    """The ClosedLoop of a plant and of the columns of its tables."""
+    pumps, levels = _fields(columns, "actuator"), number(columns["x0"])
+    inflow, initial = columns["disturbance.level"], number(pumps["initial"])
+    start = [float(levels[i]) for i in plant.outputs]
+    sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
+    # the pulse is of use only above 0, beside a dead zone
+    pulse = [high if high > 0 else 1.0 for high in pumps["high"]]
+    bank = {"stop": np.zeros(plant.pumps), "pulse": pulse, **pumps}
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(**_numbers({**sensor, **_fields(columns, "sensor")})),
+        observer=Direct() if observer is None else observer_of(observer, plant, levels, initial),
+        controller=law_of(law, plant, start, initial),
+        actuator=PumpBank(**_numbers(bank)),
+        reference=ramps(start, [], ramp=0.0),
+        disturbance=Constant(level=number(inflow)) if any(inflow) else None,
+        x0=levels,
+    )
+
+
+def _numbers(values):
+    return {name: number(value) for name, value in values.items()}
 
 
 def _units(value):
@@ -260,14 +136,27 @@ def _units(value):
     return tuple(check_unit("units: entry", name_of("units: entry", v)) for v in value)
 
 
-def _check_shares(overflows, written, spills):
-    """Raise InputError where several spills of a tank leave out a share and come to more than 1:
-    which falls where cannot be known.
+def _check_names(tanks):
+    """Raise InputError where two tanks have the same name."""
+    names = [tank["name"] for tank in tanks if tank["name"]]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two tanks have the same name, {name!r}: give each its own")
+
+
+def _check_links(table, entries):
+    """Raise InputError for an orifice or a spill from a tank to itself, and for spills of a tank of
+    which one has no share and whose sum is above 1: which falls where cannot be known.
     """
-    for source in dict.fromkeys(source for source, _ in overflows):
-        own = [k for k, (tank, _) in enumerate(overflows) if tank == source]
-        without = [k for k in own if "caught" not in written[k]]
+    for name in ("orifice", "spill"):
+        for i, (entry, given) in enumerate(zip(entries[name], table[name])):
+            value = [given["from"], given["to"]]
+            different(f"{name} {i + 1}: [from, to]", value, (entry["from"], entry["to"]))
+    spills, given = entries["spill"], table["spill"]
+    for source in dict.fromkeys(spill["from"] for spill in spills):
+        own = [k for k, spill in enumerate(spills) if spill["from"] == source]
         total = sum(spills[k]["caught"] for k in own)
+        without = any("caught" not in given[k] for k in own)
         if without and len(own) > 1 and total > 1.0 + SURPLUS:
             raise InputError(
                 f"spill {' and '.join(str(k + 1) for k in own)}, from tank {source + 1}: caught is"
@@ -276,114 +165,73 @@ def _check_shares(overflows, written, spills):
             )
 
 
-def _list(table, key, at_least=0):
-    entries = table.get(key, [])
-    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
-        raise InputError(f"{key}: must be a list of tables, [[{key}]]")
-    if len(entries) < at_least:
-        raise InputError(f"a rig needs at least one [[{key}]]")
+def _check_pumps(given, pumps, drive):
+    """Raise InputError for limits in the wrong order, and for a split without two tanks."""
+    for i, (pump, written) in enumerate(zip(pumps, given)):
+        if not pump["high"] > pump["low"]:
+            raise InputError(
+                f"pump {i + 1}: high = {pump['high']:g} {drive}: must be above its low,"
+                f" {pump['low']:g} {drive}"
+            )
+        if ("split" in written) != (pump["to"][1] is not None):
+            raise InputError(
+                f"pump {i + 1}: split is the share of the first of two tanks: give it where to ="
+                " [first, second], and only there"
+            )
+
+
+def _list(table, name):
+    """The tables of a list in a rig file; InputError for too many, and for no tank or pump."""
+    entries = table.get(name, [])
+    if not entries and name in ("tank", "pump"):
+        raise InputError(f"a rig needs at least one [[{name}]]")
     if len(entries) > MOST:
         raise InputError(
-            f"[[{key}]]: {len(entries)} {key}s: must be at most {MOST}, for each is a part of the"
+            f"[[{name}]]: {len(entries)} {name}s: must be at most {MOST}, for each is a part of the"
             " compiled loop"
         )
     return entries
 
 
-def _entry(kind, index, entry, fields, units):
-    """`entry` with what it leaves out; InputError for an unknown key, one that is missing, what is
-    no number, and what is out of range.
-    """
-    where = kind if index is None else f"{kind} {index + 1}"
-    if not isinstance(entry, dict):
-        raise InputError(f"{where}: must be a table")
-    for key, value in entry.items():
-        if key not in fields:
-            part, cls = ELSEWHERE.get(kind, ("", None))
-            if cls is not None and key in {f.name for f in dataclasses.fields(cls)}:
-                raise InputError(
-                    f'{where}: {key} is not a key of [[{kind}]]: it is "{part}.{key}" in [values],'
-                    " for all of them at once"
-                )
-            raise unknown(
-                f"key of [[{kind}]]" if index is not None else f"key of [{kind}]", key, fields
-            )
-        if key == "name":
-            name_of(f"{where}: name", value)
-        if key in ("name", "to", "from", "between", "outputs"):
-            continue
-        truth, meta = isinstance(fields[key], bool), METAS[kind][key]
-        good = (
-            isinstance(value, bool)
-            if truth
-            else not isinstance(value, bool) and isinstance(value, (int, float))
-        )
-        if not (good and is_numeric(float(value) if truth else value) and abs(value) <= 1e300):
-            huge = good and abs(value) > 1e300 and value not in (float("inf"), -float("inf"))
-            wanted = "true or false" if truth else "within +-1e300" if huge else "a finite number"
-            raise InputError(f"{where}: {key} = {shortened(value)}: must be {wanted}")
-        if not truth:
-            check_value(
-                f"{where}: {key}",
-                value,
-                {"low": None, "high": None, **meta, "unit": local(meta["unit"], units)},
-            )
-    for key, value in fields.items():
-        if value is None and key not in entry and kind != "plant":
-            raise InputError(f"{where}: {key} is missing")
-    return {**fields, **entry}
-
-
 def entries_of(loop, names):
-    """[(title, kind, {key: value})] that describe the rig of a loop tank by tank. A steady inflow
-    is the tanks' own. names: those of a Case; "name" is (name, number from 1).
+    """Return [(section, number from 1, {key: value})] that describe a loop's rig tank by tank.
 
-    Raises InputError for a plant of another class than TankNetwork.
+    A steady inflow is the tanks' own; keys without a value are left out.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    names : {"tank" or "pump": a name of each}, those of a Case
+
+    Raises
+    ------
+    InputError for a plant of another class than TankNetwork.
     """
-    plant, bank, found = loop.plant, loop.actuator, []
+    plant = loop.plant
     if not isinstance(plant, TankNetwork):
         raise InputError(f"its {type(plant).__name__} has no name in a rig file")
-    steady = (
-        np.asarray(loop.disturbance.level)
-        if isinstance(loop.disturbance, Constant)
-        else np.zeros(plant.tanks)
-    )
-    columns = {
-        "area": plant.area,
-        "rim": plant.rim,
-        "drain": plant.drain,
-        "level": loop.x0,
-        "inflow": steady,
-        "noise": np.broadcast_to(loop.sensor.noise, plant.tanks),
-    }
-    for i in range(plant.tanks):
-        own = {"name": (names["tank"][i] if "tank" in names else "", i + 1)}
-        found.append(
-            ("[[tank]]", "tank", own | {k: float(np.asarray(v)[i]) for k, v in columns.items()})
-        )
-    for (a, b), area in zip(plant.links, np.asarray(plant.orifice).tolist()):
-        found.append(("[[orifice]]", "orifice", {"from": a + 1, "to": b + 1, "area": area}))
-    for (a, b), area in zip(plant.pipes, np.asarray(plant.pipe).tolist()):
-        found.append(("[[pipe]]", "pipe", {"between": [a + 1, b + 1], "area": area}))
-    for (a, b), caught in zip(plant.spills, np.asarray(plant.caught).tolist()):
-        found.append(("[[spill]]", "spill", {"from": a + 1, "to": b + 1, "caught": caught}))
-    for j, (first, second) in enumerate(plant.feeds):
-        own = {"name": (names["pump"][j] if "pump" in names else "", j + 1)}
-        own |= {
-            "gain": float(plant.pump_gain[j]),
-            "to": first + 1 if second is None else [first + 1, second + 1],
-        }
-        own |= {} if second is None else {"split": float(plant.split[j])}
-        found.append(
-            (
-                "[[pump]]",
-                "pump",
-                own
-                | {k: float(np.asarray(getattr(bank, k))[j]) for k in ("low", "high", "initial")},
-            )
-        )
-    more = {"outputs": [i + 1 for i in plant.outputs], "gravity": float(plant.gravity)}
-    return [
-        *found,
-        ("[plant]", "plant", more | {k: getattr(plant, k) for k in ("overflow", "bottom", "knee")}),
-    ]
+    found = []
+    for name in LISTS:
+        section = SECTIONS[name]
+        for i in range(len(getattr(plant, section.per))):
+            own = {key.name: _entry_of(loop, key.target, i) for key in section.keys if key.target}
+            if name == "pump" and plant.feeds[i][1] is None:
+                del own["split"]
+            if name in ("tank", "pump"):
+                own["name"] = names[name][i] if name in names else ""
+            found.append((section, i + 1, own))
+    more = {key.name: getattr(plant, key.name) for key in SECTIONS["plant"].keys}
+    return [*found, (SECTIONS["plant"], 1, more)]
+
+
+def _entry_of(loop, target, i):
+    """Entry i of the field `target` of a loop, or a part of it; 0 of no steady inflow."""
+    if target.startswith("disturbance.") and not isinstance(loop.disturbance, Constant):
+        return 0.0
+    value: Any = loop
+    *path, part = target.split(".")
+    for step in [*path, part] if not part.isdigit() else path:
+        value = getattr(value, step)
+    if not isinstance(value, tuple) and np.ndim(value) == 0:  # one number for all tanks
+        return value
+    return value[i][int(part)] if part.isdigit() else value[i]

@@ -9,44 +9,29 @@ from jaxtank import presets
 from jaxtank.core.tree import is_component, walk
 from jaxtank.rig import components, schedule, signals
 
-# table of a rig file, field of the loop
-PARTS = (
-    ("law", "controller"),
-    ("observer", "observer"),
-    ("sensor", "sensor"),
-    ("actuator", "actuator"),
-)
-
 
 def origin_of(case):
-    """(Case of a preset with the same rig, which of PARTS are of the same kind as its own), or (None, ()): of a rig whose tanks have names too, which only a file that describes
-    it tank by tank can say.
+    """Return the preset that a case came from.
 
-    Of several, the one with the same law and observer, then of the same name, then with the most
-    static fields in common: its title is the one that the file will show. What a file can say in a
-    table of its own (reference, disturbances, faults) may differ.
+    Of several, the one with the same controller and observer, then of the same name, then with the
+    most static fields in common: its title is the one that the file will show. What a file has
+    tables of its own for (reference, disturbances, faults) may differ.
+
+    Returns
+    -------
+    (Case of a preset with the same rig, which of "law", "observer", "sensor" and "actuator" are of
+    the same kind as its own), or (None, ()): also of a rig whose tanks have names, which only a
+    file that describes it tank by tank can have.
     """
     if case.names:
         return None, ()
     loop = schedule.unscheduled(case.loop)
-    mine, statics, best, found = structures(loop), _statics(loop), None, (None, ())
+    mine, statics = structures(loop), _statics(loop)
+    best, found = None, (None, ())
     for paper in presets.PAPERS:
         for other in presets.load(paper).cases.values():
-            theirs = structures(other.loop)
-            if mine["rest"] != theirs["rest"] or not _optional(other.loop, ("plant",)) <= _optional(
-                loop
-            ):
-                continue
-            same = tuple(
-                word
-                for word, field in PARTS
-                if mine[field] == theirs[field]
-                and _optional(other.loop, (field,)) <= _optional(loop)
-            )
-            if any(
-                word not in same and not components.is_written(word, getattr(loop, field))
-                for word, field in PARTS
-            ):
+            same = _same_parts(loop, mine, other.loop)
+            if same is None:
                 continue
             common = sum(a == b for a, b in zip(statics, _statics(other.loop)))
             score = ("law" in same, "observer" in same, other.name == case.name, common)
@@ -55,21 +40,43 @@ def origin_of(case):
     return found
 
 
+def _same_parts(loop, mine, other):
+    """Which sections `other` has of the same kind as `loop`, whose structures are `mine`; None
+    where a file cannot make one loop of the other.
+    """
+    theirs = structures(other)
+    if mine["rest"] != theirs["rest"] or not _has_optional(other, "plant", loop):
+        return None
+    same = tuple(
+        name
+        for name, role in components.ROLES.items()
+        if mine[role.field] == theirs[role.field] and _has_optional(other, role.field, loop)
+    )
+    for name, role in components.ROLES.items():
+        if name not in same and not components.is_written(name, getattr(loop, role.field)):
+            return None
+    return same
+
+
+def _has_optional(other, field, loop):
+    """Whether the optional leaves that a part of `other` uses are in use in `loop`."""
+    return {name for name in _optional(other) if name.startswith(f"{field}.")} <= _optional(loop)
+
+
 def _statics(loop):
     return [value for _, value, _ in walk(loop, kind="static")] + [
         np.asarray(getattr(loop.plant, "area", ())).tolist()
     ]
 
 
-def _optional(loop, fields=None):
-    """Names of the optional leaves that are in use; fields: of which parts of the loop."""
-    named = {name for name, value, meta in walk(loop) if meta.get("like") and value is not None}
-    return named if fields is None else {name for name in named if name.split(".")[0] in fields}
+def _optional(loop):
+    """Names of the optional leaves that are in use."""
+    return {name for name, value, meta in walk(loop) if meta.get("like") and value is not None}
 
 
 def structures(loop):
-    """Pytree structures of law, observer and the rest, with what a rig file can set made alike:
-    they compare by their components.
+    """Pytree structures of controller, observer and the rest, with what a rig file can set made
+    alike: they compare by their components.
     """
 
     def settle(tree):
@@ -84,15 +91,13 @@ def structures(loop):
                 changed[field.name] = None
         return dataclasses.replace(tree, **changed)
 
-    told = {"faults": None}
+    described = {"faults": None}
     if signals.steps(loop.reference) is not None:
-        told["reference"] = None
+        described["reference"] = None
     if signals.disturbance_tables(loop.disturbance) is not None:
-        told["disturbance"] = None
-    plain = settle(dataclasses.replace(loop, **told))
-    fields = [field for _, field in PARTS]
+        described["disturbance"] = None
+    plain = settle(dataclasses.replace(loop, **described))
+    fields = [role.field for role in components.ROLES.values()]
     rest = dataclasses.replace(plain, **dict.fromkeys(fields))
-    return {
-        "rest": jax.tree.structure(rest),
-        **{field: jax.tree.structure(getattr(plain, field)) for field in fields},
-    }
+    parts = {field: jax.tree.structure(getattr(plain, field)) for field in fields}
+    return {"rest": jax.tree.structure(rest), **parts}

@@ -1,4 +1,4 @@
-"""From a rig file to a Case."""
+"""From a rig file to a Case.  Imported by `sections` and by `jaxtank.rig`."""
 
 import dataclasses
 import re
@@ -14,8 +14,9 @@ from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
-from jaxtank.rig import components, experiment_tables, network, signals, validate
-from jaxtank.rig.schema import name_of
+from jaxtank.rig import components, network, signals, validate
+from jaxtank.rig.entry import Sizes, read_value
+from jaxtank.rig.schema import SECTIONS, TANKWISE
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
 
 MOST = 100
@@ -31,7 +32,8 @@ _PART = r"""(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\[^\n])*+"|'[^'\n]*+')"""
 # such parts at most, those of a float.
 _TOKEN = re.compile(
     r'''(?P<text>"""(?:[^"\\]|\\.|"{1,2}(?!"))*+"{3,5}|\'\'\'(?:[^']|'{1,2}(?!'))*+'{3,5})'''
-    rf"""|(?P<open>\"\"\"|''')|(?P<key>{_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)|(?P<quote>["'])|[\[{{]|(?:\#[^\n]*+\s*+)++""",
+    rf"""|(?P<open>\"\"\"|''')|(?P<key>{_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)"""
+    r"""|(?P<quote>["'])|[\[{]|(?:\#[^\n]*+\s*+)++""",
     re.DOTALL,
 )
 _ONE = re.compile(_PART)
@@ -60,53 +62,73 @@ def check_keys(text):
             raise InputError(f"has more than {MOST_WORDS} keys and values")
 
 
-TABLES = (
-    "case",
-    "name",
-    "reachable",
-    *network.TABLES,
-    "law",
-    "observer",
-    "sensor",
-    "actuator",
-    "schedule",
-    "values",
-    "reference",
-    "disturbance",
-    "pour",
-    "fault",
-    "limits",
-    "free",
-    "objective",
-    "uncertain",
-    "covariance",
-    "log",
-    "scenario",
-)
-LISTS = ("scenario", "tank", "orifice", "pipe", "spill", "pump", "pour", "fault")
-KINDS = {
-    "case": (str, "a text"),
-    "name": (str, "a text"),
-    "reachable": (bool, "true or false"),
-    "units": (list, "a list"),
-    **{k: (list, f"a list of tables, [[{k}]]") for k in LISTS},
-}
-
-
 def open_case(name: str) -> Case:
-    """The Case of "paper/case", or of a rig file where `name` ends in .toml, checked."""
+    """Return the Case of "paper/case", or of a rig file where `name` ends in .toml, checked.
+
+    Parameters
+    ----------
+    name : "paper/case" as `jaxtank list` prints it, or a path
+
+    Raises
+    ------
+    InputError for a case that does not exist, and as `load`.
+
+    Examples
+    --------
+    >>> from jaxtank import rig
+    >>> rig.open_case("cascaded/pi").name
+    'cascaded/pi'
+    """
     return load(name) if name.endswith(".toml") else presets.find(name)
 
 
 def load(path: str | Path) -> Case:
-    """The Case of a rig file. Raises InputError, naming the file, for anything in it that is
-    unknown, misshapen or out of range.
+    """Return the Case of a rig file.
+
+    Parameters
+    ----------
+    path : of a TOML file, UTF-8, of at most 4 MiB
+
+    Raises
+    ------
+    InputError, naming the file, for anything in it that is unknown, misshapen or out of range.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile
+    >>> from jaxtank import rig
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder, "rig.toml")
+    ...     count = path.write_text('case = "cascaded/pi"')
+    ...     rig.load(path).clock.dt
+    4.0
     """
     return loads(read_text(path, "rig file"), f"rig file {str(path)!r}")
 
 
 def loads(text: str, words: str = "rig file") -> Case:
-    """The Case of the text of a rig file, called `words` in errors."""
+    """Return the Case of the text of a rig file.
+
+    Parameters
+    ----------
+    text : TOML
+    words : what errors call it
+
+    Raises
+    ------
+    InputError as `load`.
+
+    Examples
+    --------
+    >>> from jaxtank import rig
+    >>> case = rig.loads('''
+    ... case = "cascaded/pi"
+    ... [values]
+    ... clock.duration = 400.0
+    ... ''')
+    >>> case.clock.duration
+    400.0
+    """
     try:
         check_keys(text)
     except InputError as error:
@@ -132,53 +154,89 @@ def loads(text: str, words: str = "rig file") -> Case:
 
 
 def from_table(table: Mapping[str, Any]) -> Case:
-    """The Case described by a table of the form of a rig file."""
+    """Return the Case described by a table of the form of a rig file.
+
+    Parameters
+    ----------
+    table : {key or section: value, table, or list of tables}
+
+    Raises
+    ------
+    InputError as `load`.
+
+    Examples
+    --------
+    >>> from jaxtank import rig
+    >>> rig.from_table({"case": "cascaded/pi", "limits": {"max_level": 9.0}}).limits
+    {'max_level': 9.0}
+    """
     case = start_of(table)
-    table = {
-        **table,
-        **{
-            key: by_dotted_name(table[key], key)
-            for key in ("values", "free", "uncertain")
-            if key in table
-        },
-    }
+    dotted = ("values", "free", "uncertain")
+    named = {key: by_dotted_name(table[key], key) for key in dotted if key in table}
+    table = {**table, **named}
     values = with_models(case.loop, table.get("values", {}))
     case = set_and_schedule(case, values, table.get("schedule", {}))
-    if "limits" in table:
-        case = case.replace(limits=validate.check_limits(case.loop, table["limits"]))
-    if "objective" in table:
-        case = case.replace(objective=validate.check_objective(table["objective"]))
-    if "free" in table:
-        case = case.replace(free=validate.free_of(case.loop, table["free"]))
-    if "uncertain" in table:
-        case = case.replace(uncertain=validate.check_uncertain(case.loop, table["uncertain"]))
-    if "covariance" in table:
-        case = case.replace(
-            covariance=experiment_tables.check_covariance(case.loop, table["covariance"])
-        )
-    if "log" in table:
-        case = case.replace(log=experiment_tables.check_log(case.loop.plant, table["log"]))
-    if "scenario" in table:
-        case = case.replace(
-            scenarios=tuple(
-                validate.scenario(case, entry, i) for i, entry in enumerate(table["scenario"])
-            )
-        )
+    for name, read in TUNING.items():
+        if name in table:
+            case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
     return validate.check(case)
 
 
+TUNING = {
+    "limits": lambda case, table: validate.check_limits(case.loop, table),
+    "objective": lambda case, table: validate.check_objective(table),
+    "free": lambda case, table: validate.free_of(case.loop, table),
+    "uncertain": lambda case, table: validate.check_uncertain(case.loop, table),
+    "covariance": lambda case, table: validate.check_covariance(case.loop, table),
+    "log": lambda case, table: validate.check_log(case.loop.plant, table),
+    "scenario": lambda case, table: tuple(
+        validate.scenario(case, entry, i) for i, entry in enumerate(table)
+    ),
+}
+"""{section: function (case, its table)} of what is read after the values are set."""
+
+FIELDS = {"scenario": "scenarios"}
+"""{section: field of Case}, where it has another name."""
+
+
 def start_of(table):
-    """The Case of the tables that build: case or tanks, law, observer, reference, what disturbs;
-    before any value is set.
+    """Return the Case of the tables that build: case or tanks, law, observer, reference, what
+    disturbs; before any value is set.
     """
-    for key, value in table.items():
-        if key not in TABLES:
-            raise unknown("key", key, TABLES)
-        wanted, words = KINDS.get(key, (dict, "a table"))
-        if not isinstance(value, wanted):
-            raise InputError(f"{key} = {shortened(value)}: must be {words}")
-    name_of("name", table.get("name", ""))
-    if "case" in table and (given := [k for k in network.TABLES if k in table]):
+    top = _top(table)
+    case = (
+        _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
+    )
+    loop, changed = case.loop, {}
+    for name in ("sensor", "actuator"):
+        if name in table:
+            changed[name] = components.instrument_of(name, table[name], loop)
+    if "reference" in table:
+        changed["reference"] = signals.reference_of(table["reference"], loop.reference, loop.plant)
+    if "disturbance" in table or "pour" in table:
+        names = network.names_in(table)
+        changed["disturbance"] = signals.disturbance_of(table, loop, names)
+    if "fault" in table:
+        changed["faults"] = signals.faults_of(table["fault"], loop.plant)
+    if changed:
+        case = case.replace(loop=dataclasses.replace(loop, **changed))
+    own = {key: top[key] for key in top if key not in ("case", "units")}
+    return case.replace(**own)
+
+
+def _top(table):
+    """The values at the top of a rig file; InputError for a section or key that is unknown or of
+    another kind, and unless there is either a case or a tank.
+    """
+    _check_sections(table)
+    first = SECTIONS[""]
+    top = {
+        k.name: read_value(k, k.name, table[k.name], Sizes(0))
+        for k in first.keys
+        if k.name in table
+    }
+    given = [name for name in TANKWISE if name in table]
+    if "case" in table and given:
         raise InputError(
             f"{given[0]}: a rig file is either a case or a rig described tank by tank: leave out"
             f" case, or [{given[0]}]"
@@ -188,29 +246,21 @@ def start_of(table):
             'a rig file needs case = "paper/case" to start from (`jaxtank list` prints them), or'
             " [[tank]] to describe a rig"
         )
-    case = (
-        _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
-    )
-    loop, changed = case.loop, {}
-    for word in components.INSTRUMENTS:
-        if word in table:
-            changed[word] = components.instrument_of(word, table[word], loop)
-    if "reference" in table:
-        changed["reference"] = signals.reference_of(table["reference"], loop.reference)
-    if "disturbance" in table or "pour" in table:
-        named = network.names_in(table)
-        changed["disturbance"] = signals.disturbance_of(
-            table,
-            loop,
-            lambda value, where: network.tank_index(value, where, named, loop.plant.tanks),
-        )
-    if "fault" in table:
-        changed["faults"] = signals.faults_of(table["fault"], loop.plant)
-    if changed:
-        case = case.replace(loop=dataclasses.replace(loop, **changed))
-    return case.replace(
-        name=table.get("name", case.name), reachable=table.get("reachable", case.reachable)
-    )
+    return top
+
+
+def _check_sections(table):
+    """Raise InputError for a key at the top that is unknown, and for one that is no table."""
+    sections = {name: section for name, section in SECTIONS.items() if name and "." not in name}
+    for key, value in table.items():
+        if key in SECTIONS[""].names:
+            continue
+        if key not in sections:
+            raise unknown("key", key, [*SECTIONS[""].names, *sections])
+        many = sections[key].many
+        if not isinstance(value, list if many else dict):
+            words = f"a list of tables, [[{key}]]" if many else "a table"
+            raise InputError(f"{key} = {shortened(value)}: must be {words}")
 
 
 def _with_parts(case, table):

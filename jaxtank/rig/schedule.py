@@ -18,9 +18,10 @@ from jaxtank.core.tree import (
     walk,
     with_values,
 )
+from jaxtank.rig.entry import read_entry, sizes_of
+from jaxtank.rig.schema import SECTIONS
 
 LAW = "controller."
-KEYS = ("gains", "variable", "knots")
 
 
 def schedule(case, gains, knots):
@@ -115,27 +116,18 @@ def table_of(loop):
 
 
 def from_table(case, table):
-    """`schedule` of a table as `table_of` makes it. Raises InputError for a key that is unknown,
-    missing, or not of its kind.
+    """Return `schedule` of a table as `table_of` makes it.
+
+    Raises
+    ------
+    InputError for a key that is unknown, missing, or not of its kind.
     """
-    for key in table:
-        if key not in KEYS:
-            raise unknown("key of [schedule]", key, KEYS)
-    for key in KEYS:
-        if key not in table:
-            raise InputError(
-                f'[schedule] needs {key}: gains = [names], variable = "r1", knots = [levels]'
-            )
-    gains, knots = table["gains"], table["knots"]
-    if not (isinstance(gains, list) and gains and all(isinstance(g, str) for g in gains)):
-        raise InputError(f"schedule.gains = {gains!r}: must be a list of names of gains")
+    values = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop.plant))
+    gains, knots = values["gains"], table["knots"]
     for gain in gains:
         if gains.count(gain) > 1:
-            raise InputError(f"gain {gain} is scheduled twice")
-    numeric = isinstance(knots, list) and all(
-        isinstance(p, (int, float)) and not isinstance(p, bool) for p in knots
-    )
-    if not numeric:
+            raise InputError(f"schedule.gains: {gain} is scheduled twice: name it once")
+    if not isinstance(knots, list):
         raise InputError(f"schedule.knots = {knots!r}: must be a list of numbers")
     return schedule(case, dict.fromkeys(gains, table["variable"]), knots)
 

@@ -1,167 +1,355 @@
-"""How values are written in a rig file, and what may be said of them: numbers, ranges, units."""
+"""The schema of a rig file: one table of keys for each TOML section.
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+Reading, writing, `jaxtank init` and validation all follow `SECTIONS`; imported by the rest of rig.
+"""
 
-import numpy as np
+import dataclasses
+import functools
+from typing import Any
 
-from jaxtank.core.checks import check_value
-from jaxtank.core.errors import InputError
-from jaxtank.core.text import shortened
-from jaxtank.core.units import local
+from jaxtank.core.units import DEFAULT, local
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.plants.faults import Faults
+from jaxtank.plants.network import TankNetwork
+from jaxtank.signals.inflows import Pours
+from jaxtank.signals.setpoints import Ramps, Sine
 
-BARE = {"unit": "-", "doc": ""}
+NEEDED: Any = object()
+"""Default of a key that a file must have."""
 
 
-class Key(NamedTuple):
-    """A line "name = value" of a rig file; on: False where it is only a suggestion, commented out."""
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """A key of a section: what it is, which values it may have, and where its value goes.
+
+    Parameters
+    ----------
+    name : the key in the file
+    doc : what it is, printed by `init` and where it is missing
+    kind : how a value is read and written, a name in `entry.READ`
+    unit : of its number, written for ("cm", "V")
+    low, high, strict : allowed range, or None; strict: `low` itself is excluded
+    choices : allowed values, or None
+    default : value, as in a file, where the key is left out; None: it is then absent
+    target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
+        ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
+
+    >>> Key.of(PumpBank, "stop", target="actuator.stop").unit
+    'V'
+    """
 
     name: str
-    value: Any
-    meta: Mapping[str, Any] = BARE
-    on: bool = True
+    doc: str = ""
+    kind: str = "number"
+    unit: str = "-"
+    low: float | None = None
+    high: float | None = None
+    strict: bool = False
+    choices: tuple | None = None
+    default: Any = NEEDED
+    target: str = ""
+
+    @classmethod
+    def of(cls, owner: type, field: str, doc: str = "", **changes: Any) -> "Key":
+        """Return the key of a component's field: unit, description, range and kind are the field's.
+
+        Parameters
+        ----------
+        owner : class made by `jaxtank.component`
+        field : name of one of its leaves or static fields
+        doc : what the key is; "": what the field is
+        changes : what is different in the key
+
+        Examples
+        --------
+        >>> key = Key.of(TankNetwork, "rim", "height")
+        >>> key.name, key.kind, key.unit, key.low, key.strict
+        ('rim', 'number', 'cm', 0.0, True)
+        """
+        found = next(f for f in dataclasses.fields(owner) if f.name == field)
+        meta = found.metadata
+        own = {k: meta[k] for k in ("unit", "doc", "low", "high", "strict") if k in meta}
+        if meta["kind"] == "static":
+            own |= {"kind": _KINDS.get(type_of(found), "number"), "choices": meta["choices"]}
+        return cls(**{"name": field, **own, **({"doc": doc} if doc else {}), **changes})
+
+    def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
+        """Return the metadata of a value, as of a leaf, in the units of a rig.
+
+        >>> Key("level", unit="cm").meta(("m", "V"))["unit"]
+        'm'
+        """
+        found = {k: getattr(self, k) for k in ("kind", "doc", "low", "high", "strict", "choices")}
+        return {**found, "unit": local(self.unit, units)}
 
 
-class Section(NamedTuple):
-    """A table of a rig file; title: "[values]" or "" for lines that go on; prose: sentences above
-    it; on: False: commented out as a whole.
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A table of a rig file, or a list of tables.
+
+    Parameters
+    ----------
+    name : of the table, "reference.sine" for a table in a table
+    keys : what it may have; () where the names are parameters, measures, or fields of a class
+    many : whether it is a list of tables, [[name]]
+    prose : sentence that `init` prints above it where a case has none
+    per : field of TankNetwork with an entry for each table of the list
+    elsewhere : (part of the loop, class) whose other fields are in [values], for all tables at once
+
+    >>> SECTIONS["tank"].title, SECTIONS["tank"]["area"].unit
+    ('[[tank]]', 'cm^2')
     """
 
-    title: str
-    keys: list
-    prose: tuple = ()
-    on: bool = True
+    name: str
+    keys: tuple[Key, ...] = ()
+    many: bool = False
+    prose: str = ""
+    per: str = ""
+    elsewhere: tuple = ()
+
+    @property
+    def title(self) -> str:
+        """The line that begins the table: "[plant]", "[[tank]]"; "" of the top of a file."""
+        return f"[[{self.name}]]" if self.many else f"[{self.name}]" if self.name else ""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its keys."""
+        return [key.name for key in self.keys]
+
+    def __getitem__(self, name: str) -> Key:
+        return next(key for key in self.keys if key.name == name)
 
 
-def lines_of(section):
-    """The lines of a Section in a terse file: its title, and "name = value  # [unit] what it is" of
-    every key that is on.
-    """
-    return [section.title] * bool(section.title) + [
-        f"{k.name} = {toml(k.value)}" + (f"  # {_note(k.meta)}" if _note(k.meta) else "")
-        for k in section.keys
-        if k.on
-    ]
+_KINDS = {bool: "flag", int: "integer", str: "choice", tuple: "tanks"}
+_TYPES = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
 
 
-def _note(meta):
-    return " ".join(filter(None, ["" if meta["unit"] == "-" else f"[{meta['unit']}]", meta["doc"]]))
+def type_of(field):
+    """The type of a field, also where `from __future__ import annotations` makes it a text."""
+    return _TYPES.get(field.type, field.type)
 
 
-def keys_of(found, units, on=True):
-    """Keys of [(name, metadata, value)], units as the rig counts."""
-    return [
-        Key(name, value, {**meta, "unit": local(meta["unit"], units)}, on)
-        for name, meta, value in found
-    ]
+def _of(owner, part, field, doc, name="", **changes):
+    """The key of a component's field that is a part of the loop."""
+    target = f"{part}.{field}" if part else field
+    return Key.of(owner, field, doc, name=name or field, target=target, **changes)
 
 
-SMALL_INT = (int, np.integer)
+_plant = functools.partial(_of, TankNetwork, "plant")
+_pump = functools.partial(_of, PumpBank, "actuator")
+_sensor = functools.partial(_of, LevelSensor, "sensor")
+_optional = functools.partial(Key, default=None)
+BY_NAME = "by name or number from 1"
+
+TOP = (
+    _optional("case", "the preset that this file starts from", "choice"),
+    _optional("name", "what reports call it", "text"),
+    _optional(
+        "reachable",
+        "whether every plateau of the reference must have a steady state",
+        "flag",
+        choices=(True, False),
+    ),
+    Key("units", "[length, pump input]", "any", default=list(DEFAULT)),
+)
+TANK = (
+    Key("name", "what other tables may call it, instead of its number from 1", "text", default=""),
+    _plant("area", "cross-section A"),
+    _plant("rim", "height"),
+    _plant("drain", "effective orifice area to the basin; 0: closed", default=0.0),
+    _of(ClosedLoop, "", "x0", "level at t = 0", name="level", default=0.0),
+    Key(
+        "inflow",
+        "steady inflow that no pump brings; negative: a leak",
+        unit="cm^3/s",
+        default=0.0,
+        target="disturbance.level",
+    ),
+    _sensor("noise", "standard deviation of the noise of its sensor", default=0.0),
+)
+ORIFICE = (
+    Key("from", f"the tank that it leaves, {BY_NAME}", "tank", target="plant.links.0"),
+    Key("to", f"the tank that it flows into, {BY_NAME}", "tank", target="plant.links.1"),
+    _plant("orifice", "effective area", name="area"),
+)
+PIPE = (
+    Key("between", "the two tanks that it joins, below the surface", "pair", target="plant.pipes"),
+    _plant("pipe", "effective area", name="area"),
+)
+SPILL = (
+    Key("from", f"the tank whose rim is passed, {BY_NAME}", "tank", target="plant.spills.0"),
+    Key("to", f"the tank that it falls into, {BY_NAME}", "tank", target="plant.spills.1"),
+    _plant("caught", "share that falls into it", default=1.0),
+)
+PUMP = (
+    Key("name", "a note; nothing refers to it", "text", default=""),
+    _plant("pump_gain", "flow per unit of the pump's input (Kp)", name="gain"),
+    Key("to", "the tank that it fills, or [first, second]", "feed", target="plant.feeds"),
+    _plant("split", "share that goes to the first of two tanks", default=1.0),
+    _pump("low", "lower limit", default=0.0),
+    _pump("high", "upper limit"),
+    _pump("initial", "input at which it ran before t = 0", default=0.0),
+)
+PLANT = (
+    _optional(
+        "outputs",
+        "the tanks whose levels are controlled; left out: those that the pumps fill first",
+        "tanks",
+        target="plant.outputs",
+    ),
+    *(_plant(name, "", default=None) for name in ("gravity", "overflow", "bottom", "knee")),
+)
+KIND = Key("kind", kind="any")
+"""The key that names the class of a controller or an observer; its doc lists the classes."""
+COURSE = tuple(Key.of(Ramps, name, default=None) for name in ("ramp", "shape"))
+OPEN_LOOP = (
+    KIND,
+    _optional("initial", "(m,) input of each pump before the first change", "list", "V"),
+    _optional("changes", "[time in s, pump from 1, input] of each change", "any", "V"),
+    *COURSE,
+)
+"""[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
+REFERENCE = (
+    _optional(
+        "initial", "(outputs,) setpoint of each output before the first change", "list", "cm"
+    ),
+    _optional("changes", "[time in s, output from 1, setpoint] of each change", "any", "cm"),
+    *COURSE,
+    Key.of(Ramps, "band", default=None),
+    _optional("sine", "a sine on top: [reference.sine]; {}: none", "table"),
+)
+SINE = (
+    Key.of(Sine, "amplitude"),
+    Key.of(Sine, "offset", default=0.0),
+    Key.of(Sine, "period"),
+    Key.of(Sine, "zero", default=0.0),
+    Key.of(Sine, "start", default=0.0),
+    Key.of(Sine, "end", default=1e9),
+    Key("output", "the output it moves, from 1", "integer", low=1, target="channel"),
+)
+DISTURBANCE = (
+    _optional(
+        "inflow",
+        "(n,) steady inflow of each tank that no pump brings; negative: a leak",
+        "list",
+        "cm^3/s",
+    ),
+    Key.of(Pours, "window", default=None),
+)
+POUR = (
+    Key("time", "when it begins", unit="s", low=0.0),
+    Key("duration", "how long it lasts", unit="s", low=0.0, strict=True),
+    Key("tank", f"the tank, {BY_NAME}", "tank"),
+    Key("volume", "volume of the pulse; negative: taken out", unit="cm^3"),
+)
+FAULT = (
+    Key("of", "the entry of the plant that changes, counted from 0", "text"),
+    Key("start", "when it begins", unit="s", low=0.0),
+    Key("end", "when it is over", unit="s"),
+    Key.of(Faults, "factor", "what the entry is multiplied by", default=1.0),
+    Key.of(Faults, "extra", "what is added to it, in its own unit", default=0.0),
+)
+SCHEDULE = (
+    Key("gains", "names of the gains that follow the variable", "texts"),
+    Key("variable", "a setpoint, r1 .., or a level, h1 ..", "any"),
+    Key("knots", "values of the variable at which the gains are given", "array", "cm"),
+)
+COVARIANCE = (
+    Key("names", "parameters, an array's entry by name[i]", "texts"),
+    Key("matrix", "their covariance, in their units", "any"),
+)
+SCENARIO = (
+    _optional("name", "what reports call it", "text"),
+    Key("seed", "of its sensor noise", "integer", low=0, high=2**31 - 1, default=0),
+    Key("weight", "in the mean over scenarios", low=0.0, strict=True, default=1.0),
+    Key(
+        "values",
+        'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by'
+        ' -0.5" (less), "0.02 if zero", and "steady" for x0, actuator.initial and'
+        " reference.initial",
+        "table",
+        default={},
+    ),
+)
+WEIGHT = Key("weight", "weight in the sum that is minimised", low=0.0, default=1.0)
+SHARE = Key("share", "share", low=0.0, high=1.0, strict=True, default=0.05)
+
+_ALL = (
+    Section("", TOP),
+    Section("tank", TANK, many=True, per="area", elsewhere=("sensor", LevelSensor)),
+    Section("orifice", ORIFICE, many=True, per="links"),
+    Section("pipe", PIPE, many=True, per="pipes"),
+    Section("spill", SPILL, many=True, per="spills"),
+    Section("pump", PUMP, many=True, per="feeds", elsewhere=("actuator", PumpBank)),
+    Section("plant", PLANT),
+    Section("law"),
+    Section("observer"),
+    Section("sensor"),
+    Section("actuator"),
+    Section("reference", REFERENCE),
+    Section(
+        "reference.sine",
+        SINE,
+        prose="A sine on top of the ramps of one output, for a while; names are then"
+        " reference.first.ramp and so on.",
+    ),
+    Section(
+        "disturbance",
+        DISTURBANCE,
+        prose="A steady inflow of each tank, or pulses of inflow, [[pour]]: one of the two.",
+    ),
+    Section(
+        "pour",
+        POUR,
+        many=True,
+        prose="A pulse of inflow into a tank, for recovery_time; as many as you like.",
+    ),
+    Section(
+        "fault",
+        FAULT,
+        many=True,
+        prose="A fault of the plant that is unknown to the controller; as many as you like.",
+    ),
+    Section(
+        "schedule",
+        SCHEDULE,
+        prose="Gains that follow a setpoint or a level, linear between knots; they start from the"
+        ' value above. Theirs are then "controller.values", a row per gain; [free] may name the'
+        " gain for all its knots.",
+    ),
+    Section("values"),
+    Section("limits"),
+    Section("free"),
+    Section("objective"),
+    Section("uncertain"),
+    Section(
+        "covariance",
+        COVARIANCE,
+        prose="Parameters that vary together, as `jaxtank identify` writes them; used in the place"
+        " of [uncertain].",
+    ),
+    Section(
+        "scenario",
+        SCENARIO,
+        many=True,
+        prose="A run that `tune` judges by, in the place of the case's own; as many as you like.",
+    ),
+    Section(
+        "log",
+        prose="Columns of the experiment data for jaxtank identify, where its header does not name"
+        " them: [header, unit].",
+    ),
+)
+SECTIONS = {section.name: section for section in _ALL}
+"""{name: Section} of a rig file, in the order in which it is written."""
+
+TANKWISE = (*(s.name for s in _ALL if s.per), "plant", "units")
+"""What describes a rig tank by tank, and is not given beside `case`."""
 
 
-def toml(value: Any) -> str:
-    """`value` as TOML: numbers to their last digit, texts escaped, lists and tuples as arrays."""
-    if isinstance(value, (np.generic, np.ndarray)):
-        value = value.tolist()
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(toml(v) for v in value) + "]"
-    if isinstance(value, dict):
-        inside = ", ".join(f"{toml(k)} = {toml(v)}" for k, v in value.items())
-        return f"{{ {inside} }}" if inside else "{}"
-    return repr(value)
-
-
-def name_of(where, value):
-    """`value` if it can be a name: a text of one line without control characters, which a terminal
-    would obey.
-    """
-    if not isinstance(value, str) or not value.isprintable():
-        raise InputError(
-            f"{where} = {shortened(value)}: must be a text"
-            + " of printable characters" * isinstance(value, str)
-        )
-    return value
-
-
-def is_numeric(value):
-    """True for a number that a float can hold, and for lists of such numbers and arrays of a
-    regular shape.
-    """
-    if isinstance(value, (np.ndarray, np.generic)):
-        return np.issubdtype(value.dtype, np.number)
-    if isinstance(value, (list, tuple)):
-        return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
-    try:
-        return (
-            isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and float(value) is not None
-        )
-    except OverflowError:
-        return False
-
-
-def is_finite(value):
-    """True for what `is_numeric` is true for, if every number is finite. A whole number is taken as
-    the float next to it: numpy's own answer to one of 2^64 and more is a TypeError.
-    """
-    return is_numeric(value) and bool(np.all(np.isfinite(np.asarray(value, dtype=float))))
-
-
-def plain(name, value):
-    """`value` as a float; InputError, naming it `name`, unless it is a number."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):
-        raise InputError(f"{name} = {shortened(value)}: must be a number")
-    return float(value)
-
-
-def static_value(name, value, meta, kind):
-    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is
-    another, out of range, or no choice.
-    """
-    if meta["choices"] is not None:
-        if (
-            isinstance(value, (list, dict))
-            or value not in meta["choices"]
-            or isinstance(value, bool) != (kind is bool)
-        ):
-            raise InputError(
-                f"{name} = {shortened(value)}: must be one of {_choices(meta['choices'])}"
-            )
-        return value
-    if kind is str:  # a text of which the component itself knows what it may be
-        if not isinstance(value, str):
-            raise InputError(f"{name} = {shortened(value)}: must be a text")
-        return value
-    value = plain(name, value)
-    check_value(name, value, meta)
-    if kind is int and not value.is_integer():
-        raise InputError(f"{name} = {value:g}: must be a whole number")
-    return kind(value)
-
-
-def _choices(choices):
-    return ", ".join(str(c).lower() if isinstance(c, bool) else c for c in choices)
-
-
-def unit(meta):
-    """ " [cm]" of metadata, or nothing where there is no unit."""
-    return "" if meta["unit"] == "-" else f" [{meta['unit']}]"
-
-
-def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another.
-    Empty where all numbers are allowed.
-    """
-    if meta.get("choices") is not None:
-        return " or ".join(toml(c) for c in meta["choices"])
-    low, high = meta.get("low"), meta.get("high")
-    above = "" if low is None else f"{'above' if meta['strict'] else 'at least'} {low:g}"
-    below = "" if high is None else f"at most {high:g}"
-    whole = "whole number" if isinstance(value, SMALL_INT) and not isinstance(value, bool) else ""
-    return ", ".join(filter(None, [whole, above, below]))
+def targets(*names):
+    """The fields of the loop that keys of these sections hold, such as "actuator.low"."""
+    return {key.target for name in names for key in SECTIONS[name].keys if key.target}

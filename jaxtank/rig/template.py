@@ -1,24 +1,20 @@
 """Suggestions of a complete rig file, commented out: what could be set besides, each line of which
-can be used as it stands.
+can be used as it stands.  Imported by `sections`.
 """
 
 import numpy as np
 
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import describe, get_value, is_component, number, parameters, walk
-from jaxtank.measures.catalogue import MEASURES, TIMES
-from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.rig import components, signals
+from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
+from jaxtank.measures import MEASURES, of_loop
+from jaxtank.measures import unit as measure_unit
+from jaxtank.rig import components
 from jaxtank.rig import schedule as scheduling
-from jaxtank.rig.schema import Key, Section, keys_of
+from jaxtank.rig.lines import Block, Line, suggestion, toml
+from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
-
-RELATIVE = (
-    'what is different in it, by name: numbers, or relative to the case "x1.3" (times), "by -0.5" '
-    '(less), "0.02 if zero", and "steady" for x0, actuator.initial and reference.initial'
-)
 
 
 def absent(loop, name, meta):
@@ -31,26 +27,23 @@ def absent(loop, name, meta):
         owner = getattr(owner, step)
     shape = np.shape(getattr(owner, meta["like"]))
     low, high = meta["low"], meta["high"]
-    value = (
-        0.0
-        if low is None or (low <= 0.0 and not meta["strict"])
-        else 1.0
-        if high is None or high >= 1.0
-        else 0.5 * (low + high)
-    )
+    if low is None or (low <= 0.0 and not meta["strict"]):
+        value = 0.0
+    else:
+        value = 1.0 if high is None or high >= 1.0 else 0.5 * (low + high)
     return np.full(shape, value).tolist()
 
 
 def of_measure(case, name):
     """What a measure is, as metadata."""
+    per = MEASURES[name].per
+    each = "" if per == "run" else f", of each {per}"
     rim = '; "rim": that of each tank' if name == "max_level" else ""
     # where rims are physics no level passes one (tuning.objective)
     if rim and case.loop.plant.overflow:
-        rim += ", which beside overflow = true is a limit on overflow_volume: nothing may be lost"
-    return {
-        "unit": measure_unit(name, case.loop.units),
-        "doc": f"{MEASURES[name].doc}{_each(name)}{rim}",
-    }
+        rim += ", which beside overflow = true is a limit on overflow_volume: none may overflow"
+    unit = measure_unit(name, case.loop.units)
+    return {"unit": unit, "doc": f"{MEASURES[name].doc}{each}{rim}"}
 
 
 def of_free(case, name):
@@ -59,281 +52,131 @@ def of_free(case, name):
     return {**meta, "doc": f"[low, high, scale] of: {meta['doc']}"}
 
 
-def _each(name):
-    per = MEASURES[name].per
-    return "" if per == "run" else f", of each {per}"
+def of_uncertain(case, name):
+    """What a share of a parameter is, as metadata."""
+    entry = SHARE.meta()
+    return {**entry, "doc": f"{entry['doc']}, of: {describe(case.loop, name)['doc']}"}
 
 
 def _measures(case, but):
-    """Names of the measures that a run of the case has, without those in `but`."""
-    known = {m: spec for m, spec in MEASURES.items() if m not in but and m not in TIMES.values()}
-    poured, stepped = (
-        case.loop.disturbance is not None and case.loop.disturbance.onset is not None,
-        case.loop.reference.changes is not None,
-    )
+    """Suggested lines of the measures that a run of the case has, without those in `but`."""
     return [
-        m
-        for m, spec in known.items()
-        if (poured or not spec.pours) and (stepped or not spec.windows)
+        Line(name, WEIGHT.default, of_measure(case, name), False)
+        for name in of_loop(case.loop)
+        if name not in but
     ]
 
 
 def limits(case):
-    """Keys of the measures that are not limited."""
-    return [Key(m, 1.0, of_measure(case, m), False) for m in _measures(case, case.limits)]
+    """Lines of the measures that are not limited."""
+    return _measures(case, case.limits)
 
 
 def objective(case):
-    """Keys of the measures that are not in the objective."""
-    return [Key(m, 1.0, of_measure(case, m), False) for m in _measures(case, case.objective)]
+    """Lines of the measures that are not in the objective."""
+    return _measures(case, case.objective)
 
 
 def free(case):
-    """Keys of the parameters of law and observer that could be free, over a decade each way."""
-    found = []
+    """Lines of the parameters of controller and observer that could be free, over a decade each
+    way.
+    """
+    found, taken = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
     for name, value, meta in walk(case.loop):
         part, _, rest = name.partition(".")
-        taken = any(n.split("[")[0] == name for n in case.free)
-        if (
-            part not in ("controller", "observer")
-            or "model." in rest
-            or value is None
-            or taken
-            or meta.get("rows")
-        ):
+        if part not in ("controller", "observer") or "model." in rest or name in taken:
             continue
-        span = _around(np.asarray(value, dtype=float), meta)
-        if span is not None and name != "controller.knots":
-            found.append(Key(f'"{name}"', list(span), of_free(case, name), False))
+        span = None if value is None or meta.get("rows") else _around(value, meta)
+        if span is not None:
+            found.append(Line(toml(name), list(span), of_free(case, name), False))
     return found
 
 
 def _around(value, meta):
     """Free of a tenth to ten times a value within its range, or either side of 0 where it is not
-    positive; None where there is no room.
+    positive; None of a range that is empty.
     """
+    value = np.asarray(value, dtype=float)
     if value.size == 0:
         return None
-    low, high = (
-        (0.1 * value.min(), 10.0 * value.max())
-        if value.min() > 0
-        else (-1.0 - 2 * np.abs(value).max(), 1.0 + 2 * np.abs(value).max())
-    )
+    low, high = 0.1 * value.min(), 10.0 * value.max()
+    if value.min() <= 0:
+        high = 1.0 + 2 * np.abs(value).max()
+        low = -high
     low = low if meta["low"] is None else max(low, meta["low"])
     high = high if meta["high"] is None else min(high, meta["high"])
-    low, high = float(f"{low:.3g}"), float(f"{high:.3g}")
+    low, high = _rounded(low), _rounded(high)
     return Free(low, high, "log" if low > 0 else "linear") if low < high else None
 
 
-def of_uncertain(case, name):
-    """What a share of a parameter is, as metadata."""
-    return {
-        "unit": "-",
-        "doc": f"share, of: {describe(case.loop, name)['doc']}",
-        "low": 0.0,
-        "high": 1.0,
-        "strict": True,
-    }
+def _rounded(value):
+    return float(f"{value:.3g}")
 
 
 def uncertain(case):
-    """Keys of the plant's parameters whose spread is not given."""
-    found = []
-    for name, value in parameters(case.loop).items():
-        taken = any(n.split("[")[0] == name for n in case.uncertain)
-        if (
-            name.startswith("plant.")
-            and np.size(value)
-            and np.any(np.asarray(value) != 0)
-            and not taken
-        ):
-            found.append(Key(f'"{name}"', 0.05, of_uncertain(case, name), False))
-    return found
-
-
-def sections(case, have):
-    """Tables that a case does not have, as they could be; have: titles and top-level keys that its
-    file has already.
-    """
-    loop, units = case.loop, case.loop.units
-    seconds = lambda share: float(f"{share * case.clock.duration:.3g}")
-    found = []
-
-    def add(title, rows, *prose, local_units=True):
-        if title in have or (title.startswith("[[") and title.strip("[]") in have):
-            return
-        found.append(Section(title, keys_of(rows, units) if local_units else rows, prose, False))
-
-    if not scheduling.table_of(loop):
-        own = (
-            components.keys_of(loop.controller, components.LAWS)
-            if components.kind_of(loop.controller, components.LAWS)
-            else []
-        )
-        if own and is_component(getattr(loop.controller, "model", None)):
-            add(
-                "[law]",
-                [row for row in own if row[2] is not None],
-                f"Another law than the preset's: {', '.join(components.LAWS)}. [values] above then"
-                " has that law's names.",
-            )
-        table = schedule(case)
-        if table:
-            docs = (
-                ("gains", "gains that follow the variable"),
-                ("variable", "a setpoint, r1 .., or a level, h1 .."),
-                ("knots", f"its values [{units[0]}] at which the gains are given"),
-            )
-            add(
-                "[schedule]",
-                [(k, {"unit": "-", "doc": doc}, table[k]) for k, doc in docs],
-                "Gains that follow a setpoint or a level, linear between knots; they start from the"
-                ' value above. Theirs are then "controller.values", a row per gain; [free] may name'
-                " the gain for all its knots.",
-            )
-    add(
-        "[observer]",
-        _observer(loop),
-        f"Another observer than the preset's: {', '.join(components.OBSERVERS)}.",
-    )
-    if (
-        signals.steps(loop.reference) is loop.reference
-        and isinstance(loop.reference, Ramps)
-        and not _refers(case)
-    ):
-        start = signals.Sine(
-            amplitude=number(0.0),
-            offset=number(0.0),
-            period=seconds(0.1),
-            zero=0.0,
-            start=0.0,
-            end=seconds(1),
-            channel=0,
-            width=1,
-        )
-        add(
-            "[reference.sine]",
-            signals.sine_keys(start),
-            "A sine on top of the ramps of one output, for a while; names are then"
-            " reference.first.ramp and so on.",
-        )
-    if loop.disturbance is None:
-        flows = [0.0] * loop.plant.tanks
-        add(
-            "[disturbance]",
-            [("inflow", signals.INFLOW, flows)],
-            "A steady inflow, or volumes that are poured: one of the two.",
-        )
-    if not isinstance(loop.disturbance, Constant) or not np.any(np.asarray(loop.disturbance.level)):
-        some = float(
-            f"{0.01 * float(np.asarray(loop.plant.area)[0] * np.asarray(loop.plant.rim)[0]):.3g}"
-        )
-        add(
-            "[[pour]]",
-            signals.pour_keys(seconds(0.5), seconds(0.01), 1, some),
-            "A volume poured into a tank, for recovery_time; as many as you like.",
-        )
-    add(
-        "[[fault]]",
-        signals.fault_keys("pump_gain[0]", seconds(0.5), seconds(0.7), 0.6, 0.0),
-        "What breaks while the rig runs, untold to the law; as many as you like.",
-    )
-    if not case.covariance:
-        name = next(
-            (
-                n
-                for n in case.uncertain
-                if np.size(get_value(loop, n)) and np.ravel(get_value(loop, n))[0] != 0
-            ),
-            "plant.pump_gain",
-        )
-        value = np.ravel(np.asarray(get_value(loop, name)))[0]
-        scalar = "[" in name or np.ndim(get_value(loop, name)) == 0
-        rows = [
-            (
-                "names",
-                {"unit": "-", "doc": "parameters, an array's entry by name[i]"},
-                [name if scalar else f"{name}[0]"],
-            ),
-            (
-                "matrix",
-                {"unit": "-", "doc": "their covariance, in their units"},
-                [[float(f"{(0.05 * value) ** 2:.3g}")]],
-            ),
-        ]
-        add(
-            "[covariance]",
-            rows,
-            "Parameters that vary together, as `jaxtank identify` writes them; used in the place of"
-            " [uncertain].",
-        )
-    rows = [
-        ("name", {"unit": "-", "doc": "what reports call it"}, "noisy"),
-        ("seed", {"unit": "-", "doc": "of its sensor noise"}, 1),
-        (
-            "weight",
-            {"unit": "-", "doc": "in the mean over scenarios", "low": 0.0, "strict": True},
-            1.0,
-        ),
-        ("values", {"unit": "-", "doc": RELATIVE}, {"sensor.noise": 0.0}),
-    ]
-    add(
-        "[[scenario]]",
-        rows,
-        "A run that `tune` judges by, in the place of the case's own; as many as you like.",
-    )
-    if not case.log:
-        slots = [("t", ["time", "s"])]
-        slots += [(f"pump{j + 1}", [f"u{j + 1}", units[1]]) for j in range(loop.plant.pumps)]
-        slots += [(f"h{i + 1}", [f"level {i + 1}", units[0]]) for i in range(loop.plant.tanks)]
-        rows = [Key(slot, value) for slot, value in slots]
-        prose = (
-            "Which column of a log is what, for jaxtank identify, where its header does not say so:"
-            " [header, unit]."
-        )
-        add("[log]", rows, prose, local_units=False)
-    return found
-
-
-def _refers(case):
-    """Whether a scenario names the reference, whose names change where a sine is added."""
-    return any(name.startswith("reference.") for s in case.scenarios for name in s.values)
-
-
-def _observer(loop):
-    """Rows of an [observer]: the loop's own, or an extended Kalman filter where it has none."""
-    if components.kind_of(loop.observer, components.OBSERVERS) not in (None, "direct"):
-        return [
-            row
-            for row in components.keys_of(loop.observer, components.OBSERVERS)
-            if row[2] is not None
-        ]
-    rim = float(np.asarray(loop.plant.rim)[0])
-    meta = lambda field: {**signals.meta_of(components.OBSERVERS["extended-kalman"], field)}
-    small = lambda share: float(f"{(share * rim) ** 2:.3g}")
+    """Lines of the plant's parameters whose spread is not given."""
+    taken, share = {n.split("[")[0] for n in case.uncertain}, SHARE.default
     return [
-        (
-            "kind",
-            {"unit": "-", "doc": f"one of {', '.join(components.OBSERVERS)}"},
-            "extended-kalman",
-        ),
-        ("process", meta("process"), small(1e-3)),
-        ("measurement", meta("measurement"), small(1e-3)),
-        ("spread", meta("spread"), small(1e-2)),
-        (
-            "measured",
-            {"unit": "-", "doc": "tanks whose levels are measured, from 1"},
-            list(range(1, loop.plant.tanks + 1)),
-        ),
+        Line(toml(name), share, of_uncertain(case, name), False)
+        for name, value in parameters(case.loop).items()
+        if name.startswith("plant.") and name not in taken and np.any(np.asarray(value) != 0)
     ]
+
+
+def suggestions(case, have):
+    """Return the Blocks of tables that a case does not have, as they could be.
+
+    Parameters
+    ----------
+    case : Case
+    have : titles and top-level keys that its file has already
+    """
+    given = have - {section.title for section in SECTIONS.values() if section.many}
+    found = []
+    for name, example in EXAMPLES.items():
+        if SECTIONS[name].title in given or (SECTIONS[name].many and name in given):
+            continue
+        values = example(case)
+        if isinstance(values, Block):
+            found.append(values)
+        elif values is not None:
+            section = values.pop("section", SECTIONS[name])
+            found.append(suggestion(section, values, case.loop.units))
+    return found
+
+
+def _seconds(case, share):
+    """A share of a run, rounded [s]."""
+    return _rounded(share * case.clock.duration)
+
+
+def _law(case):
+    """The case's own controller, as a start for another."""
+    part = case.loop.controller
+    known = components.kind_of("law", part) is not None
+    if not known or not is_component(getattr(part, "model", None)):
+        return None  # also of a controller with a schedule, whose class has no name
+    return _component("law", part)
+
+
+def _component(name, part):
+    """{key: value} of a controller or observer, and its section."""
+    section, values = components.values_of(name, part)
+    word = {"law": "controller"}.get(name, name)
+    prose = f"Another {word} than the preset's: {', '.join(components.ROLES[name].classes)}."
+    if name == "law":
+        prose += " [values] above then has the names of that controller."
+    return {"section": Section(name, section.keys, prose=prose), **values}
 
 
 def schedule(case):
-    """A [schedule] table that the case's law allows, {} where it allows none: its first free gain
-    along the first setpoint.
+    """A [schedule] table that the case's controller allows, None where it allows none: its first
+    free gain along the first setpoint.
     """
-    rim = float(_rim(case.loop))
-    knots = [float(f"{share * rim:.3g}") for share in (0.25, 0.5, 0.75)]
+    if scheduling.table_of(case.loop):
+        return None
+    rim = float(np.asarray(case.loop.plant.rim)[case.loop.plant.outputs[0]])
+    knots = [_rounded(share * rim) for share in (0.25, 0.5, 0.75)]
     for name in case.free:
         if name.startswith("controller.") and "model" not in name:
             for variable in ("r1", "h1"):
@@ -343,9 +186,104 @@ def schedule(case):
                 except (InputError, LookupError, TypeError, ValueError):
                     continue
                 return {"gains": [name], "variable": variable, "knots": knots}
-    return {}
+    return None
 
 
-def _rim(loop):
-    """Height of the first controlled tank [cm]."""
-    return np.asarray(loop.plant.rim)[loop.plant.outputs[0]]
+def _observer(case):
+    """The loop's own observer, or an extended Kalman filter where it has none."""
+    part = case.loop.observer
+    if components.kind_of("observer", part) not in (None, "direct"):
+        return _component("observer", part)
+    rim = float(np.asarray(case.loop.plant.rim)[0])
+    small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
+    kind = "extended-kalman"
+    keys = components.section_of("observer", kind).keys
+    prose = f"Another observer than the preset's: {', '.join(components.OBSERVERS)}."
+    return {
+        "section": Section("observer", keys, prose=prose),
+        "kind": kind,
+        "process": small,
+        "measurement": small,
+        "spread": large,
+        "measured": range(case.loop.plant.tanks),
+    }
+
+
+def _sine(case):
+    """A sine of amplitude 0 on a reference of ramps, whose names no scenario has."""
+    named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
+    if not isinstance(case.loop.reference, Ramps) or named:
+        return None
+    return {"amplitude": 0.0, "period": _seconds(case, 0.1), "end": _seconds(case, 1), "output": 1}
+
+
+def _disturbance(case):
+    """No inflow, of every tank."""
+    tanks = case.loop.plant.tanks
+    return {"inflow": np.zeros(tanks)} if case.loop.disturbance is None else None
+
+
+def _pour(case):
+    """A pulse of 1 % of the first tank, where there is no steady inflow."""
+    steady, plant = case.loop.disturbance, case.loop.plant
+    if isinstance(steady, Constant) and np.any(np.asarray(steady.level)):
+        return None
+    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0])
+    times = {"time": _seconds(case, 0.5), "duration": _seconds(case, 0.01)}
+    return {**times, "tank": 0, "volume": _rounded(0.01 * volume)}
+
+
+def _fault(case):
+    """A weaker first pump for a while."""
+    times = {"start": _seconds(case, 0.5), "end": _seconds(case, 0.7)}
+    return {"of": "pump_gain[0]", **times, "factor": 0.6}
+
+
+def _covariance(case):
+    """5 % of the first uncertain parameter."""
+    if case.covariance:
+        return None
+    loop, name = case.loop, "plant.pump_gain"
+    for other in case.uncertain:
+        if np.size(get_value(loop, other)) and np.ravel(get_value(loop, other))[0] != 0:
+            name = other
+            break
+    value = np.ravel(np.asarray(get_value(loop, name)))[0]
+    scalar = "[" in name or np.ndim(get_value(loop, name)) == 0
+    return {
+        "names": [name if scalar else f"{name}[0]"],
+        "matrix": [[_rounded((0.05 * value) ** 2)]],
+    }
+
+
+def _scenario(case):
+    """A run with sensor noise of its own."""
+    return {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}}
+
+
+def _log(case):
+    """The columns of experiment data of the rig."""
+    if case.log:
+        return None
+    plant, (length, drive) = case.loop.plant, case.loop.units
+    columns = {"t": ["time", "s"]}
+    columns |= {f"pump{j + 1}": [f"u{j + 1}", drive] for j in range(plant.pumps)}
+    columns |= {f"h{i + 1}": [f"level {i + 1}", length] for i in range(plant.tanks)}
+    section = SECTIONS["log"]
+    lines = [Line(name, value, {"unit": "-", "doc": ""}) for name, value in columns.items()]
+    return Block(section.title, lines, (section.prose,), False)
+
+
+EXAMPLES = {
+    "law": _law,
+    "schedule": schedule,
+    "observer": _observer,
+    "reference.sine": _sine,
+    "disturbance": _disturbance,
+    "pour": _pour,
+    "fault": _fault,
+    "covariance": _covariance,
+    "scenario": _scenario,
+    "log": _log,
+}
+"""{section: function of a case} that gives the values suggested for it, None where it has none."""

@@ -1,5 +1,5 @@
-"""Checks of what a rig file says of a tuning: limits, objective, what is free, what is uncertain,
-scenarios.
+"""Input validation of what a rig file says of a tuning: limits, objective, what is free and
+uncertain, covariance, scenarios, columns of experiment data.  Imported by `read` and `jaxtank.rig`.
 """
 
 import math
@@ -12,180 +12,61 @@ import numpy as np
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.checks import check_value
-from jaxtank.core.clock import CLOCK_UNITS, Clock
+from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, is_component, split_index, walk
-from jaxtank.loop import run as lp
+from jaxtank.core.tree import describe, get_value, split_index
+from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.rig import schedule
-from jaxtank.rig.schema import is_finite, is_numeric, name_of
-from jaxtank.rig.signals import steps
+from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
+from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.values import by_dotted_name, set_scenario
-from jaxtank.signals.inflows import Pours
 from jaxtank.signals.setpoints import Ramps
 
 
-def doubts(case: Case) -> list[str]:
-    """Sentences on what of a case can hardly be meant: a clock of broken samples, changes and pours
-    after the end of the run, changes that overlap, levels and setpoints above the rim, pumps that
-    start outside their limits, models that differ from the plant. (Steps that are too long:
-    `step_length`.)
-    """
-    loop, (length, drive) = case.loop, case.loop.units
-    found, end, rim = clock_doubts(case.clock), case.clock.duration, np.asarray(loop.plant.rim)
-    reference, bank = steps(loop.reference), loop.actuator
-    events = [] if reference is None else list(reference.changes)
-    _late(found, "changes of the reference", [t for t, _ in events], end)
-    if isinstance(loop.disturbance, Pours):
-        _late(found, "pours", [t for t, *_ in loop.disturbance.events], end)
-    over, early, ramp = {}, [], 0.0 if reference is None else reference.ramp
-    for t, i in events:
-        early += [(i, t)] if t < over.get(i, 0.0) - 1e-7 * case.clock.dt else []
-        over[i] = t + ramp
-    if early:
-        found.append(
-            f"reference: {len(early)} of {len(events)} changes begin before the one before is over"
-            f" (ramp {ramp:g} s), the first of output {early[0][0] + 1} at {early[0][1]:g} s: each"
-            " starts from where that one has got to"
-        )
-    lost = (
-        "what is above it is lost at once"
-        if loop.plant.overflow
-        else "rims are limits here and not physics"
-    )
-    for i, level in enumerate(np.asarray(loop.x0)):
-        if level > rim[i]:
-            found.append(
-                f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g}"
-                f" {length}: {lost}"
-            )
-    never = "a level cannot get there" if loop.plant.overflow else lost
-    for i, tank in enumerate(loop.plant.outputs):
-        if reference is None:
-            break
-        asked = [
-            reference.initial[i],
-            *(v for (_, j), v in zip(events, np.asarray(reference.targets)) if j == i),
-        ]
-        if max(asked) > rim[tank]:
-            found.append(
-                f"reference: output {i + 1} is asked for {max(asked):g} {length}, above the rim of"
-                f" {_tank(case, tank)} at {rim[tank]:g} {length}: {never}"
-            )
-    for j, (low, volts, high) in enumerate(
-        zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))
-    ):
-        if not low <= volts <= high:
-            found.append(
-                f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
-                f" {low:g} and {high:g} {drive}"
-            )
-    return [*found, *model_doubts(case)]
-
-
-def model_doubts(case: Case) -> list[str]:
-    """Return a sentence for each parameter in a model of controller or observer that differs from
-    the plant's by more than its uncertainty.
-
-    The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
-    but rounding where neither has the parameter. Rims count only in a model in which they are
-    physics, and no model that its law does not read (PID without feed-forward).
-    """
-    found, plant = [], case.loop.plant
-    for holder in ("controller", "observer"):
-        part = getattr(case.loop, holder)
-        inner = f"{holder}.law." if is_component(getattr(part, "law", None)) else f"{holder}."
-        law = getattr(part, "law", part)
-        model = getattr(law, "model", None)
-        if model is None or not getattr(law, "reads_model", True):
-            continue
-        # no level depends on rims that are no physics
-        vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
-        theirs = {name: value for name, value, _ in walk(model)}
-        for name, value, meta in walk(plant):
-            other = None if name in vacant else theirs.get(name)
-            if value is None or other is None or np.shape(other) != np.shape(value):
-                continue
-            own, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
-            allowed, words = _uncertainty(case, f"plant.{name}", own)
-            if np.any(np.abs(other - own) > np.maximum(allowed, 1e-9 * np.abs(own))):
-                unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
-                here = f"{inner}model.{name}"
-                found.append(
-                    f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the"
-                    f" model of the {holder} differs from the plant{words}; unless that is meant,"
-                    f" set {here} = {_listed(own)} too (in a rig file a model that is left out"
-                    " follows the plant)"
-                )
-    return found
-
-
-def _uncertainty(case, name, value):
-    """(how far a model may be off the plant's parameter `name`, in its unit; the same in words)."""
-    allowed, words = np.zeros(np.shape(value)), ""
-    for key, share in case.uncertain.items():
-        base, index = split_index(key)
-        if base == name:
-            allowed[index or ...] = share * np.abs(value[index or ...])
-            words = f" by more than [uncertain] has ({100 * share:g} %)"
-    for i, key in enumerate(case.covariance[0] if case.covariance else ()):
-        base, index = split_index(key)
-        if base == name:
-            allowed[index or ...] = 2.0 * np.sqrt(case.covariance[1][i][i])
-            words = " by more than two standard deviations of [covariance]"
-    return allowed, words
-
-
-def _listed(value):
-    return "[" + ", ".join(f"{v:.6g}" for v in value) + "]" if np.ndim(value) else f"{value:.6g}"
-
-
-def clock_doubts(clock: Clock) -> list[str]:
-    """Sentences on a clock: where the run does not end when it is asked to, for it is made of whole
-    samples.
-    """
-    end = (clock.samples - 1) * clock.dt
-    if abs(end - clock.duration) <= 1e-6 * clock.dt:
-        return []
-    return [
-        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt ="
-        f" {clock.dt:.9g} s: the run ends at {end:.9g} s"
-    ]
-
-
-def _tank(case, i):
-    name = case.names.get("tank", {i: ""})[i]
-    return f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}"
-
-
-def _late(found, what, times, end):
-    late = [t for t in times if t >= end]
-    if late:
-        found.append(
-            f"{len(late)} of {len(times)} {what} come after the end of the run at {end:g} s"
-        )
-
-
-SCENARIO_KEYS = ("name", "values", "seed", "weight")
-
-
 def check(case: Case) -> Case:
-    """`case`, after input validation: the loop and clock can be run, and every plateau of the
+    """Return `case` after input validation: the loop and clock can be run, and every plateau of the
     reference has a steady state.
+
+    Parameters
+    ----------
+    case : Case
+
+    Raises
+    ------
+    InputError for a loop that cannot be run; EquilibriumError for a plateau without a steady state,
+    unless `case.reachable` is False.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> rig.check(presets.find("cascaded/pi")).name
+    'cascaded/pi'
     """
     # a key will be given where there is noise
-    lp.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
+    run.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
     if case.reachable and (why := unreachable(case)):
         raise EquilibriumError(why)
     return case
 
 
 def unreachable(case: Case) -> str | None:
-    """Which plateau of the reference has no steady state on this plant, and why, in a sentence;
-    None where all of them have one.
+    """Return which plateau of the reference has no steady state on this plant, and why, in a
+    sentence; None where all of them have one.
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = presets.find("gouta2015/backstepping")
+    >>> rig.unreachable(rig.set_values(case, {"reference.initial": [16.0, 3.0]}))[:40]
+    'reference: setpoints (16, 3) cm have no '
     """
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
@@ -198,10 +79,26 @@ def unreachable(case: Case) -> str | None:
 
 
 def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str, float]:
-    """`uncertain` as a dict, if every one is a parameter in use with a spread above 0 and below 1."""
+    """Return the spreads of uncertain parameters after input validation.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    uncertain : {dotted name: spread as a share of the parameter [-]}
+
+    Raises
+    ------
+    InputError for a parameter that is not in use, and for a share that is not above 0 and below 1.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> rig.check_uncertain(presets.find("cascaded/pi").loop, {"plant.drain": 0.1})
+    {'plant.drain': 0.1}
+    """
     for name, share in uncertain.items():
         get_value(loop, name)
-        if not (is_numeric(share) and np.ndim(share) == 0 and 0 < share < 1):
+        if not (is_finite(share, 0) and 0 < share < 1):
             raise InputError(
                 f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1"
             )
@@ -211,31 +108,60 @@ def check_uncertain(loop: ClosedLoop, uncertain: Mapping[str, Any]) -> dict[str,
 def uncovered(
     loop: ClosedLoop, name: str, share: float, covered: Iterable[str]
 ) -> dict[str, float]:
-    """{name: share} of what [uncertain] says of `name`, less what is in `covered`: entry by entry
-    where that is part of an array; a share of nothing is left out.
+    """Return the part of a spread in [uncertain] that other parameters do not cover.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    name : dotted name of the parameter
+    share : its spread [-]
+    covered : dotted names of parameters whose covariance is known
+
+    Returns
+    -------
+    {name: share}, entry by entry where `covered` has some entries of an array; a spread of an entry
+    of 0 is left out.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> loop = presets.find("gouta2015/ngpc").loop
+    >>> rig.uncovered(loop, "plant.pump_gain", 0.1, ["plant.pump_gain[0]"])
+    {'plant.pump_gain[1]': 0.1}
     """
     if not any(split_index(c)[0] == split_index(name)[0] for c in covered):
         return {name: share}
     if "[" in name:
         return {} if name in covered else {name: share}
     value = np.asarray(get_value(loop, name))
-    entries = (
-        [f"{name}[{','.join(map(str, i))}]" for i in np.ndindex(value.shape) if value[i] != 0]
-        if value.shape
-        else []
-    )
-    return {n: share for n in entries if n not in covered}
+    indices = [i for i in np.ndindex(value.shape) if i and value[i] != 0]
+    names = [f"{name}[{','.join(map(str, i))}]" for i in indices]
+    return {n: share for n in names if n not in covered}
 
 
 def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """`limits` as a dict, if every one is a measure with a finite number, one for each of its
-    entries, or "rim" for max_level.
+    """Return hard limits of measures after input validation.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    limits : {measure: upper limit in its unit, one or one per entry; "rim" for max_level}
+
+    Raises
+    ------
+    InputError for an unknown measure, and for a limit of another kind or number of entries.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> rig.check_limits(presets.find("cascaded/pi").loop, {"max_level": "rim"})
+    {'max_level': 'rim'}
     """
     check_names(limits)
     for measure, value in limits.items():
-        count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
         if isinstance(value, str) and value == "rim" and measure == "max_level":
             continue
+        count, unit = entries(measure, loop.plant), measure_unit(measure, loop.units)
         if not (is_finite(value) and np.shape(value) in ((), (count,))):
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
@@ -251,12 +177,25 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
-    """`objective` as a dict, if every one is a measure with a finite weight at or above 0, and one
-    of them above.
+    """Return the weights of an objective after input validation.
+
+    Parameters
+    ----------
+    objective : {measure: weight [-]}
+
+    Raises
+    ------
+    InputError for an unknown measure, a weight below 0, and no weight above 0.
+
+    Examples
+    --------
+    >>> from jaxtank import rig
+    >>> rig.check_objective({"rms_error_total": 1})
+    {'rms_error_total': 1.0}
     """
     check_names(objective)
     for measure, weight in objective.items():
-        if not (is_finite(weight) and np.ndim(weight) == 0 and weight >= 0):
+        if not (is_finite(weight, 0) and weight >= 0):
             raise InputError(
                 f"objective {measure} = {shortened(weight)}: must be a finite weight at or above 0"
             )
@@ -266,11 +205,32 @@ def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
 
 
 def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
-    """The Free of a parameter, if it is a leaf in use and its range lies within what it allows."""
-    if name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS:
-        meta = {"kind": "static"}
-    else:
-        meta = describe(loop, name)
+    """Return the range of a free parameter after input validation.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    name : dotted name of a leaf, or of an entry of it
+    low, high : ends of the range, in the parameter's unit
+    scale : "log" or "linear"
+
+    Returns
+    -------
+    Free; its scale is "linear" where `low` is not above 0.
+
+    Raises
+    ------
+    InputError for a parameter that does not exist, is not in use or is no number, and for a range
+    that is empty or not within what the parameter allows.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> rig.check_free(presets.find("cascaded/pi").loop, "controller.Kc", 0.1, 10.0)
+    Free(low=0.1, high=10.0, scale='log')
+    """
+    is_clock = name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS
+    meta: dict[str, Any] = {"kind": "static"} if is_clock else describe(loop, name)
     if meta["kind"] == "static":
         raise InputError(
             f"free {name}: cannot be tuned, it is part of the compiled program and not a number"
@@ -278,8 +238,8 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
         )
     schedule.check_not_scheduled(loop, name)
     get_value(loop, name)
-    unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
         raise InputError(
             f"free {name} = {low:g}:{high:g}: must be LOW:HIGH with finite LOW below HIGH{unit}"
         )
@@ -297,11 +257,8 @@ def free_of(loop, table):
     """
     found = {}
     for name, spec in table.items():
-        good = (
-            isinstance(spec, list)
-            and len(spec) in (2, 3)
-            and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
-        )
+        good = isinstance(spec, list) and len(spec) in (2, 3)
+        good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
         if not good or (len(spec) == 3 and spec[2] not in ("log", "linear")):
             raise InputError(
                 f'free {name} = {shortened(spec)}: must be [low, high] or [low, high, "log" or'
@@ -314,35 +271,69 @@ def free_of(loop, table):
 
 def scenario(case, entry, index):
     """The Scenario of one [[scenario]] table, if it can be run."""
-    if not isinstance(entry, dict):
-        raise InputError(f"scenario {index + 1} = {shortened(entry)}: must be a table")
-    for key in entry:
-        if key not in SCENARIO_KEYS:
-            raise unknown("key of [[scenario]]", key, SCENARIO_KEYS)
-    name, values = entry.get("name", f"scenario {index + 1}"), entry.get("values", {})
-    seed, weight = entry.get("seed", 0), entry.get("weight", 1.0)
-    name_of(f"scenario {index + 1}: name", name)
-    if not isinstance(values, dict):
-        raise InputError(f"scenario {name!r}: values = {shortened(values)}: must be a table")
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
-        raise InputError(
-            f"scenario {name!r}: seed = {shortened(seed)} must be a whole number from 0 to"
-            f" {2**31 - 1}"
-        )
-    if not (is_finite(weight) and np.ndim(weight) == 0 and weight > 0):
-        raise InputError(
-            f"scenario {name!r}: weight = {shortened(weight)} must be a finite number above 0"
-        )
+    own = read_entry(SECTIONS["scenario"], entry, sizes_of(case.loop.plant), index)
+    name = own.pop("name", f"scenario {index + 1}")
     try:
-        values = by_dotted_name(values, "scenario.values")
+        values = by_dotted_name(own.pop("values"), "scenario.values")
         set_scenario(case, values)
     except EquilibriumError:
         pass  # `check` names the plateau without one; where that is allowed, `tune` refuses
     except InputError as error:
         raise type(error)(f"scenario {name!r}: {error}") from None
-    return Scenario(
-        name,
-        {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()},
-        seed,
-        float(weight),
-    )
+    values = {n: tuple(v) if isinstance(v, list) else v for n, v in values.items()}
+    return Scenario(name, values, **own)
+
+
+def check_log(plant, table):
+    """{slot: header or (header, unit)} of a [log] table; InputError for a slot that the plant does
+    not have, and for a column that is given twice.
+    """
+    pumps = (f"pump{j + 1}" for j in range(plant.pumps))
+    slots = ["t", *pumps, *(f"h{i + 1}" for i in range(plant.tanks))]
+    found = {}
+    for slot, spec in table.items():
+        if slot not in slots:
+            raise unknown("key of [log]", slot, slots)
+        pair = [spec] if isinstance(spec, str) else spec
+        good = isinstance(pair, (list, tuple)) and 1 <= len(pair) <= 2
+        if not (good and all(isinstance(v, str) and v.strip() for v in pair)):
+            raise InputError(
+                f"log {slot} = {shortened(spec)}: must be a column's header, or [header, unit]"
+            )
+        header = pair[0].strip()
+        for other, taken in found.items():
+            if (taken if isinstance(taken, str) else taken[0]).strip() == header != "none":
+                raise InputError(
+                    f"log {slot} = {shortened(pair[0])}: that column is {other} already"
+                )
+        found[slot] = pair[0] if len(pair) == 1 else tuple(pair)
+    return found
+
+
+def check_covariance(loop, table):
+    """(names, rows) of a [covariance] table; InputError unless it is a covariance of scalars of the
+    loop.
+    """
+    values = read_entry(SECTIONS["covariance"], table, sizes_of(loop.plant))
+    names, size = values["names"], len(values["names"])
+    if len(set(names)) < size:
+        raise InputError("covariance.names: one is given twice")
+    for name in names:
+        if describe(loop, name)["kind"] == "static" or np.ndim(get_value(loop, name)) != 0:
+            raise InputError(f"covariance {name}: must be a number, an array's entry by name[i]")
+    rows = values["matrix"]
+    if not (is_finite(rows) and np.shape(rows) == (size, size) and _is_covariance(rows)):
+        raise InputError(
+            f"covariance.matrix: must be a symmetric, positive definite {size} by {size} matrix of"
+            " finite numbers"
+        )
+    return tuple(names), tuple(tuple(float(v) for v in row) for row in rows)
+
+
+def _is_covariance(rows):
+    """Whether a square matrix is symmetric and positive definite, whatever its units."""
+    rows = np.asarray(rows, dtype=float)
+    if not np.allclose(rows, rows.T, rtol=1e-9, atol=0) or np.any(np.diag(rows) <= 0):
+        return False
+    sd = np.sqrt(np.diag(rows))
+    return np.linalg.eigvalsh(rows / np.outer(sd, sd))[0] > 0

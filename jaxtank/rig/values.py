@@ -16,7 +16,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index, walk, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import schedule
-from jaxtank.rig.schema import is_numeric, plain, static_value, unit
+from jaxtank.rig.entry import is_numeric, plain, static_value, unit
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Where controller and observer hold the plant's parameters, by the same names."""

@@ -32,7 +32,7 @@ class Signal(abc.ABC):
         """Number of channels [-]."""
 
     @abc.abstractmethod
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         """Return the samples of a run, evaluated before the time loop.
 
         A method whose every sample follows from `sample_times(clock)` alone may be marked
@@ -48,7 +48,7 @@ class Signal(abc.ABC):
         """
 
     @pointwise
-    def windows(self, clock: Clock) -> tuple | None:
+    def windows(self, clock: Clock) -> tuple[Any, ...] | None:
         """Return what overshoot and settling refer to, or None without `changes`.
 
         Returns
@@ -83,7 +83,7 @@ class Constant(Signal):
         return np.shape(self.level)[0]
 
     @pointwise
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
         return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
@@ -107,7 +107,7 @@ class Table(Signal):
     def channels(self) -> int:
         return np.shape(self.values)[0]
 
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         last = np.shape(self.values)[1] - 1
         # which sample, and how far past it, is known to the host: a little forgiveness makes 3 *
         # 0.1 s sample 3
@@ -138,7 +138,7 @@ class Sum(Signal):
         return self.first.changes
 
     @pointwise
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         value, rate, second = (
             tuple(a + b for a, b in zip(one, two))
             for one, two in zip(self.first.sample(clock), self.second.sample(clock))
@@ -146,7 +146,7 @@ class Sum(Signal):
         return value, rate, second
 
     @pointwise
-    def windows(self, clock: Clock) -> tuple | None:
+    def windows(self, clock: Clock) -> tuple[Any, ...] | None:
         """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step
         from its start on.
         """

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Free, Scenario
-from jaxtank.presets import khalid, mirakhorli
+from jaxtank.presets.loops import khalid, mirakhorli
 
 
 class Bound(NamedTuple):
@@ -152,7 +152,7 @@ def unseen():
 
 
 GAINS = {"controller.K": mirakhorli.TUNABLE["controller.K"]}
-BLEND = {n: mirakhorli.TUNABLE[n] for n in mirakhorli.LAWS["hybrid"][2]}
+BLEND = {n: mirakhorli.TUNABLE[n] for n in mirakhorli.CONTROLLERS["hybrid"][2]}
 BOTH = {"controller.pairing": ["cross", "same"]}
 
 

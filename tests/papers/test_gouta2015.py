@@ -22,7 +22,7 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.instruments.actuators import allocate
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.presets import load
-from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, law
+from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, controller_of
 from jaxtank.signals.base import Constant
 
 MEASURES = (
@@ -416,7 +416,7 @@ ALLOCATIONS = {
 
 def command(kind, area, at):
     levels, r, dr, ddr = (tuple(map(float, v)) for v in at)
-    controller = law(kind, state_coupled_four_tank(area))
+    controller = controller_of(kind, state_coupled_four_tank(area))
     return controller, controller.step((), Tick(t=0.0, r=r, dr=dr, ddr=ddr), Estimate(x=levels))[0]
 
 

@@ -27,7 +27,8 @@ from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.run import evaluate_compiled
-from jaxtank.presets import khalid
+from jaxtank.presets import khalid as paper
+from jaxtank.presets.loops import khalid
 
 DT = 2.0
 PRESET = presets.load("khalid")
@@ -49,7 +50,7 @@ def closed(kind, where="S2", mode="unconstrained", du=0.5, r_w=1e-2):
 def summary(kind, *setting, **more):
     """What the tables print of a run, one entry per output or pump."""
     loop, run = closed(kind, *setting, **more)
-    edge = khalid.edges(loop.reference, run)
+    edge = paper.edges(loop.reference, run)
     held = (run.u < 3e-6) | (run.u > 3.0 - 3e-6)
     return {
         "rmse": np.sqrt(np.mean(run.e**2, axis=0)),
@@ -492,7 +493,7 @@ def short_gpc(where, mode, r_w):
     )
     run = jax.tree.map(np.asarray, jaxtank.simulate(loop, khalid.CLOCK))
     return np.sqrt(np.mean(run.e**2, axis=0)), [
-        pair["overshoot"][0] for pair in khalid.edges(loop.reference, run)
+        pair["overshoot"][0] for pair in paper.edges(loop.reference, run)
     ]
 
 
@@ -1006,7 +1007,7 @@ def test_published_claims_are_measured():
             np.asarray, jaxtank.simulate(case.loop, case.clock, save_every=save_every)
         )
 
-    found = khalid.measured(run)
+    found = paper.measured(run)
     assert set(found) == set(PRESET.published)
     for name, published in PRESET.published.items():
         if not isinstance(published.value, str):

@@ -43,8 +43,16 @@ from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
-from jaxtank.presets import load, mirakhorli
-from jaxtank.presets.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, response
+from jaxtank.presets import load
+from jaxtank.presets.loops.mirakhorli import (
+    GAIN,
+    RELAY,
+    SETPOINT,
+    UNROUNDED_SPLIT,
+    plant,
+    sliding,
+)
+from jaxtank.presets.mirakhorli import measured, response
 
 PLANT = plant()
 SHARP = dataclasses.replace(PLANT, knee=1e-9)  # with the roots of plant and surface both exact
@@ -472,10 +480,10 @@ def test_an_error_of_tank_2_alone_decides_on_one_input(pairing, moved):
     )
     blended = command(hybrid, X0, (12.0, 14.0))
     plain = command(StateFeedback(model=PLANT, K=number(GAIN)), X0, (12.0, 14.0))
-    sliding = np.clip(command(mirakhorli.sliding(PLANT), X0, (12.0, 14.0)), 0, 5)
+    slides = np.clip(command(sliding(PLANT), X0, (12.0, 14.0)), 0, 5)
     assert blended[1 - moved] == plain[1 - moved]
     # |e2| = 2 cm: all sliding mode
-    np.testing.assert_allclose(blended[moved], sliding[moved], rtol=1e-12)
+    np.testing.assert_allclose(blended[moved], slides[moved], rtol=1e-12)
     assert abs(blended[moved] - plain[moved]) > 0.1
 
 
@@ -489,7 +497,7 @@ def test_the_blend_rests_where_its_laws_rest():
 
 def test_the_first_command_from_empty_tanks():
     """Notes H5: at h = 0 the smooth root makes the law ask for (.38, .53) V only, with phi 0.02."""
-    law = dataclasses.replace(mirakhorli.sliding(PLANT), phi=number(0.02))
+    law = dataclasses.replace(sliding(PLANT), phi=number(0.02))
     np.testing.assert_allclose(command(law, (0.0,) * 4, SETPOINT), (0.38, 0.53), atol=6e-3)
 
 
@@ -1319,7 +1327,7 @@ def test_names_of_the_contract():
 
 
 def test_every_published_number_that_can_be_measured_is():
-    measured = mirakhorli.measured(
+    measured = measured(
         lambda name, values=None, save_every=1: run(
             name, **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}
         )
@@ -1355,7 +1363,7 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
             }
             return run(instead.get(name, name), **values)
 
-        return mirakhorli.measured(other)["zero steady-state error of the SFC"].verdict
+        return measured(other)["zero steady-state error of the SFC"].verdict
 
     assert told(swapped, {}) == "reproduced"
     assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"

@@ -33,7 +33,7 @@ def open_case(args):
 
     opened = rig.open_case(args.case)
     # of the file as it is: what --set changes is meant
-    of_file = rig.doubts(opened) if args.case.endswith(".toml") and not args.quiet else []
+    of_file = rig.case_warnings(opened) if args.case.endswith(".toml") and not args.quiet else []
     for sentence in of_file:
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values = settings(args)
@@ -58,10 +58,10 @@ def _warnings(args, opened, case, replaced):
     if args.command == "tune" and not args.scenario:
         for name, scenarios in replaced.items():
             found.append(f"--set {name} also replaces the value of {name} in {_named(scenarios)}")
-    found += rig.model_doubts(case)
+    found += rig.model_warnings(case)
     if case.clock != opened.clock:
-        found += rig.clock_doubts(case.clock)
-    return found + step_size.doubts(case.loop, case.clock)
+        found += rig.clock_warnings(case.clock)
+    return found + step_size.step_warnings(case.loop, case.clock)
 
 
 def settings(args):

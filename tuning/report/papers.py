@@ -119,7 +119,7 @@ def _set_in(preset, name):
 
 
 def _same(printed, found):
-    """True if the preset's value is the printed one (a list of equal entries counts as one number)."""
+    """Return whether the preset's value is the printed one (equal entries count as one number)."""
     if found is None or isinstance(found, str):
         return False
     a, b = np.ravel(printed).astype(float), np.ravel(found).astype(float)

@@ -87,7 +87,7 @@ def measure_table(values, rig_units=DEFAULT):
     rows = [
         [m, ms.unit(m, rig_units), numbers(values[m]), spec.doc]
         for m, spec in ms.MEASURES.items()
-        if m in values and m not in ms.TIMES.values()
+        if m in values and m not in ms.times()
     ]
     return table(rows, ["measure", "unit", "value", ""])
 

@@ -107,7 +107,7 @@ CAPTIONS = {
         " limit."
     ),
     "margins": (
-        "Margin of the tuned run to each limit; a bar to the left of zero is a limit that is broken."
+        "Margin of the tuned run to each limit; a bar to the left of zero is a broken limit."
     ),
     "inner": (
         "The tanks that are not controlled, one against the other, from the dot to the square."
@@ -118,8 +118,8 @@ CAPTIONS = {
     ),
     "estimates": "Estimates of the observer and true values, in the tuned run.",
     "clouds": (
-        "Validation runs, on perturbed plants and with new sensor noise where the case has them: one"
-        " dot a run, before tuning on the horizontal axis, after it on the vertical one."
+        "Validation runs, on perturbed plants and with new sensor noise where the case has them:"
+        " one dot a run, before tuning on the horizontal axis, after it on the vertical one."
     ),
     "convergence": "Every evaluation of the search in its order.",
     "landscape": "The objective around the tuned values, at the case's own step.",

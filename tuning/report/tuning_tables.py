@@ -37,7 +37,7 @@ def parts_of(result):
 
 
 def _parameter_table(result):
-    """Every free parameter before and after, its range, and how sensitive the objective is to it."""
+    """Every free parameter before and after, its range, and the sensitivity of the objective."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""

@@ -1,4 +1,4 @@
-"""Tables, JSON and pictures of an ensemble."""
+"""The report of an uncertainty study: text, JSON, pictures, page and folder."""
 
 import dataclasses
 import io
@@ -9,17 +9,18 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
+from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
 from tuning.search import provenance
 from tuning.storage import batch_store
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
-WORDS = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
+QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
 
 INTERVALS = (
-    "intervals are those of independent draws: exact for random ones, for others an indication that"
-    " is mostly too wide"
+    "intervals are those of independent draws: exact for random draws, mostly too wide for latin"
+    " and sobol ones"
 )
 
 
@@ -52,16 +53,14 @@ def json_of(ensemble):
         for m in found["measures"].values()
     ):
         found["reason"] = (
-            "null: no finite number, as of a settling time where some draw never settles, or of a"
-            " spread of one draw"
+            "null: not a finite number, as a settling time where some draw never settles, or the"
+            " standard deviation of one draw"
         )
     return found
 
 
 def remarks_of(ensemble):
-    """Sentences on what to doubt of the draws: that steps are too long for the rig as it is, before
-    anything is drawn.
-    """
+    """Return warnings on the draws: that the steps are too long for the rig before any is drawn."""
     return [
         f"of the rig as it is, and of draws like it: {line}"
         for line in step_size.step_warnings(ensemble.case.loop, ensemble.case.clock)
@@ -69,125 +68,127 @@ def remarks_of(ensemble):
 
 
 def lines(ensemble):
-    """What is printed of an Ensemble: lines and tables."""
-    units, rows = ensemble.case.loop.units, []
-    for name, found in ensemble.summary().items():
-        shape, per = ensemble.measures[name].shape[1:], ms.MEASURES[name].per
-        columns = {
-            w: np.broadcast_to(np.nan if found[w] is None else found[w], shape).ravel()
-            for w in WORDS
-        }
-        ends = (
-            None
-            if found["mean_interval95"] is None
-            else [np.ravel(v) for v in found["mean_interval95"]]
-        )
-        for i in range(len(columns["mean"])):
-            label = name if per == "run" else f"{name} of {per} {i + 1}"
-            interval = "-" if ends is None else " : ".join(tables.number(end[i], 4) for end in ends)
-            shown = [tables.number(columns[w][i], 4) for w in WORDS]
-            rows.append([label, ms.unit(name, units), shown[0], interval, *shown[1:]])
-    head = [
-        "measure",
-        "unit",
-        "mean",
-        "95 % of the mean",
-        "sd",
-        "5 %",
-        "median",
-        "95 %",
-        "worst 5 %",
-        "highest",
-    ]
-    spread = ", ".join(f"{n} {_words(d)}" for n, d in ensemble.distributions.items())
-    words = [
-        (
-            f"{ensemble.case.name}: {ensemble.samples} draws ({ensemble.method}, seed"
-            f" {ensemble.seed}), {ensemble.wall_s:.1f} s"
-        ),
-        f"uncertain: {spread}",
+    """Return what is printed of an Ensemble: lines and Tables."""
+    varied = ", ".join(f"{n} {in_words(d)}" for n, d in ensemble.distributions.items())
+    found = [
+        f"{ensemble.case.name}: {count(ensemble.samples, 'draw')} ({ensemble.method}, seed"
+        f" {ensemble.seed}), {ensemble.wall_s:.1f} s",
+        f"uncertain: {varied}",
         "",
-        tables.table(rows, head),
+        _measure_table(ensemble),
         "",
     ]
     finite = int(np.sum(~ensemble.failed))
     if finite < 2:
-        words.append("one run has no spread: " if finite else "no run is left: ")
-        words[-1] += (
-            "a standard deviation and an interval of the mean need two draws that end in numbers"
+        found.append(
+            f"{count(finite, 'run')} finite: a standard deviation and an interval of the mean need"
+            " two finite runs"
         )
-        words.append("")
-    if ensemble.limits:
-        rows = [
-            [
-                v["name"],
-                f"{tables.number(v['limit'])} {v['unit']}",
-                v["count"],
-                f"{v['probability']:.4g}",
-                "{:.4g} : {:.4g}".format(*v["interval95"]),
-            ]
-            for v in ensemble.violations()
-        ]
-        words += [
-            tables.table(rows, ["limit", "value", "broken in", "probability", "95 % interval"]),
-            "",
-        ]
+        found.append("")
+    found += _violation_table(ensemble)
     if ensemble.method != "random":
-        words.append(f"{INTERVALS} (here draws are {ensemble.method})")
-    words.append(
-        f"{int(ensemble.failed.sum())} runs left the numbers; they count as breaking every limit"
-        " and are in no other figure"
+        found.append(f"{INTERVALS} (these draws are {ensemble.method})")
+    found.append(
+        f"{count(ensemble.samples - finite, 'run')} diverged: counted as breaking every limit, left"
+        " out of all other figures"
     )
-    words += remarks_of(ensemble)
+    found += remarks_of(ensemble)
     if ensemble.infeasible is not None:
-        words.append(
-            f"{int(ensemble.infeasible.sum())} draws have a plateau without a steady state within"
-            " rims and pumps; they are in all figures"
+        found.append(
+            f"{count(int(ensemble.infeasible.sum()), 'draw')} without a steady state within rims"
+            " and pump limits at some plateau of the reference: included in all figures"
         )
-    return words
+    return found
 
 
-def _words(distribution):
-    """A distribution in words, in the units of its parameter."""
+def _measure_table(ensemble):
+    """The statistics of every measure, a row for each of its entries."""
+    rows, units = [], ensemble.case.loop.units
+    for name, found in ensemble.summary().items():
+        shape, per = ensemble.measures[name].shape[1:], ms.MEASURES[name].per
+        columns = [np.nan if found[q] is None else found[q] for q in QUANTITIES]
+        columns = [np.broadcast_to(values, shape).ravel() for values in columns]
+        ends = found["mean_interval95"]
+        for i in range(len(columns[0])):
+            label = name if per == "run" else f"{name} of {per} {i + 1}"
+            shown = [tables.number(values[i], 4) for values in columns]
+            interval = "-"
+            if ends is not None:
+                interval = " : ".join(tables.number(np.ravel(end)[i], 4) for end in ends)
+            rows.append([label, ms.unit(name, units), shown[0], interval, *shown[1:]])
+    heads = ["measure", "unit", "mean", "95 % of the mean", "sd"]
+    return tables.table(rows, [*heads, "5 %", "median", "95 %", "mean of worst 5 %", "highest"])
+
+
+def _violation_table(ensemble):
+    """How often each limit is broken."""
+    if not ensemble.limits:
+        return []
+    rows = [
+        [
+            v["name"],
+            f"{tables.number(v['limit'])} {v['unit']}",
+            v["count"],
+            f"{v['probability']:.4g}",
+            "{:.4g} : {:.4g}".format(*v["interval95"]),
+        ]
+        for v in ensemble.violations()
+    ]
+    heads = ["limit", "value", "broken in", "probability", "95 % interval"]
+    return [tables.table(rows, heads), ""]
+
+
+def in_words(distribution):
+    """Return a distribution in words, in the unit of its parameter.
+
+    Examples
+    --------
+    >>> in_words(Uniform(relative=0.1))
+    '+-10 % (uniform)'
+    >>> in_words(Normal(mean=2.0, sd=0.1))
+    '2 sd 0.1 (normal, truncated at 3 sd)'
+    """
     d = distribution
     if isinstance(d, Correlated):
-        return f"{len(d.names)} of them together, with a covariance" + (
-            "" if d.mean is None else " and means of their own"
-        )
+        means = "" if d.mean is None else " and means of their own"
+        return f"{count(len(d.names), 'parameter')}, correlated, with a covariance{means}"
     if isinstance(d, Discrete):
-        return (
-            "one of "
-            + ", ".join(f"{v:g}" for v in d.values)
-            + ("" if d.weights is None else f" (weights {', '.join(f'{w:g}' for w in d.weights)})")
+        weights = (
+            "" if d.weights is None else f" (weights {', '.join(f'{w:g}' for w in d.weights)})"
         )
+        return f"one of {', '.join(f'{v:g}' for v in d.values)}{weights}"
     kind = {
-        Uniform: "even",
-        LogUniform: "even in the logarithm",
-        Normal: f"normal, cut at {getattr(d, 'cut', 0):g} sd",
+        Uniform: "uniform",
+        LogUniform: "uniform in the logarithm",
+        Normal: f"normal, truncated at {getattr(d, 'cut', 0):g} sd",
     }[type(d)]
+    return f"{_extent(d)} ({kind}{', all entries together' if d.tied else ''})"
+
+
+def _extent(d):
+    """How wide a Uniform, LogUniform or Normal is."""
     if getattr(d, "relative", None) is not None:
-        extent = f"{100 * d.relative:g} %" + (" sd" if isinstance(d, Normal) else "")
-        extent = extent if isinstance(d, Normal) else f"+-{extent}"
-    elif getattr(d, "factor", None) is not None:
-        extent = f"within a factor {d.factor:g}"
-    elif isinstance(d, Normal):
-        extent = (f"{d.mean:g} " if d.mean is not None else "") + f"sd {d.sd:g}"
-    else:
-        extent = f"{d.low:g} to {d.high:g}"
-    return f"{extent} ({kind}{', all entries together' if d.tied else ''})"
+        share = f"{100 * d.relative:g} %"
+        return f"{share} sd" if isinstance(d, Normal) else f"+-{share}"
+    if getattr(d, "factor", None) is not None:
+        return f"within a factor {d.factor:g}"
+    if isinstance(d, Normal):
+        return (f"{d.mean:g} " if d.mean is not None else "") + f"sd {d.sd:g}"
+    return f"{d.low:g} to {d.high:g}"
 
 
 def draws_csv(ensemble):
-    """Every draw as CSV: its number, what was drawn, whether the run failed, its measures; units in
-    the header.
+    """Return every draw as CSV: number, whether it diverged, parameters, measures.
+
+    Units are in the header.
     """
     columns = [("draw", np.arange(ensemble.samples)), ("failed", ensemble.failed.astype(int))]
     for source, unit in ((ensemble.values, None), (ensemble.measures, ms.unit)):
         for name, values in source.items():
             flat = np.asarray(values).reshape(ensemble.samples, -1)
-            said = "" if unit is None else f" [{unit(name, ensemble.case.loop.units)}]"
+            units = "" if unit is None else f" [{unit(name, ensemble.case.loop.units)}]"
             columns += [
-                (name + (f"[{i}]" if flat.shape[1] > 1 else "") + said, flat[:, i])
+                (name + (f"[{i}]" if flat.shape[1] > 1 else "") + units, flat[:, i])
                 for i in range(flat.shape[1])
             ]
     out = io.StringIO()
@@ -197,7 +198,7 @@ def draws_csv(ensemble):
 
 
 def figures(ensemble):
-    """Matplotlib figures {name: figure}: "fan" of the levels, "violations", "rig"."""
+    """Return matplotlib figures {name: Figure}: "fan" of the levels, "violations", "rig"."""
     from jaxtank.plots import responses
     from tuning.report import figures as pictures
 
@@ -212,19 +213,18 @@ def figures(ensemble):
 
 
 def drawn_of(ensemble):
-    """Which draws the fan is of, in words: the first are kept whole, and of these the ones that
-    stayed finite.
-    """
+    """Return which draws the fan is of, in words: of the first ones those that are finite."""
     first, kept = ensemble.fan["of"], ensemble.fan["draws"]
-    whole = f"{first} draw{'' if first == 1 else 's'}"
-    of = f"the first {first} of {ensemble.samples} draws" if first < ensemble.samples else whole
-    return of if kept == first else f"{kept} of {of}, the rest left the numbers"
+    of = count(first, "draw")
+    if first < ensemble.samples:
+        of = f"the first {first} of {ensemble.samples} draws"
+    return of if kept == first else f"{kept} of {of}, the others diverged"
 
 
 CAPTIONS = {
     "fan": (
-        "Levels over the draws that were kept whole (at most the first 512): the median, the middle"
-        " half, and 9 in 10 of them at each moment."
+        "Levels of the first draws (at most 512): the median, the middle half, and 9 in 10 of them"
+        " at each moment."
     ),
     "violations": (
         "The probability that a rig of this spread breaks each limit, with its 95 % interval."
@@ -234,42 +234,23 @@ CAPTIONS = {
 
 
 def page_of(ensemble, drawn, command=None):
-    """The page report.html of an ensemble, with `drawn`, the figures of `figures`; command: the
-    line that made it.
+    """Return the page report.html of an Ensemble.
+
+    drawn: the figures of `figures`; command: the command line that made it.
     """
-    failed, broken = int(ensemble.failed.sum()), ensemble.violations() if ensemble.limits else []
+    diverged, broken = int(ensemble.failed.sum()), ensemble.violations() if ensemble.limits else []
     facts = [
         ("draws", str(ensemble.samples)),
-        ("runs that left the numbers", str(failed)),
+        ("runs that diverged", str(diverged)),
         ("time", f"{ensemble.wall_s:.1f} s"),
     ]
-    said = remarks_of(ensemble)
-    if broken:
-        worst = max(broken, key=lambda v: v["probability"])
-        low, high = worst["interval95"]
-        facts.insert(1, ("the limit most often broken", f"{100 * worst['probability']:.3g} %"))
-        which = f"{worst['name']} ({tables.number(worst['limit'])} {worst['unit']})"
-        said.append(
-            f"{which} is the limit most often broken: in {worst['count']} of {ensemble.samples}"
-            f" draws, a probability between {low:.3g} and {high:.3g} with 95 % confidence"
-            if worst["count"]
-            else (
-                f"a limit that none of {ensemble.samples} draws breaks is broken with a probability"
-                f" of at most {high:.3g}, with 95 % confidence"
-            )
-        )
-    found = ensemble.summary().get("rms_error_total")
-    if found is not None and found["p50"] is not None:
-        unit = ms.unit("rms_error_total", ensemble.case.loop.units)
-        shown = [tables.number(np.ravel(found[k])[0], 4) for k in ("p50", "p05", "p95")]
-        facts.insert(1, ("median rms_error_total", f"{shown[0]} {unit}"))
-        said.append(
-            f"rms_error_total: half of the draws lie below {shown[0]} {unit}, 9 in 10 between"
-            f" {shown[1]} and {shown[2]} {unit}"
-        )
-    status = "no limits were asked for" if not broken else "no limit was broken in any draw"
-    if failed:
-        status = f"{failed} of {ensemble.samples} runs left the numbers"
+    sentences = remarks_of(ensemble)
+    for fact, sentence in (_worst_limit(ensemble, broken), _typical_error(ensemble)):
+        facts[1:1] = fact
+        sentences += sentence
+    status = "no limit was broken in any draw" if broken else "no limits were given"
+    if diverged:
+        status = f"{diverged} of {count(ensemble.samples, 'run')} diverged"
     elif any(v["count"] for v in broken):
         status = "some draws break a limit"
     return html.document(
@@ -278,7 +259,7 @@ def page_of(ensemble, drawn, command=None):
         status,
         status.startswith("no "),
         facts,
-        said,
+        sentences,
         html.drawings(drawn, CAPTIONS),
         lines(ensemble),
         command,
@@ -286,11 +267,44 @@ def page_of(ensemble, drawn, command=None):
     )
 
 
-def save(ensemble, folder, command=None):
-    """Write result.json, draws.csv, pictures and report.html to `folder`; returns their paths.
-    Finished batches that lie there are removed.
+def _worst_limit(ensemble, broken):
+    """(facts, sentences) on the limit that is broken most often."""
+    if not broken:
+        return [], []
+    worst = max(broken, key=lambda v: v["probability"])
+    low, high = worst["interval95"]
+    which = f"{worst['name']} ({tables.number(worst['limit'])} {worst['unit']})"
+    sentence = (
+        f"{which} is the limit most often broken: in {worst['count']} of {ensemble.samples} draws,"
+        f" a probability between {low:.3g} and {high:.3g} with 95 % confidence"
+    )
+    if not worst["count"]:
+        sentence = (
+            f"none of {count(ensemble.samples, 'draw')} breaks a limit: the probability of breaking"
+            f" a given one is at most {high:.3g}, with 95 % confidence"
+        )
+    return [("the limit most often broken", f"{100 * worst['probability']:.3g} %")], [sentence]
 
-    command: the line that made the ensemble, for the report, where there is one.
+
+def _typical_error(ensemble):
+    """(facts, sentences) on the total RMS error."""
+    found = ensemble.summary().get("rms_error_total")
+    if found is None or found["p50"] is None:
+        return [], []
+    unit = ms.unit("rms_error_total", ensemble.case.loop.units)
+    median, low, high = (tables.number(np.ravel(found[k])[0], 4) for k in ("p50", "p05", "p95"))
+    sentence = (
+        f"rms_error_total: half of the draws lie below {median} {unit}, 9 in 10 between {low} and"
+        f" {high} {unit}"
+    )
+    return [("median rms_error_total", f"{median} {unit}")], [sentence]
+
+
+def save(ensemble, folder, command=None):
+    """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths.
+
+    The checkpoint in it, which is no longer needed, is removed. command: the command line that
+    made the ensemble.
     """
     check_folder(folder)
     folder = Path(folder)

@@ -14,19 +14,19 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.step_size import StepWarning, check_run, step_warnings
+from jaxtank.loop.step_size import StepWarning, check_run
 from tuning.problem import scenarios as sc
 from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
 
 MOST = 16
-"""Runs that are made to see whether the explicit step is unstable near empty in one."""
+"""Runs that are made to see whether a level is thrown up in one."""
 
 
 def of_answer(problem, tuned, values, key=None):
     """[] where the steps of the tuned case and of its scenarios are short enough, else one
-    sentence: which run is wrong, for its step was unstable near empty; or, where none is, what would
-    happen to a tank that runs empty. Runs are made only where there are warnings.
+    sentence: which run is wrong, for a level was thrown up in it; or, where none was, what would
+    happen to a tank that runs empty. Runs are made only where there are doubts.
 
     values: {parameter: the answer's}; key: of the sensor noise of the case's own run.
     """
@@ -39,13 +39,13 @@ def of_answer(problem, tuned, values, key=None):
     told = []
     for name, loop, clock, own in runs:
         found = step_warnings(loop, clock)
-        if found and (why := _unstable(loop, clock, own)):
+        if found and (why := _thrown_up(loop, clock, own)):
             return [f"{name}this answer's run is wrong, and so are its numbers: {why}"]
         told += [f"{name}{sentence}" for sentence in found]
     return told[:1]
 
 
-def _unstable(loop, clock, key):
+def _thrown_up(loop, clock, key):
     """What `check_run` says of the run of a loop; None where it is right."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StepWarning)  # the sentence says it

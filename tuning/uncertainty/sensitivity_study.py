@@ -63,7 +63,7 @@ class SensitivityResult(Result):
         [s].
     """
 
-    REPORT = "tuning.report.sensitivity_tables"
+    REPORT = "tuning.report.sensitivity_report"
 
     case: Any
     method: str

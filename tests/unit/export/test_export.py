@@ -23,7 +23,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
 from jaxtank.export.source import export
 from jaxtank.plants.network import network
-from jaxtank.rig import schema as rig_words
+from jaxtank.rig import lines as rig_lines
 from tuning.cli import main
 
 SAMPLES = 10_000
@@ -473,7 +473,7 @@ HOSTILE = [
 
 def exported(folder, name, language):
     """The text that `jaxtank export` writes of a rig with a hostile name."""
-    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_words.toml(name)))
+    (folder / "rig.toml").write_text(HOSTILE_RIG.format(name=rig_lines.toml(name)))
     words = [
         "export",
         str(folder / "rig.toml"),

@@ -37,11 +37,11 @@ def test_a_single_draw_is_told_without_a_spread(case):
             and {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
             and unit == "V"
         )
-    assert "one run has no spread" in page
+    assert "1 run finite: a standard deviation" in page
 
 
 @pytest.mark.parametrize(
-    "failed, words", [([True, False], "one run has no spread"), ([True, True], "no run is left")]
+    "failed, words", [([True, False], "1 run finite: a standard deviation"), ([True, True], "0 runs finite: a standard deviation")]
 )
 def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
     two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))

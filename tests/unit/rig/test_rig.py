@@ -15,7 +15,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.files import LARGEST_TEXT
 from jaxtank.core.tree import parameters
-from jaxtank.rig.schema import toml
+from jaxtank.rig.lines import toml
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
@@ -224,7 +224,7 @@ def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
     assert "model." not in rig.dump(case)
     wrong = rig.set_values(case, {"plant.pump_gain": gain.tolist()})
     assert_same(rig.loads(rig.dump(wrong)), wrong)
-    assert len([s for s in rig.doubts(wrong) if "model.pump_gain" in s]) == len(models)
+    assert len([s for s in rig.case_warnings(wrong) if "model.pump_gain" in s]) == len(models)
 
 
 def test_a_model_of_a_rig_of_ones_own_follows_what_is_set(tmp_path):
@@ -247,12 +247,12 @@ Ti = 50.0
     case = rig.loads(text)
     assert (
         case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3
-        and rig.doubts(case) == []
+        and rig.case_warnings(case) == []
     )
     wrong = rig.set_values(case, {"controller.model.drain": 0.2})
     assert_same(rig.loads(rig.dump(wrong)), wrong)
-    assert rig.doubts(wrong) == []  # PID reads its model for the feed-forward alone
-    assert len(rig.doubts(rig.set_values(wrong, {"controller.feed_forward": True}))) == 1
+    assert rig.case_warnings(wrong) == []  # PID reads its model for the feed-forward alone
+    assert len(rig.case_warnings(rig.set_values(wrong, {"controller.feed_forward": True}))) == 1
 
 
 def test_values_relative_to_the_case_are_written_as_they_are():
@@ -518,8 +518,11 @@ def test_scenarios_and_what_is_uncertain_go_through_a_file(tmp_path):
             '[[scenario]]\nname = "a"\nvalues = { "sensor.noise" = -1.0 }',
             "scenario 'a': sensor.noise[0] = -1 cm",
         ),
-        ("[[scenario]]\nseed = 1.5", "seed = 1.5 must be a whole number"),
-        ("[[scenario]]\nweight = 0.0", "weight = 0.0 must be a finite number above 0"),
+        (
+            "[[scenario]]\nseed = 1.5",
+            "seed = 1.5: must be a whole number, at least 0, at most 2147483647",
+        ),
+        ("[[scenario]]\nweight = 0.0", "scenario 1: weight = 0: must be above 0"),
         (
             '[uncertain]\n"plant.drain" = 2.0',
             "uncertain plant.drain = 2.0: must be a share between 0 and 1",

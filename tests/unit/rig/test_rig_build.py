@@ -167,7 +167,7 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"tank": []}, "at least one"),
         ({"pump": [{"gain": 1.0, "to": "middle", "high": 1.0}]}, "'middle'; nearest"),
         ({"pump": [{"gain": 1.0, "to": 7, "high": 1.0}]}, "from 1 to 4"),
-        ({"pump": [{"gain": 1.0, "to": 1}]}, "pump 1: high is missing"),
+        ({"pump": [{"gain": 1.0, "to": 1}]}, r"pump 1 needs high \[V\]: upper limit"),
         ({"pump": [{"gain": True, "to": 1, "high": 1.0}]}, "gain = True"),
         (
             {"pump": [{"gian": 1.0, "to": 1, "high": 1.0}]},

@@ -30,7 +30,7 @@ from tuning.uncertainty.sensitivity_study import what_varies
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
 TWO = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
-OPTIONS = {"samples": 50, "key": 3, "lanes": 16, "fan": False}
+OPTIONS = {"samples": 50, "key": 3, "batch": 16, "fan": False}
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +178,7 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
         ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
         ({"origin": {"rig": "x = ", "limits": {}}}, "is not TOML"),
         ({"samples": "50"}, "does not say"),
-        ({"lanes": 0}, "not one of this program"),
+        ({"batch": 0}, "not one of this program"),
         ({"distributions": {"plant.drain": {"kind": "Path"}}}, "not a distribution"),
         (
             {
@@ -294,7 +294,7 @@ def test_a_batch_that_was_changed_is_refused(case, tmp_path, change):
     """Whatever was done to it: a number, another batch in its place, its shape, or what it is said
     to be of.
     """
-    options = {"samples": 40, "lanes": 16, "key": 5, "measures": ("max_level",), "fan": False}
+    options = {"samples": 40, "batch": 16, "key": 5, "measures": ("max_level",), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
     paths = sorted(tmp_path.glob("part-*.npz"))
@@ -339,7 +339,7 @@ FORGED = {
 @pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
 def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, tmp_path):
     """Whoever has the program can seal a batch: what it holds is looked at, too."""
-    options = {"samples": 8, "lanes": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
+    options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
     store = batch_store.Store.__new__(batch_store.Store)
@@ -419,7 +419,7 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
     assert all(v["count"] >= bad.sum() for v in found.violations())
     assert np.all(
         np.isfinite(found.summary()["rms_error"]["mean"])
-    ) and f"{bad.sum()} runs left the numbers" in repr(found)
+    ) and f"{bad.sum()} runs diverged" in repr(found)
 
 
 def test_plateaus_without_a_steady_state_are_counted(gouta):
@@ -841,17 +841,17 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
     }
 
 
-def test_distributions_are_told_in_words():
+def test_distributions_are_put_into_words():
     from tuning import Correlated, Normal, Uniform
-    from tuning.report.uncertainty import _words
+    from tuning.report.uncertainty import in_words
 
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
-    assert _words(Uniform(relative=0.1)) == "+-10 % (even)"
+    assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"
     assert (
-        _words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (even, all entries together)"
+        in_words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (uniform, all entries together)"
     )
-    assert _words(Normal(relative=0.05)) == "5 % sd (normal, cut at 3 sd)"
-    assert _words(pair) == "2 of them together, with a covariance"
+    assert in_words(Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
+    assert in_words(pair) == "2 parameters, correlated, with a covariance"
 
 
 def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain(case):

@@ -344,7 +344,7 @@ def test_runs_that_fail_are_counted_and_told(case):
     said = study.to_json()
     assert said[
         "failed"
-    ] == count and f"{count} of {study.runs} runs stopped being finite" in " ".join(said["notes"])
+    ] == count and f"{count} of {study.runs} runs diverged" in " ".join(said["notes"])
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4

@@ -1,0 +1,1 @@
+"""Rigs and closed loops of the papers whose preset alone would be too long."""

@@ -1,0 +1,353 @@
+"""A section of a rig file read by its schema: known keys, kinds of values, ranges, units.
+
+Imported by the rest of `rig` and, for the checks of numbers, by its callers.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.core.checks import check_value
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.text import shortened
+from jaxtank.core.tree import number
+from jaxtank.core.units import DEFAULT
+from jaxtank.rig.schema import NEEDED
+
+LARGEST = 1e300
+"""Magnitude of a number of a rig file: products of two stay finite for most."""
+
+
+class Sizes(NamedTuple):
+    """What is known of a rig while its file is read: how many tanks, pumps and controlled tanks it
+    has, the units it counts in, and {name: index} of its tanks.
+    """
+
+    tanks: int
+    pumps: int = 0
+    outputs: int = 0
+    units: tuple = DEFAULT
+    names: Mapping[str, int] = {}
+
+
+def sizes_of(plant, names: Mapping[str, int] = {}) -> Sizes:
+    """Return the Sizes of a plant; names: those of its tanks."""
+    return Sizes(plant.tanks, plant.pumps, len(plant.outputs), plant.units, names)
+
+
+def read_entry(
+    section, table: Any, sizes: Sizes, index: int | None = None, title: str = ""
+) -> dict[str, Any]:
+    """Return the values of a table of a rig file, checked key by key against its section.
+
+    Parameters
+    ----------
+    section : schema.Section
+    table : {key: value} as in the file
+    sizes : of the rig
+    index : number of the table in its list, from 0, or None
+    title : what messages on missing keys call it; "": its title
+
+    Returns
+    -------
+    {key: value}, tanks as indices from 0; a default where the table leaves a key out, nothing where
+    that is None.
+
+    Raises
+    ------
+    InputError naming the key, its value, unit and range: a key that is unknown (with the nearest)
+    or missing, a value of the wrong kind, and one out of range.
+
+    Examples
+    --------
+    >>> from jaxtank.rig.schema import SECTIONS
+    >>> read_entry(SECTIONS["pipe"], {"between": [1, 2], "area": 0.5}, Sizes(tanks=2), 0)
+    {'between': (0, 1), 'area': 0.5}
+    """
+    where = section.name if index is None else f"{section.name} {index + 1}"
+    if not isinstance(table, Mapping):
+        raise InputError(f"{where} = {shortened(table)}: must be a table")
+    for key in table:
+        if key not in section.names:
+            raise _unknown(section, where, key)
+    found = {}
+    for key in section.keys:
+        value = table.get(key.name, None if key.default is NEEDED else key.default)
+        if key.name in table or value is not None:
+            label = f"{where}: {key.name}" if section.many else f"{where}.{key.name}"
+            found[key.name] = read_value(key, label, value, sizes)
+        elif key.default is NEEDED:
+            label = where if section.many else title or section.title
+            raise InputError(f"{label} needs {key.name}{unit(key.meta(sizes.units))}: {key.doc}")
+    return found
+
+
+def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
+    """Return `read_entry` of each table of a list in a rig file, [] where there is none."""
+    return [read_entry(section, entry, sizes, i) for i, entry in enumerate(table[section.name])]
+
+
+def _unknown(section, where, key):
+    """The InputError for a key that a section does not have."""
+    part, owner = section.elsewhere or ("", None)
+    if key in getattr(owner, "__dataclass_fields__", ()):
+        return InputError(
+            f'{where}: {key} is not a key of {section.title}: it is "{part}.{key}" in [values],'
+            " for all of them at once"
+        )
+    return unknown(f"key of {section.title}", key, section.names)
+
+
+def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
+    """Return the value of a key, as `READ` of its kind has it; `label` names it in errors."""
+    return READ[key.kind](key, label, value, sizes)
+
+
+def written(key, value: Any) -> Any:
+    """Return a value as a rig file has it: tanks counted from 1, arrays as lists."""
+    if value is None or isinstance(value, (str, dict)):
+        return value
+    return WRITTEN.get(key.kind, lambda v: np.asarray(v).tolist())(value)
+
+
+def _number(key, label, value, sizes):
+    good = isinstance(value, (int, float)) and not isinstance(value, bool)
+    meta = key.meta(sizes.units)
+    if not good or not is_numeric(value):
+        wanted = f"a finite number{unit(meta)}"
+        raise InputError(f"{label} = {shortened(value)}: must be {_within(wanted, meta)}")
+    if LARGEST < abs(value) < float("inf"):
+        raise InputError(f"{label} = {shortened(value)}{unit(meta)}: must be within +-{LARGEST:g}")
+    check_value(label, float(value), meta)
+    return float(value)
+
+
+def _within(wanted, meta):
+    return ", ".join(filter(None, [wanted, allowed({**meta, "choices": None})]))
+
+
+def _integer(key, label, value, sizes):
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and is_numeric(value)
+    inside = number and (key.low is None or value >= key.low)
+    inside = inside and (key.high is None or value <= key.high)
+    if not (inside and float(value).is_integer()):
+        wanted = _within("a whole number", key.meta(sizes.units))
+        raise InputError(f"{label} = {shortened(value)}: must be {wanted}")
+    return int(value)
+
+
+def _flag(key, label, value, sizes):
+    if not isinstance(value, bool):
+        raise InputError(f"{label} = {shortened(value)}: must be true or false")
+    return value
+
+
+def _texts(key, label, value, sizes):
+    if not (isinstance(value, list) and value and all(isinstance(v, str) for v in value)):
+        raise InputError(f"{label} = {shortened(value)}: must be a list of texts: {key.doc}")
+    return [name_of(label, text) for text in value]
+
+
+def _list(key, label, value, sizes):
+    size = size_of(key.doc, sizes)
+    if not (is_finite(value) and np.shape(value) == (size,)):
+        per = {"(n,": ", one per tank", "(m,": ", one per pump"}.get(key.doc[:3], "")
+        numbers = f"{size} finite numbers{unit(key.meta(sizes.units))}{per}"
+        raise InputError(f"{label} = {shortened(value)}: must be a list of {numbers}")
+    return number(value)
+
+
+def _array(key, label, value, sizes):
+    """An array; one number for an array of one entry per pump, tank or output fills it."""
+    if not is_numeric(value):
+        numbers = f"a number or a list of numbers{unit(key.meta(sizes.units))}"
+        raise InputError(f"{label} = {shortened(value)}: must be {numbers}")
+    array, size = number(value), size_of(key.doc, sizes)
+    return np.full(size, array) if size is not None and array.ndim == 0 else array
+
+
+def _scalar(key, label, value, sizes):
+    array = _array(key, label, value, sizes)
+    if array.ndim:
+        one = f"one number{unit(key.meta(sizes.units))}"
+        raise InputError(f"{label} = {shortened(value)}: must be {one}")
+    return array
+
+
+def _tank(key, label, value, sizes):
+    """Index of a tank given by its name or its number from 1."""
+    if isinstance(value, str):
+        if value not in sizes.names:
+            raise unknown(f"tank of {label}", value, sizes.names or ["1"])
+        return sizes.names[value]
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= sizes.tanks:
+        raise InputError(
+            f"{label} = {shortened(value)}: must be a tank, by its name or its number, counted"
+            f" from 1 to {sizes.tanks}"
+        )
+    return value - 1
+
+
+def _tanks(key, label, value, sizes):
+    if not isinstance(value, list):
+        raise InputError(
+            f"{label} = {shortened(value)}: must be a list of tanks, counted from 1 to"
+            f" {sizes.tanks}"
+        )
+    return tuple(_tank(key, label, tank, sizes) for tank in value)
+
+
+def _pair(key, label, value, sizes):
+    if not isinstance(value, list) or len(value) != 2:
+        raise InputError(f"{label} = {shortened(value)}: must name two tanks")
+    return different(label, value, _tanks(key, label, value, sizes))
+
+
+def _feed(key, label, value, sizes):
+    """The one or two tanks that a pump fills, None in the place of a second."""
+    tanks = value if isinstance(value, list) else [value]
+    if not 1 <= len(tanks) <= 2:
+        raise InputError(f"{label} = {shortened(value)}: must name one tank, or two")
+    found = different(label, value, _tanks(key, label, tanks, sizes))
+    return (*found, None) if len(found) == 1 else found
+
+
+def different(label, value, tanks):
+    """Return `tanks`; InputError, with `value` as the file has it, where one is given twice."""
+    if len(set(tanks)) < len(tanks):
+        raise InputError(f"{label} = {shortened(value)}: must be two different tanks")
+    return tanks
+
+
+def _table(key, label, value, sizes):
+    if not isinstance(value, dict):
+        raise InputError(f"{label} = {shortened(value)}: must be a table: {key.doc}")
+    return value
+
+
+READ = {
+    "number": _number,
+    "integer": _integer,
+    "flag": _flag,
+    "choice": lambda key, label, value, sizes: static_value(label, value, key.meta(), str),
+    "text": lambda key, label, value, sizes: name_of(label, value),
+    "texts": _texts,
+    "list": _list,
+    "array": _array,
+    "scalar": _scalar,
+    "tank": _tank,
+    "tanks": _tanks,
+    "pair": _pair,
+    "feed": _feed,
+    "table": _table,
+    "any": lambda key, label, value, sizes: value,
+}
+"""{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
+
+_numbers = lambda tanks: [i + 1 for i in tanks if i is not None]
+WRITTEN = {
+    "any": lambda value: value,
+    "tank": lambda i: i + 1,
+    "tanks": _numbers,
+    "pair": _numbers,
+    "feed": lambda pair: pair[0] + 1 if pair[1] is None else _numbers(pair),
+}
+"""{kind: function of a value} that writes it as a rig file has it, where that is different."""
+
+SHAPES = ("(m,", "(n,", "(outputs,", "(pumps,", "(2,", "(tanks + outputs,")
+
+
+def size_of(doc, sizes):
+    """Number of entries of an array that has one per pump, tank or output, by the shape that its
+    description begins with; None of another.
+    """
+    n, m, outputs = sizes.tanks, sizes.pumps, sizes.outputs
+    counts = dict(zip(SHAPES, (m, n, outputs, m, 2, n + outputs)))
+    shape = doc.split(")")[0]
+    return next((size for start, size in counts.items() if shape.startswith(start)), None)
+
+
+def name_of(where, value):
+    """`value` if it can be a name: a text of one line without control characters."""
+    if not isinstance(value, str) or not value.isprintable():
+        raise InputError(
+            f"{where} = {shortened(value)}: must be a text"
+            + " of printable characters" * isinstance(value, str)
+        )
+    return value
+
+
+def is_numeric(value):
+    """Whether a value is a number that a float can hold, or a regular array or list of such."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return np.issubdtype(value.dtype, np.number)
+    if isinstance(value, (list, tuple)):
+        return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+    try:
+        return (
+            isinstance(value, (int, float))
+            and not isinstance(value, bool)
+            and float(value) is not None
+        )
+    except OverflowError:
+        return False
+
+
+def is_finite(value, ndim=None):
+    """True for what `is_numeric` is true for, if every number is finite; ndim: number of axes that
+    it must have. A whole number is taken as the float next to it: numpy's own answer to one of 2^64
+    and more is a TypeError.
+    """
+    finite = is_numeric(value) and bool(np.all(np.isfinite(np.asarray(value, dtype=float))))
+    return finite and ndim in (None, np.ndim(value))
+
+
+def plain(name, value):
+    """`value` as a float; InputError, naming it `name`, unless it is a number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not is_numeric(value):
+        raise InputError(f"{name} = {shortened(value)}: must be a number")
+    return float(value)
+
+
+def static_value(name, value, meta, kind):
+    """`value` for a static field of type `kind` (bool, int, float or str); InputError where it is
+    another, out of range, or no choice.
+    """
+    if meta["choices"] is not None:
+        choices = meta["choices"]
+        good = not isinstance(value, (list, dict)) and value in choices
+        if not good or isinstance(value, bool) != (kind is bool):
+            named = ", ".join(str(c).lower() if isinstance(c, bool) else c for c in choices)
+            raise InputError(f"{name} = {shortened(value)}: must be one of {named}")
+        return value
+    if kind is str:  # a text of which the component itself knows what it may be
+        if not isinstance(value, str):
+            raise InputError(f"{name} = {shortened(value)}: must be a text")
+        return value
+    value = plain(name, value)
+    check_value(name, value, meta)
+    if kind is int and not value.is_integer():
+        raise InputError(f"{name} = {value:g}: must be a whole number")
+    return kind(value)
+
+
+def unit(meta):
+    """ " [cm]" of metadata, or nothing where there is no unit."""
+    return "" if meta["unit"] == "-" else f" [{meta['unit']}]"
+
+
+def allowed(meta, value=0.0):
+    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another.
+    Empty where all numbers are allowed.
+    """
+    if meta.get("choices") is not None:
+        return " or ".join(
+            str(c).lower() if isinstance(c, bool) else f'"{c}"' for c in meta["choices"]
+        )
+    low, high = meta.get("low"), meta.get("high")
+    above = "" if low is None else f"{'above' if meta['strict'] else 'at least'} {low:.10g}"
+    below = "" if high is None else f"at most {high:.10g}"
+    integer = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    integer = integer and meta.get("kind") not in ("tank", "feed")  # by name too
+    return ", ".join(filter(None, ["whole number" if integer else "", above, below]))

@@ -1,0 +1,211 @@
+"""Warnings about a case that can run but is hardly meant: reported by the commands, never refused.
+
+Imported by `jaxtank.rig`.
+"""
+
+import numpy as np
+
+from jaxtank.case import Case
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import is_component, split_index, walk
+from jaxtank.rig.signals import steps
+from jaxtank.signals.inflows import Pours
+
+
+def case_warnings(case: Case) -> list[str]:
+    """Return sentences on what of a case is hardly meant.
+
+    A run that does not end at a sample, changes and inflow pulses after its end, changes that
+    overlap, levels and setpoints above a rim, pumps that start outside their limits, models that
+    differ from the plant. (Steps that are too long: `loop.step_size`.)
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("cascaded/pi"), {"actuator.initial": 11.0})
+    >>> rig.case_warnings(case)
+    ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
+    """
+    return [
+        *clock_warnings(case.clock),
+        *_late(case),
+        *_overlapping(case),
+        *_above_rims(case),
+        *_pumps(case),
+        *model_warnings(case),
+    ]
+
+
+def clock_warnings(clock: Clock) -> list[str]:
+    """Return a sentence where a run, which is made of whole samples, does not end when it is asked
+    to.
+
+    Parameters
+    ----------
+    clock : Clock
+
+    Examples
+    --------
+    >>> from jaxtank import Clock, rig
+    >>> rig.clock_warnings(Clock(dt=7.0, duration=300.0))[0].partition(":")[2]
+    ' the run ends at 301 s'
+    """
+    end = (clock.samples - 1) * clock.dt
+    if abs(end - clock.duration) <= 1e-6 * clock.dt:
+        return []
+    return [
+        f"clock.duration = {clock.duration:.9g} s is no whole number of samples of clock.dt ="
+        f" {clock.dt:.9g} s: the run ends at {end:.9g} s"
+    ]
+
+
+def _late(case):
+    """On changes of the reference and inflow pulses after the end of the run."""
+    reference, disturbance, end = (
+        steps(case.loop.reference),
+        case.loop.disturbance,
+        case.clock.duration,
+    )
+    changes = () if reference is None else reference.changes
+    pulses = disturbance.events if isinstance(disturbance, Pours) else ()
+    for name, events in (("changes of the reference", changes), ("inflow pulses", pulses)):
+        late = sum(time >= end for time, *_ in events)
+        if late:
+            yield f"{late} of {len(events)} {name} come after the end of the run at {end:g} s"
+
+
+def _overlapping(case):
+    """On changes of an output that begin before the one before is over."""
+    reference = steps(case.loop.reference)
+    if reference is None:
+        return
+    over, early = {}, []
+    for time, output in reference.changes:
+        if time < over.get(output, 0.0) - 1e-7 * case.clock.dt:
+            early.append((output, time))
+        over[output] = time + reference.ramp
+    if early:
+        yield (
+            f"reference: {len(early)} of {len(reference.changes)} changes begin before the one"
+            f" before is over (ramp {reference.ramp:g} s), the first of output {early[0][0] + 1} at"
+            f" {early[0][1]:g} s: each starts from where that one has got to"
+        )
+
+
+def _above_rims(case):
+    """On levels at t = 0 and setpoints above a rim."""
+    plant, length = case.loop.plant, case.loop.units[0]
+    rim, reference = np.asarray(plant.rim), steps(case.loop.reference)
+    limits = "rims are limits here and not physics"
+    for i, level in enumerate(np.asarray(case.loop.x0)):
+        if level > rim[i]:
+            yield (
+                f"{_tank(case, i)} starts at {level:g} {length}, above its rim at {rim[i]:g}"
+                f" {length}: "
+                + ("what is above it overflows at once" if plant.overflow else limits)
+            )
+    if reference is None:
+        return
+    for i, tank in enumerate(plant.outputs):
+        targets = zip(reference.changes, np.asarray(reference.targets))
+        highest = max([reference.initial[i], *(v for (_, j), v in targets if j == i)])
+        if highest > rim[tank]:
+            yield (
+                f"reference: output {i + 1} is asked for {highest:g} {length}, above the rim of"
+                f" {_tank(case, tank)} at {rim[tank]:g} {length}: "
+                + ("a level cannot get there" if plant.overflow else limits)
+            )
+
+
+def _tank(case, i):
+    name = case.names.get("tank", {i: ""})[i]
+    return f"tank {i + 1} ({name!r})" if name else f"tank {i + 1}"
+
+
+def _pumps(case):
+    """On pumps that start outside their limits."""
+    bank, drive = case.loop.actuator, case.loop.units[1]
+    rows = zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))
+    for j, (low, volts, high) in enumerate(rows):
+        if not low <= volts <= high:
+            yield (
+                f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
+                f" {low:g} and {high:g} {drive}"
+            )
+
+
+def model_warnings(case: Case) -> list[str]:
+    """Return a sentence for each parameter in a model of controller or observer that differs from
+    the plant's by more than its uncertainty.
+
+    The uncertainty is the share in [uncertain], or two standard deviations of [covariance]; nothing
+    but rounding where neither has the parameter. Rims count only in a model in which they are
+    physics, and no model that its controller does not read (PID without feed-forward).
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = presets.find("gouta2015/ngpc")
+    >>> wrong = rig.set_values(case, {"controller.model.gravity": 900.0})
+    >>> rig.model_warnings(wrong)[0][:66]
+    'controller.model.gravity = 900 cm/s^2, and plant.gravity = 981 cm/'
+    """
+    found = []
+    for holder in ("controller", "observer"):
+        part = getattr(case.loop, holder)
+        inner = f"{holder}.law." if is_component(getattr(part, "law", None)) else f"{holder}."
+        part = getattr(part, "law", part)
+        model = getattr(part, "model", None)
+        if model is not None and getattr(part, "reads_model", True):
+            found += _differences(case, holder, model, f"{inner}model.")
+    return found
+
+
+def _differences(case, holder, model, prefix):
+    """`model_warnings` of the model of one holder; prefix: of its dotted names."""
+    # no level depends on rims that are no physics
+    vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
+    theirs = {name: value for name, value, _ in walk(model) if name not in vacant}
+    for name, value, meta in walk(case.loop.plant):
+        other = theirs.get(name)
+        if value is None or other is None or np.shape(other) != np.shape(value):
+            continue
+        own, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
+        allowed, words = _uncertainty(case, f"plant.{name}", own)
+        if np.any(np.abs(other - own) > np.maximum(allowed, 1e-9 * np.abs(own))):
+            unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
+            here = f"{prefix}{name}"
+            yield (
+                f"{here} = {_listed(other)}{unit}, and plant.{name} = {_listed(own)}{unit}: the"
+                f" model of the {holder} differs from the plant{words}; unless that is meant, set"
+                f" {here} = {_listed(own)} too (in a rig file a model that is left out follows the"
+                " plant)"
+            )
+
+
+def _uncertainty(case, name, value):
+    """(how far a model may be off the plant's parameter `name`, in its unit; the same in words)."""
+    allowed, words = np.zeros(np.shape(value)), ""
+    for key, share in case.uncertain.items():
+        base, index = split_index(key)
+        if base == name:
+            allowed[index or ...] = share * np.abs(value[index or ...])
+            words = f" by more than [uncertain] has ({100 * share:g} %)"
+    for i, key in enumerate(case.covariance[0] if case.covariance else ()):
+        base, index = split_index(key)
+        if base == name:
+            allowed[index or ...] = 2.0 * np.sqrt(case.covariance[1][i][i])
+            words = " by more than two standard deviations of [covariance]"
+    return allowed, words
+
+
+def _listed(value):
+    return "[" + ", ".join(f"{v:.6g}" for v in value) + "]" if np.ndim(value) else f"{value:.6g}"

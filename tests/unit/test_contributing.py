@@ -1,0 +1,162 @@
+"""The four files of CONTRIBUTING.md, saved outside the package, imported, and used."""
+
+import importlib.util
+import json
+import math
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+import tuning
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from jaxtank.export import export, source
+from jaxtank.measures import accumulators, catalogue
+from jaxtank.rig import components
+from tuning.cli.main import main
+
+PAGE = next(p for p in Path(__file__).resolve().parents if (p / ".github").is_dir()) / (
+    ".github/CONTRIBUTING.md"
+)
+TABLES = (
+    components.LAWS,
+    components.REGISTERED,
+    catalogue.MEASURES,
+    accumulators.ACCUMULATORS,
+    presets._ADDED,
+    source.LANGUAGES,
+)
+
+
+@pytest.fixture
+def added(tmp_path):
+    """Save the code below the heading "Add a ..." as a module in a folder, and import it."""
+    papers = list(presets.PAPERS)
+    before = [dict(t) if isinstance(t, dict) else set(t) for t in TABLES]
+
+    def add(what):
+        section = PAGE.read_text().split(f"## Add {what}\n")[1].split("\n## ")[0]
+        (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+        path = tmp_path / f"own_{what.split()[-1]}.py"
+        path.write_text(code)
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    yield add
+    for table, old in zip(TABLES, before):
+        table.clear()
+        table.update(old)
+    presets.PAPERS[:] = papers
+    presets._load.cache_clear()
+    jax.clear_caches()
+
+
+RIG = """
+case = "cascaded/pi"
+name = "own"
+[law]
+kind = "biased-proportional"
+Kc = 1.0
+bias = 4.0
+[values]
+"clock.duration" = 400.0
+[reference]
+initial = [4.0]
+changes = [[40.0, 1, 5.0]]
+ramp = 0.0
+[free]
+"controller.Kc" = [0.05, 5.0]
+"""
+
+
+def test_a_controller_from_outside_runs_and_is_tuned_by_the_commands(added, tmp_path, capsys):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    assert main(["simulate", str(path)]) == 2  # not registered yet
+    added("a controller")
+    assert main(["simulate", str(path), "--json"]) == 0
+    capsys.readouterr()
+    assert main(["tune", str(path), "--json", "--quiet", "--starts", "1", "--validation", "0"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    gain = found["parameters"]["controller.Kc[0]"]
+    assert gain["unit"] == "V/V" and gain["before"] == 1.0 and gain["after"] != 1.0
+    assert found["objective"]["after"] < found["objective"]["before"]
+
+
+def test_a_measure_from_outside_is_evaluated_limited_and_minimised(added, capsys):
+    case = presets.find("cascaded/pi").replace(clock=jaxtank.Clock(dt=4.0, duration=800.0))
+    with pytest.raises(InputError, match="unknown measure"):
+        jaxtank.evaluate(case.loop, case.clock, ["mean_absolute_error"])
+    added("a measure")
+    names = ["mean_absolute_error", "largest_total_input"]
+    values = jaxtank.evaluate(case.loop, case.clock, names)
+    run = jaxtank.simulate(case.loop, case.clock)
+    np.testing.assert_allclose(values[names[0]], np.abs(run.e).mean(axis=0), rtol=1e-12)
+    assert float(values[names[1]]) == np.asarray(run.u).sum(axis=1).max()
+    result = tuning.tune(
+        case,
+        objective={"mean_absolute_error": 1.0},
+        limits={"largest_total_input": 9.0},
+        scenarios=(),
+        starts=1,
+        validation=0,
+    )
+    row = next(r for r in result.constraints if r["name"].startswith("largest_total_input"))
+    assert row["value"] <= 9.0 * (1 + 1e-6) and row["unit"] == "V"
+    assert result.objective["after"] < result.objective["before"]
+    assert main(["show", "cascaded/pi"]) == 0
+    assert "mean_absolute_error" in capsys.readouterr().out
+
+
+def test_a_paper_from_outside_is_found_listed_and_compared(added, tmp_path, capsys):
+    with pytest.raises(InputError, match="unknown"):
+        presets.find("doe2026/pi")
+    module = added("a paper")
+    case = presets.find("doe2026/pi")
+    assert case.uncertain == {"plant.drain": 0.05} and "doe2026/pi" in presets.names()
+    assert presets.load("doe2026").notes == tmp_path / "notes" / "doe2026.md"
+    assert main(["list"]) == 0 and "doe2026/pi" in capsys.readouterr().out
+    assert main(["show", "doe2026/pi"]) == 0 and "J. Doe" in capsys.readouterr().out
+    assert main(["simulate", "doe2026/pi", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["measures"]["max_level"][0] > 9.99
+    assert main(["compare", "doe2026"]) == 0
+    assert "reproduced" in capsys.readouterr().out
+    with pytest.raises(InputError, match="taken"):
+        presets.register(module.preset())
+
+
+@pytest.mark.parametrize("name", ["gouta2015/backstepping", "calofir/backstepping"])
+def test_a_language_from_outside_gives_the_voltages_of_the_simulation(added, name, capsys):
+    with pytest.raises(InputError, match=r"must be one of c, m$"):
+        export(presets.find(name), "py")
+    added("an export language")
+    assert main(["export", name, "--lang", "py", "--name", "own"]) == 0
+    code = {"math": math}
+    exec(capsys.readouterr().out, code)
+    case = presets.find(name)
+    case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt})
+    run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock))
+    r, dr, ddr = (np.stack(part, axis=1) for part in case.loop.reference.sample(case.clock))
+    s = code["own_begin"](run.x[0].tolist(), np.asarray(case.loop.actuator.initial).tolist())
+    for k, t in enumerate(run.t):
+        rows = [signal[k].tolist() for signal in (run.y, r, dr, ddr)]
+        u, s = code["own_step"](s, float(t), *rows)
+        np.testing.assert_allclose(u, run.applied[k], rtol=1e-12, atol=1e-12 * run.applied.max())
+
+
+def test_a_name_that_is_taken_is_refused():
+    with pytest.raises(InputError, match="'m' is taken"):
+        source.register("m", source.Language(lambda program, name, precision: ""))
+    with pytest.raises(InputError, match="must be named"):
+        one = presets.load("cascaded")
+        presets.register(type(one)(**{**vars(one), "paper": "other"}))
+    with pytest.raises(InputError, match="max_level"):
+        jaxtank.measures.register("max_level", catalogue.MEASURES["ise"])
+    with pytest.raises(InputError, match="letters"):
+        source.register("../c", source.LANGUAGES["c"])
