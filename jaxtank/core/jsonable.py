@@ -1,7 +1,7 @@
 """Values as JSON takes them. May import nothing of ours."""
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,17 +16,15 @@ def clean(value: Any) -> Any:
     {'h': [1.0, None]}
     """
     if isinstance(value, dict):
-        table: dict[Any, Any] = value
-        return {k: clean(v) for k, v in table.items()}
+        return {k: clean(v) for k, v in cast(dict[Any, Any], value).items()}
     if isinstance(value, (list, tuple)):
-        entries: Any = value
-        return [clean(v) for v in entries]
+        return [clean(v) for v in cast(list[Any], value)]
     if (
         isinstance(value, (np.ndarray, np.generic))
         or hasattr(value, "__jax_array__")
         or type(value).__module__.startswith("jax")
     ):
-        return clean(np.asarray(value).tolist())
+        return clean(np.asarray(cast(Any, value)).tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value

@@ -154,9 +154,9 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
         bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: steps too long: near empty the explicit step is"
-                f" unstable, the level of tank {tank + 1} rises by itself after"
-                f" t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
+                f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tank + 1}, which runs"
+                " empty: near empty the explicit step is unstable and its level rises by itself"
+                f" after t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
             )
 
 

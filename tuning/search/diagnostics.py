@@ -14,7 +14,7 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.step_size import StepWarning, check_run
+from jaxtank.loop.step_size import StepWarning, check_run, step_warnings
 from tuning.problem import scenarios as sc
 from tuning.uncertainty.distributions import Correlated
 from tuning.uncertainty.draws import Draws
@@ -39,13 +39,13 @@ def of_answer(problem, tuned, values, key=None):
     told = []
     for name, loop, clock, own in runs:
         found = step_warnings(loop, clock)
-        if found and (why := _thrown_up(loop, clock, own)):
+        if found and (why := _unstable(loop, clock, own)):
             return [f"{name}this answer's run is wrong, and so are its numbers: {why}"]
         told += [f"{name}{sentence}" for sentence in found]
     return told[:1]
 
 
-def _thrown_up(loop, clock, key):
+def _unstable(loop, clock, key):
     """What `check_run` says of the run of a loop; None where it is right."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StepWarning)  # the sentence says it
