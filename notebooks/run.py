@@ -1,11 +1,10 @@
 """Execute the notebooks of this folder, top to bottom.
 
 python notebooks/run.py            in full, and keep the outputs in the files
-python notebooks/run.py --fast     with JAXTANK_NOTEBOOK_FAST=1 (coarse steps, few starts), outputs thrown away
+python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts); the files stay as they are
 python notebooks/run.py 05 08      those alone, by the beginnings of their names
 """
 
-import os
 import re
 import subprocess
 import sys
@@ -16,6 +15,29 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
+# Parameters of a quick run, by the beginning of a notebook's name: they replace those of its cell tagged "parameters".
+FAST = {
+    "01": {"dt": "0.1", "starts, screening": "2, 8", "rigs": "16", "slow_cases": '("backstepping-slow",)'},
+    "02": {"dt": "0.1"},
+    "03": {"starts, screening": "1, 8", "size": "15", "heights": "[30.0, 33.0, 36.0]", "bound_heights": "[33.0]", "bound_iterations": "20"},
+    "04": {"dt": "0.05", "rates": "np.array([0.3, 3.0, 10.0])", "starts, screening": "1, 8"},
+    "05": {"size": "6", "kinds": '("hybrid",)', "screening": "2", "iterations": "2"},
+    "06": {"horizons": "np.geomspace(1.5, 60.0, 9)", "tps": "np.geomspace(0.1, 5.0, 7)", "poles": "np.linspace(0.0, 0.95, 5)", "orders": "(1, 4)"},
+    "07": {"rigs": "64", "sobol_samples": "16"},
+    "08": {"starts, plants, fresh": "1, 8, 64"},
+    "09": {"starts": "2", "samples, fresh, iterations": "4, 16, 4"},
+    "10": {"dt": "0.1", "starts, screening, validation": "1, 8, 8", "rigs": "32"},
+}
+
+
+def inject(notebook, values):
+    """Replace the assignments of `values` {names: source of the value} in the cell tagged "parameters"."""
+    (cell,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", ()))
+    for names, value in values.items():
+        cell.source, count = re.subn(f"^{re.escape(names)} = .*$", lambda _, line=f"{names} = {value}": line, cell.source, flags=re.M)
+        if count != 1:
+            raise KeyError(f"the parameters are assigned {count} times, not once: {names}")
+
 
 def main():
     fast = "--fast" in sys.argv[1:]
@@ -23,7 +45,6 @@ def main():
     paths = [p for p in sorted(Path(__file__).parent.glob("*.ipynb")) if not wanted or p.name.startswith(wanted)]
     if not paths:
         sys.exit(f"no notebook here begins with {' or '.join(wanted)}")
-    os.environ["JAXTANK_NOTEBOOK_FAST"] = "1" if fast else "0"
     if fast and len(paths) > 1:  # two at once, each in a process of its own
         alone = lambda path: subprocess.run([sys.executable, __file__, "--fast", path.name]).returncode
         with ThreadPoolExecutor(2) as pool:
@@ -31,6 +52,8 @@ def main():
     for path in paths:
         began = time.perf_counter()
         notebook = nbformat.read(path, as_version=4)
+        if fast:
+            inject(notebook, FAST[path.name[:2]])
         NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}}).execute()
         print(f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells ran in {time.perf_counter() - began:.0f} s")
         if not fast:

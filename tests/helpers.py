@@ -2,8 +2,20 @@
 (pyproject.toml), so that every test imports it by name.
 """
 
+import contextlib
 import dataclasses
+import io
+import json
 from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+from jaxtank.core.tree import parameters
+from jaxtank.presets import Free
+from tuning.cli import main
 
 ROOT = Path(__file__).parents[1]
 TESTS = ROOT / "tests"
@@ -55,3 +67,39 @@ def in_metres(plant):
         **{name: getattr(plant, name) * 1e-2**power for name, power in powers.items()},
         units=("m", "V"),
     )
+
+
+class Output(NamedTuple):
+    """What a command returned and printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self):
+        """The one object on stdout; refuses NaN and infinity, which are not JSON."""
+        return json.loads(self.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+def command(*words):
+    """Run the command in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main.main(list(words))
+    return Output(code, out.getvalue(), err.getvalue())
+
+
+def assert_same_case(a, b):
+    """Names, clocks, every leaf and static field, limits, free parameters and objective agree."""
+    assert (a.name, a.clock) == (b.name, b.clock)
+    # components, static fields, absent leaves
+    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)
+    assert parameters(a.loop).keys() == parameters(b.loop).keys()
+    for name, value in parameters(a.loop).items():
+        other = parameters(b.loop)[name]
+        assert np.shape(value) == np.shape(other) and np.array_equal(value, other), name
+    assert a.limits.keys() == b.limits.keys()
+    assert all(np.array_equal(limit, b.limits[measure]) for measure, limit in a.limits.items())
+    assert {n: Free(*s) for n, s in a.free.items()} == {n: Free(*s) for n, s in b.free.items()}
+    assert dict(a.objective) == dict(b.objective)

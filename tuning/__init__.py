@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from tuning.identification.design import compare_experiments as compare_experiments
     from tuning.identification.experiment import Log as Log
     from tuning.identification.experiment import log as log
-    from tuning.identification.fit import Identification as Identification
     from tuning.identification.fit import identify as identify
     from tuning.identification.problem import Estimation as Estimation
+    from tuning.identification.result import Identification as Identification
     from tuning.optimal_input.perfect_information import bound as bound
     from tuning.problem.bounds import Bound as Bound
     from tuning.problem.problem import Problem as Problem
@@ -60,7 +60,7 @@ _NAMES = {
     "Discrete": "tuning.uncertainty.distributions",
     "Ensemble": "tuning.uncertainty.result",
     "Estimation": "tuning.identification.problem",
-    "Identification": "tuning.identification.fit",
+    "Identification": "tuning.identification.result",
     "Log": "tuning.identification.experiment",
     "LogUniform": "tuning.uncertainty.distributions",
     "Normal": "tuning.uncertainty.distributions",

@@ -3,7 +3,7 @@
 Imports core only; may be imported by every folder.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, cast
 
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.fields import Meta, is_real, number
+from jaxtank.core.fields import is_real, number
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import walk
 
@@ -48,7 +48,7 @@ def check_leaves(
         check_value(name, value, meta)
 
 
-def check_value(name: str, value: Any, meta: Meta) -> None:
+def check_value(name: str, value: Any, meta: Mapping[str, Any]) -> None:
     """Check that every entry of a value is real, finite and within its range.
 
     Parameters
@@ -90,7 +90,7 @@ def check_value(name: str, value: Any, meta: Meta) -> None:
     raise InputError(_out_of_range(name, array[index], index, meta))
 
 
-def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Meta) -> str:
+def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[str, Any]) -> str:
     """The message for an entry that is not finite or out of range."""
     unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
     label = name + (f"[{','.join(map(str, index))}]" if index else "")
@@ -126,7 +126,8 @@ def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = Fals
     a, b = getattr(part, lower), getattr(part, upper)
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((a, b))):
         return
-    for i, (low, high) in enumerate(zip(np.ravel(a), np.ravel(b))):
+    pairs: list[tuple[float, float]] = list(zip(np.ravel(a).tolist(), np.ravel(b).tolist()))
+    for i, (low, high) in enumerate(pairs):
         if not (low <= high if equal else low < high):
             most = "at most" if equal else "below"
             raise InputError(

@@ -1,22 +1,24 @@
-"""Long runs piece by piece: what is known of every sample beforehand is then known of one piece at
-a time, and memory does not grow.
+"""The clock of a run, and its samples: all at once, or chunk by chunk in a long run.
 
-A piece can be asked for where every sample follows from its time alone. Methods of which that is so
-are marked `pointwise`; a run with any other, a recorded table or a law of the user's own that looks
-ahead, is made in one piece.
+What is known of every sample before the time loop starts (setpoints, noise) is then known of one
+chunk at a time, so that memory does not grow. A chunk can be asked for where every sample follows
+from its time alone; methods of which that is so are marked `pointwise`. A run with any other, such
+as recorded samples or a controller that looks ahead, is made in one chunk. Imports core only.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+import math
+from typing import Any, NamedTuple, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 
 from jaxtank.core.errors import InputError
 
-PIECE = 2**18  # samples
+CHUNK = 2**18  # samples
 # what is asked before the loop starts
 METHODS = ("sample", "windows", "since", "prepare", "inputs")
+<<<<<<< HEAD
 
 
 class Piece(NamedTuple):
@@ -54,19 +56,33 @@ def is_pointwise(part: Any) -> bool:
     )
 
 
+=======
+>>>>>>> main
 INTEGRATORS = ("rk4", "midpoint")
+LARGEST_RUN = 100_000_000  # samples
+
+F = TypeVar("F")
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Clock:
-    """When the law samples and how the plant is integrated between samples.
+    """Sampling of the controller, and integration of the plant between samples.
 
-    dt: sampling period of the law (Ts) [s]; duration: length of the run [s]; substeps: integrator
-        steps per sample [-];
-    integrator: "rk4" (fourth order) or "midpoint" (second order). Sample k is at t_k = k dt, k = 0
-        .. duration/dt rounded to
-    a whole number: a run is made of whole samples, and ends at (samples - 1) dt.
+    Sample k is at t_k = k dt, k = 0 .. duration/dt rounded to a whole number: a run is made of
+    whole samples, and ends at (samples - 1) dt.
+
+    Parameters
+    ----------
+    dt : sampling period of the controller (Ts) [s]
+    duration : length of the run [s]
+    substeps : integrator steps per sample [-]
+    integrator : "rk4" (fourth order) or "midpoint" (second order)
+
+    Examples
+    --------
+    >>> Clock(dt=0.5, duration=10.0).samples
+    21
     """
 
     dt: float = 0.01
@@ -82,60 +98,130 @@ class Clock:
         return round(self.duration / self.dt) + 1
 
 
+class Chunk(NamedTuple):
+    """Consecutive samples of a clock, given to a signal in place of the Clock; `first` is the index
+    of the first of them, and may be traced.
+    """
+
+    first: Any
+    samples: int
+    dt: float
+
+
+def indices(clock: Clock | Chunk) -> jax.Array:
+    """Return (samples,) indices of the samples.
+
+    Examples
+    --------
+    >>> indices(Chunk(first=2, samples=3, dt=0.5)).tolist()
+    [2, 3, 4]
+    """
+    return clock.first + cast(Any, jnp).arange(clock.samples)
+
+
+def sample_times(clock: Clock | Chunk) -> jax.Array:
+    """Return (samples,) times t_k = k dt [s], from the integer k: no drift over long runs.
+
+    Examples
+    --------
+    >>> sample_times(Clock(dt=0.5, duration=1.0)).tolist()
+    [0.0, 0.5, 1.0]
+    """
+    return indices(clock) * clock.dt
+
+
+def pointwise(method: F) -> F:
+    """Mark a method whose sample k depends on t_k and on sample k of its arguments alone.
+
+    Examples
+    --------
+    >>> @pointwise
+    ... def sample(self, clock):
+    ...     return jnp.sin(sample_times(clock))
+    >>> sample.pointwise
+    True
+    """
+    cast(Any, method).pointwise = True
+    return method
+
+
+def is_pointwise(part: Any) -> bool:
+    """Return whether a component, with all inside it, can be asked for its samples by chunks.
+
+    Examples
+    --------
+    >>> from jaxtank.signals import Constant, Table
+    >>> is_pointwise(Constant(level=[1.0])), is_pointwise(Table(values=[[1.0, 2.0]], period=1.0))
+    (True, False)
+    """
+    cls = cast(Any, type(part))
+    asked = [getattr(cls, name) for name in METHODS if hasattr(cls, name)]
+    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
+    return all(hasattr(method, "pointwise") for method in asked) and all(
+        map(is_pointwise, filter(dataclasses.is_dataclass, inside))
+    )
+
+
+def _meta(
+    unit: str,
+    doc: str,
+    low: float | None = None,
+    high: float | None = None,
+    strict: bool = False,
+    choices: tuple[str, ...] | None = None,
+) -> dict[str, Any]:
+    found = {"unit": unit, "doc": doc, "low": low, "high": high}
+    return {**found, "strict": strict, "choices": choices}
+
+
 CLOCK = {  # what each field is, as metadata of a component's fields
-    "dt": {
-        "unit": "s",
-        "doc": "sampling period of the law (Ts)",
-        "low": 0.0,
-        "high": None,
-        "strict": True,
-        "choices": None,
-    },
-    "duration": {
-        "unit": "s",
-        "doc": "length of the run",
-        "low": 0.0,
-        "high": None,
-        "strict": True,
-        "choices": None,
-    },
-    "substeps": {
-        "unit": "-",
-        "doc": "integrator steps per sample",
-        "low": 1,
-        "high": 10,
-        "strict": False,
-        "choices": None,
-    },
-    "integrator": {
-        "unit": "-",
-        "doc": "fourth order, or second",
-        "low": None,
-        "high": None,
-        "strict": False,
-        "choices": INTEGRATORS,
-    },
+    "dt": _meta("s", "sampling period of the controller (Ts)", low=0.0, strict=True),
+    "duration": _meta("s", "length of the run", low=0.0, strict=True),
+    "substeps": _meta("-", "integrator steps per sample", low=1, high=10),
+    "integrator": _meta("-", "fourth order, or second", choices=INTEGRATORS),
 }
 
-CLOCK_UNITS = {name: meta["unit"] for name, meta in CLOCK.items()}
-
-LARGEST_RUN = 100_000_000  # samples
+CLOCK_UNITS: dict[str, str] = {name: meta["unit"] for name, meta in CLOCK.items()}
 
 
 def check_clock(clock: Any) -> None:
+<<<<<<< HEAD
     """Raise InputError unless the clock describes a run."""
+=======
+    """Check that a clock describes a run.
+
+    Raises
+    ------
+    InputError, naming the field, its value and what is allowed.
+
+    Examples
+    --------
+    >>> check_clock(Clock(dt=2.0, duration=1.0))
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: clock.dt = 2 s: must be at most clock.duration = 1 s
+    """
+>>>>>>> main
     if not isinstance(clock, Clock):
         raise InputError(
             f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, as case.clock (first the"
             " loop, then the clock)"
         )
+    _check_duration(clock)
+    substeps: Any = clock.substeps
+    if not isinstance(substeps, int) or isinstance(substeps, bool) or not 1 <= substeps <= 10:
+        raise InputError(f"clock.substeps = {substeps!r}: must be a whole number from 1 to 10")
+    if clock.integrator not in INTEGRATORS:
+        raise InputError(
+            f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}"
+        )
+
+
+def _check_duration(clock: Clock) -> None:
+    """Raise InputError for a sampling period or duration that gives no run, or too long a one."""
     for name in ("dt", "duration"):
         value = getattr(clock, name)
-        if not (
-            isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and 0 < value < float("inf")
-        ):
+        real = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (real and 0 < value < math.inf):
             raise InputError(f"clock.{name} = {value!r} s: must be a finite number above 0 s")
     if clock.dt > clock.duration:
         raise InputError(
@@ -146,16 +232,4 @@ def check_clock(clock: Any) -> None:
         raise InputError(
             f"clock.duration / clock.dt = {clock.duration / clock.dt:.9g} samples: must be below"
             f" {LARGEST_RUN}"
-        )
-    if (
-        not isinstance(clock.substeps, int)
-        or isinstance(clock.substeps, bool)
-        or not 1 <= clock.substeps <= 10
-    ):
-        raise InputError(
-            f"clock.substeps = {clock.substeps!r}: must be a whole number from 1 to 10"
-        )
-    if clock.integrator not in INTEGRATORS:
-        raise InputError(
-            f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}"
         )

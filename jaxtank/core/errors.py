@@ -1,8 +1,9 @@
-"""Input validation errors: one line that names the thing, its value, what is allowed, and the
-nearest valid name.
+"""Errors of input validation: one line that names the thing, its value, what is allowed, and the
+nearest valid name. Imports nothing of ours; may be imported by every folder.
 """
 
 import difflib
+from collections.abc import Iterable
 
 
 class InputError(ValueError):
@@ -16,8 +17,8 @@ class EquilibriumError(InputError):
 
 
 class DataError(InputError):
-    """A log cannot be used. The message is one line and names file, line and column; the command
-    line ends with exit code 5.
+    """Experiment data cannot be used. The message is one line and names file, line and column; the
+    command line ends with exit code 5.
     """
 
 
@@ -27,8 +28,14 @@ class NonFiniteError(ArithmeticError):
     """
 
 
-def nearest(name, names, count=3):
-    """The `count` names closest to `name`, as the tail of an error message."""
+def nearest(name: str, names: Iterable[str], count: int = 3) -> str:
+    """Return the tail of an error message: the `count` names closest to `name`.
+
+    Examples
+    --------
+    >>> nearest("areas", ["rim", "area"], count=1)
+    '; nearest: area'
+    """
     names = list(names)
     close = (
         difflib.get_close_matches(name, names, n=count, cutoff=0.3)
@@ -41,6 +48,12 @@ def nearest(name, names, count=3):
     return f"; nearest: {', '.join(close)}" if close else ""
 
 
-def unknown(kind, name, names):
-    """An InputError for an unknown name, with the nearest valid ones."""
+def unknown(kind: str, name: str, names: Iterable[str]) -> InputError:
+    """Return an InputError for an unknown name, with the nearest valid ones.
+
+    Examples
+    --------
+    >>> print(unknown("parameter", "areas", ["area"]))
+    unknown parameter 'areas'; nearest: area
+    """
     return InputError(f"unknown {kind} {name!r}{nearest(name, names)}")

@@ -166,7 +166,7 @@ def _register(cls: type[Any], data: tuple[str, ...], meta: tuple[str, ...]) -> N
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
 
     def flatten(tree: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        values = vars(tree)
+        values = cast(dict[str, Any], vars(tree))
         return tuple(values[name] for name in data), tuple(values[name] for name in meta)
 
     def flatten_with_keys(tree: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -174,11 +174,13 @@ def _register(cls: type[Any], data: tuple[str, ...], meta: tuple[str, ...]) -> N
         return tuple(zip(keys, children)), static
 
     def unflatten(static: Iterable[Any], children: Iterable[Any]) -> Any:
-        tree = object.__new__(cls)
-        vars(tree).update(zip(data, children), **dict(zip(meta, static)))
+        tree: Any = object.__new__(cls)
+        values = cast(dict[str, Any], vars(tree))
+        values.update(zip(data, children), **dict(zip(meta, static)))
         return tree
 
-    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, cast(Any, unflatten), flatten)
+    # the stubs of jax leave types of keys open
+    cast(Any, jax.tree_util).register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
 def _converted(value: Any) -> Any:
@@ -228,7 +230,7 @@ def is_real(value: Any) -> bool:
         return all(is_real(v) for v in cast(Iterable[Any], value))
     kind = getattr(value, "dtype", None)
     if kind is None:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool)
+        return not isinstance(value, bool) and isinstance(value, numbers.Real)
     if kind == np.dtype(object):  # whole numbers of 2^64 and more, or anything
         return all(is_real(v) for v in np.ravel(value).tolist())
     # jnp: its own short floats too

@@ -1,4 +1,7 @@
-"""Files are written whole or not at all."""
+"""Reading and writing of files: each is written whole or not at all.
+
+Imports core only; may be imported by every folder.
+"""
 
 import contextlib
 import errno
@@ -13,30 +16,62 @@ from jaxtank.core.errors import InputError
 LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 
 LOCK = ".jaxtank.lock"
-"""What a run leaves in its folder while it lasts, and after a kill."""
+"""File that a run keeps in its folder while it lasts, and that stays after a kill."""
 
 ASIDE = ".jaxtank"
-"""How the names of files end that are not yet whole."""
+"""Suffix of files that are not yet complete."""
 
 
-def untouched(folder):
-    """True of a folder in which nothing was written but that a run had begun."""
+def untouched(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a run began in a folder and wrote nothing else there.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     Path(folder, LOCK).touch()
+    ...     untouched(folder)
+    True
+    """
     return os.path.isdir(folder) and os.listdir(folder) == [LOCK]
 
 
-def write_atomic(path, data):
-    """Write `data` (str or bytes) to `path` by way of a temporary file in the same folder; a link
-    is not followed.
+def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
+    """Write a file by way of a temporary one in the same folder; a link is not followed.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_atomic(Path(folder, "a.txt"), "text")
+    ...     Path(folder, "a.txt").read_text()
+    'text'
     """
     path = Path(path)
     write_together(path.parent, {path.name: data})
 
 
-def write_together(folder, files):
-    """Write {name: str or bytes} to `folder`: all of them are whole on the disk before the first
-    takes its place, so that a disk that is full leaves what was there as it was.
+def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | bytes]) -> None:
+    """Write several files to a folder, all of them or none.
+
+    All are complete on the disk before the first replaces an older one, so that a full disk leaves
+    what was there as it was.
+
+    Parameters
+    ----------
+    folder : existing folder
+    files : {name: text or bytes}
+
+    Raises
+    ------
+    OSError where a file cannot be written.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_together(folder, {"a.txt": "text", "b.bin": b"bytes"})
+    ...     sorted(os.listdir(folder))
+    ['a.txt', 'b.bin']
     """
-    folder, aside = Path(folder), []
+    folder, aside = Path(folder), list[tuple[str, Path]]()
     try:
         for name, data in files.items():
             if (folder / name).is_dir():
@@ -57,6 +92,7 @@ def write_together(folder, files):
         raise
 
 
+<<<<<<< HEAD
 def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[Path]:
     """Write {name: text or bytes} to `folder`, made if need be, all of them or none; return the
     paths. Raises InputError for a folder that cannot be written to.
@@ -76,19 +112,41 @@ def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[P
 
 def sweep(folder):
     """Remove the unfinished files that a killed run left in a folder."""
+=======
+def sweep(folder: str | os.PathLike[str]) -> None:
+    """Remove the incomplete files that a killed run left in a folder.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     Path(folder, f".a.txt.{ASIDE}").touch()
+    ...     sweep(folder)
+    ...     os.listdir(folder)
+    []
+    """
+>>>>>>> main
     for path in Path(folder).glob(f".*{ASIDE}"):
         with contextlib.suppress(OSError):
             path.unlink()
 
 
-def _umask():
+def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
 
 
-def check_folder(path):
-    """Raise InputError unless `path` is, or can become, a folder to write to. Nothing is made yet."""
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """Check that a path is, or can become, a folder to write to. Nothing is made yet.
+
+    Raises
+    ------
+    InputError, naming the path and what is in the way.
+
+    Examples
+    --------
+    >>> check_folder(tempfile.gettempdir())
+    """
     path = Path(path)
     if "\0" in str(path):
         raise InputError(f"--out {str(path)!r}: a name cannot hold the character NUL")
@@ -110,9 +168,24 @@ def check_folder(path):
         raise InputError(f"--out {str(path)!r}: no permission to write to {str(parent)!r}")
 
 
-def refusal(path, largest):
-    """Why a file is not to be read, in words, or None: it is a folder, a device or a pipe, which
-    may never end, or has more than `largest` bytes. Raises OSError where there is none.
+def refusal(path: str | os.PathLike[str], largest: int) -> str | None:
+    """Return why a file is not to be read, or None.
+
+    A folder, a device or a pipe, which may never end, is not read.
+
+    Parameters
+    ----------
+    path : the file
+    largest : the most bytes that are read
+
+    Raises
+    ------
+    OSError where there is no such file.
+
+    Examples
+    --------
+    >>> refusal(tempfile.gettempdir(), 10)
+    'is not a file'
     """
     found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
@@ -124,8 +197,24 @@ def refusal(path, largest):
     )
 
 
-def read_text(path, kind):
-    """The text of a file of at most 4 MiB; InputError if it is missing, too large, or not UTF-8."""
+def read_text(path: str | os.PathLike[str], kind: str) -> str:
+    """Return the text of a file of at most 4 MiB.
+
+    Parameters
+    ----------
+    path : the file
+    kind : what messages call it, as in "rig file"
+
+    Raises
+    ------
+    InputError if it is missing, too large, or not UTF-8.
+
+    Examples
+    --------
+    >>> read_text("missing.toml", "rig file")
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: rig file 'missing.toml' does not exist
+    """
     path = Path(path)
     if not path.exists():
         raise InputError(f"{kind} {str(path)!r} does not exist")

@@ -1,4 +1,7 @@
-"""The records that cross rooms, and the clock."""
+"""Records that sensors, observers, controllers and measures exchange; check of a random key.
+
+Imports core only; may be imported by every folder.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,8 +14,24 @@ from jaxtank.core.errors import InputError
 
 
 def check_key(key: Any) -> None:
+<<<<<<< HEAD
     """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the
     older one, a row of unsigned integers; traced ones and placeholders too.
+=======
+    """Check a random key: None, or one key of jax, typed or a row of unsigned integers.
+
+    Raises
+    ------
+    InputError for anything else; traced keys and placeholders pass.
+
+    Examples
+    --------
+    >>> check_key(jax.random.key(0))
+    >>> check_key(0)
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: key is a int: must be one random key, as jax.random.key(0), or \
+None where there is no noise
+>>>>>>> main
     """
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
     typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
@@ -21,16 +40,16 @@ def check_key(key: Any) -> None:
     ):
         return
     if key is not None:
-        told = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
+        given = f"has shape {key.shape}" if typed else f"is a {type(key).__name__}"
         raise InputError(
-            f"key {told}: must be one random key, as jax.random.key(0), or None where there is no"
+            f"key {given}: must be one random key, as jax.random.key(0), or None where there is no"
             " noise"
         )
 
 
 class Tick(NamedTuple):
-    """What a law and an observer are told at sample k besides measurements: tuples of scalars, one
-    per output.
+    """What a controller and an observer know at sample k besides measurements: tuples of scalars,
+    one per output.
     """
 
     t: Any  # time [s]
@@ -38,12 +57,12 @@ class Tick(NamedTuple):
     dr: tuple[Any, ...]  # its rate r' [cm/s]
     ddr: tuple[Any, ...]  # its second derivative r'' [cm/s^2]
     dt: Any = 0.0  # sampling period Ts [s]
-    plan: Any = ()  # what the law prepared for this sample before the loop started
-    own: Any = ()  # this sample of the signals that are the law's own (`Controller.inputs`)
+    plan: Any = ()  # what the controller prepared for this sample before the loop started
+    own: Any = ()  # this sample of the controller's own signals (`Controller.inputs`)
 
 
 class Estimate(NamedTuple):
-    """What an observer hands to a law: tuples of scalars."""
+    """What an observer gives to a controller: tuples of scalars."""
 
     x: Sequence[Any]  # level estimate, one per tank [cm]
     # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
@@ -51,7 +70,7 @@ class Estimate(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """The world at t_k, before it moves: tuples of scalars."""
+    """State and signals at t_k, before the plant moves: tuples of scalars."""
 
     t: Any  # time [s]
     x: Sequence[Any]  # levels, one per tank [cm]
@@ -61,9 +80,34 @@ class Sample(NamedTuple):
     d_hat: Sequence[Any]
     r: tuple[Any, ...]  # setpoint, one per output [cm]
     e: tuple[Any, ...]  # tracking error of the true output, x - r, one per output [cm]
+<<<<<<< HEAD
     command: Sequence[Any]  # what the law asked for, one per pump [V]
     applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
     u: Sequence[Any]  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
     spilled: Sequence[Any]  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
     shortfall: Sequence[Any] = ()
+=======
+    command: Sequence[Any]  # what the controller commanded, one per pump [V]
+    applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
+    u: Sequence[Any]  # inputs at the plant over [t_k, t_k + dt), one per pump [V]
+    spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]
+    # volume that a negative inflow could not take from each tank in that time [cm^3]
+    shortfall: Sequence[Any] = ()
+
+
+class Trajectory(NamedTuple):
+    """A run as arrays with one row per saved sample; row k is at t_k, before the plant moves."""
+
+    t: Any  # (rows,) [s]
+    x: Any  # (rows, tanks) [cm]
+    y: Any  # (rows, tanks) [cm]
+    x_hat: Any  # (rows, tanks) [cm]
+    d_hat: Any  # (rows, tanks) [cm/s]
+    r: Any  # (rows, outputs) [cm]
+    e: Any  # (rows, outputs) [cm]
+    command: Any  # (rows, pumps) [V]
+    applied: Any  # (rows, pumps) [V]
+    u: Any  # (rows, pumps) [V]
+    spilled: Any  # (rows, tanks) overflow since the start [cm^3]
+>>>>>>> main

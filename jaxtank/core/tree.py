@@ -297,7 +297,11 @@ def _real(old: Any, value: Any, name: str, on_device: bool) -> Any:
     """`value` as an array of floats; InputError for what is no real number."""
     try:
         if is_real(value):  # numpy would make 1 of True, 3 of "3", and drop what is imaginary
-            return jnp.asarray(value, dtype=jnp.result_type(float)) if on_device else number(value)
+            return (
+                cast(Any, jnp).asarray(value, dtype=jnp.result_type(float))
+                if on_device
+                else number(value)
+            )
     except (TypeError, ValueError, OverflowError):
         pass
     wanted = "must be a real number" + ("" if np.ndim(old) == 0 else " or a list of real numbers")

@@ -1,5 +1,5 @@
-"""Units of a rig. Metadata is written for centimetres and volts; a rig in other units says so, and
-every printed unit follows.
+"""Units of a rig. Metadata is written for centimetres and volts; a rig in other units declares
+them, and every printed unit follows. Imports core only; may be imported by every folder.
 
 `plant.units` is (length, pump input): ("cm", "V") unless its paper counts otherwise, as in ("m",
 "m^3/s").
@@ -15,12 +15,26 @@ LONGEST = 40
 """Characters of a unit at most."""
 
 
-def check_unit(where, text):
+def check_unit(where: str, text: str) -> str:
     """Return `text` if it is a unit, such as "cm", "L/min", "m^3/s" or "cm^3/(s V)".
 
     A unit is names joined by *, / or a space, each with ^ and a number where it has an exponent; a
     product may stand in brackets. A name is letters, digits and _, and begins with a letter; "%",
-    "1" and "-" are units too. Raises InputError, with `where` for its name, for any other text.
+    "1" and "-" are units too.
+
+    Parameters
+    ----------
+    where : what messages call it
+    text : the unit
+
+    Raises
+    ------
+    InputError for any other text.
+
+    Examples
+    --------
+    >>> check_unit("column h1", "L/min")
+    'L/min'
     """
     name = r"(?:[^\W\d_]\w*|°[CF]|%|1)"
     factor = rf"{name}(?:\^-?\d+(?:\.\d+)?)?"
@@ -37,11 +51,24 @@ def check_unit(where, text):
 
 
 def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
+<<<<<<< HEAD
     """`unit`, written with "cm" for the length, "V" for the pump input and "volt" for a sensor's
     volt, in the units of a rig.
+=======
+    """Return a unit in the units of a rig.
+>>>>>>> main
 
-    A unit of several factors is put in brackets where it is one of several itself: V^2 of ("m",
-    "m^3/s") is (m^3/s)^2.
+    A unit of several factors is put in brackets where it is one of several itself.
+
+    Parameters
+    ----------
+    unit : written with "cm" for the length, "V" for the pump input and "volt" for a sensor's volt
+    units : (length, pump input) of the rig
+
+    Examples
+    --------
+    >>> local("cm/V", ("m", "m^3/s"))
+    'm/(m^3/s)'
     """
     length, drive = units
     if drive == f"{length}^3/s" and unit == "cm^3/(s V)":  # the input is the flow itself
@@ -53,6 +80,6 @@ def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
     )
 
 
-def _factor(unit, alone):
+def _factor(unit: str, alone: bool) -> str:
     """`unit` as one factor of another."""
     return unit if alone or not re.search(r"[\s/*^]", unit) else f"({unit})"

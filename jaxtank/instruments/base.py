@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxtank.core.clock import PIECE, Clock
+from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.numerics import clip
 
 
@@ -95,11 +95,11 @@ class Sensor(abc.ABC):
         )
         if piece is not None:
             deviates = drawn(jax.random.fold_in(key, piece), samples)
-        elif samples <= PIECE:
+        elif samples <= CHUNK:
             deviates = drawn(key, samples)
         else:
-            whole, last = divmod(samples, PIECE)
-            chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), PIECE))(jnp.arange(whole))
+            whole, last = divmod(samples, CHUNK)
+            chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), CHUNK))(jnp.arange(whole))
             remainder = drawn(jax.random.fold_in(key, whole), last)
             deviates = jnp.concatenate(
                 [jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1

@@ -1,1 +1,1 @@
-"""Conversion to other libraries: python-control, Gymnasium, pandas and xarray."""
+"""Conversion to other libraries: python-control, Gymnasium, pandas and xarray, for users."""

@@ -1,5 +1,6 @@
-"""A rig as a Gymnasium environment, for those who would rather learn a controller than tune one
-(pip install ".[gym]").
+"""A rig as a Gymnasium environment, for reinforcement learning (pip install ".[gym]").
+
+Imports loop; imported as `jaxtank.environment` where gymnasium is installed.
 """
 
 import functools
@@ -19,25 +20,40 @@ from jaxtank.loop.step import move
 from jaxtank.loop.validation import check
 
 PENALTY = 100.0
-"""What a rim passed by one unit of length costs more than an error of as much [-]."""
+"""Weight of a rise past a rim beside a tracking error of the same size [-]."""
 
 
 class TankEnv(gymnasium.Env):
-    """One episode is one run of a case, without its controller: the action is what the pumps are
-    given.
+    """An environment of Gymnasium whose episode is one run of a case without its controller.
 
-    action: (pumps,) inputs scaled to [-1, 1] over the pumps' limits; observation: readings,
-    setpoints and their rates, each as a share of the highest rim (rates per 100 s); reward: minus
-    the mean squared error of the outputs over the rim's square, less 100 times the squared rise
-    past the rims as the same share. Truncated at the end of the clock; terminated where a level is
-    not finite. info: {"t" [s], "x" (tanks,), "y" (tanks,), "u" (pumps,), "e" (outputs,), "spilled"
-    (tanks,) [cm^3]} in the rig's units: levels, readings, inputs at the plant, errors, and the
-    volume lost over each rim so far.
+    Action: (m,) inputs of the pumps, scaled to [-1, 1] over their limits. Observation:
+    (n + 2 outputs,) readings, setpoints and their rates, each as a share of the highest rim (rates
+    per 100 s). Reward [-]: -mean(e^2)/R^2 - 100 sum(max(h - rim, 0)^2)/R^2, R the highest rim.
+    Truncated at the end of the clock; terminated where a level is not finite. info: {"t" [s],
+    "x" (n,) levels, "y" (n,) readings, "u" (m,) inputs at the plant, "e" (outputs,) errors,
+    "spilled" (n,) volume that has overflowed each rim [cm^3]} in the rig's units.
 
     Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise, offset,
     ADC) and reference are the case's own: with the inputs of `jaxtank.simulate(case.loop,
     case.clock, key=jax.random.key(seed))` (its `applied`) as actions, the episode after
-    reset(seed=seed) is that run, to rounding. Raises InputError for a case that cannot be run.
+    reset(seed=seed) is that run, to rounding.
+
+    Parameters
+    ----------
+    case : Case
+
+    Raises
+    ------
+    InputError for a case that cannot be run.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> env = TankEnv(presets.find("cascaded/pi"))
+    >>> env.action_space.shape, env.observation_space.shape
+    ((1,), (4,))
+    >>> observation, info = env.reset(seed=0)  # doctest: +SKIP
+    >>> observation, reward, terminated, truncated, info = env.step([0.5])  # doctest: +SKIP
     """
 
     metadata = {"render_modes": []}
@@ -56,8 +72,8 @@ class TankEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (plant.pumps,), np.float64)
 
     def reset(self, *, seed=None, options=None):
-        """(observation, info) at the beginning of an episode; without a seed its noise is the next
-        of the last seed's.
+        """Return (observation, info) at the beginning of an episode; without a seed its noise is
+        the next of the last seed's.
         """
         super().reset(seed=seed)
         loop = self.case.loop
@@ -72,33 +88,33 @@ class TankEnv(gymnasium.Env):
         self.y = _array(y)
         self.u = np.asarray(loop.actuator.initial, dtype=float)
         self.spilled = np.zeros(len(self.x))
-        return self._seen(), self._told()
+        return self._observation(), self._info()
 
     def step(self, action):
-        """(observation, reward, terminated, truncated, info) a sample later."""
+        """Return (observation, reward, terminated, truncated, info) a sample later."""
         loop = self.case.loop
-        asked = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
+        wanted = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
             self.high - self.low
         )
         self.state, y, u, spilled = _advance(
-            loop, self.clock, self.inputs, self.state, tuple(asked)
+            loop, self.clock, self.inputs, self.state, tuple(wanted)
         )
         self.x, self.y, self.u = map(_array, (self.state.x, y, u))
         self.spilled = self.spilled + _array(spilled)
         self.k = min(self.k + 1, self.clock.samples - 1)
         error = self._error() / self.size
         past = np.maximum(self.x - np.asarray(loop.plant.rim), 0.0) / self.size
-        broken = not np.all(np.isfinite(self.x))
-        reward = -1e6 if broken else -float(np.mean(error**2) + PENALTY * np.sum(past**2))
-        return self._seen(), reward, broken, self.k == self.clock.samples - 1, self._told()
+        diverged = not np.all(np.isfinite(self.x))
+        reward = -1e6 if diverged else -float(np.mean(error**2) + PENALTY * np.sum(past**2))
+        return self._observation(), reward, diverged, self.k == self.clock.samples - 1, self._info()
 
     def _error(self):
         return self.x[list(self.case.loop.plant.outputs)] - self.r[self.k]
 
-    def _seen(self):
+    def _observation(self):
         return np.concatenate([self.y, self.r[self.k], 100.0 * self.rate[self.k]]) / self.size
 
-    def _told(self):
+    def _info(self):
         found = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
         return {"t": self.k * self.clock.dt, "e": self._error(), **found}
 
@@ -113,20 +129,20 @@ def _begin(loop, clock, key):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _readings(loop, clock, every, state):
+def _readings(loop, clock, samples, state):
     """((tanks,) readings of a state, the state after them); of the last sample also after it."""
-    y, sensor = loop.sensor.step(state.sensor, state.x, _now(every, state).xi, clock.dt)
+    y, sensor = loop.sensor.step(state.sensor, state.x, _now(samples, state).xi, clock.dt)
     return y, state._replace(sensor=sensor)
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _advance(loop, clock, every, state, asked):
-    """(state, readings, inputs at the plant, volumes lost) a sample later."""
-    applied = tuple(jnp.asarray(v, dtype=state.x[0].dtype) for v in asked)
-    state, u, spilled, _ = move(loop, clock, state, applied, _now(every, state))
-    y, state = _readings(loop, clock, every, state)
+def _advance(loop, clock, samples, state, wanted):
+    """(state, readings, inputs at the plant, volumes that overflowed) a sample later."""
+    applied = tuple(jnp.asarray(v, dtype=state.x[0].dtype) for v in wanted)
+    state, u, spilled, _ = move(loop, clock, state, applied, _now(samples, state))
+    y, state = _readings(loop, clock, samples, state)
     return state, y, u, spilled
 
 
-def _now(every, state):
-    return jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, state.k, keepdims=False), every)
+def _now(samples, state):
+    return jax.tree.map(lambda a: jax.lax.dynamic_index_in_dim(a, state.k, keepdims=False), samples)

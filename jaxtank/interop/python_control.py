@@ -1,4 +1,7 @@
-"""Interoperability: a python-control system of any rig, the columns of a run for pandas or xarray."""
+"""Conversion of a rig to python-control, and of the columns of a run to pandas or xarray.
+
+Imports analysis and core; imported by users.
+"""
 
 import numpy as np
 
@@ -27,6 +30,14 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
     ------
     InputError : python-control is not installed (pip install control), an output is no tank of
         the rig, or the operating point is missing, given twice or not finite.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> plant = presets.find("mirakhorli/sfc").loop.plant
+    >>> system = to_control(plant, setpoints=(12.0, 12.0))  # doctest: +SKIP
+    >>> system.nstates, system.ninputs, system.noutputs  # doctest: +SKIP
+    (4, 2, 2)
     """
     try:
         import control
@@ -38,6 +49,21 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
             f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to"
             f" {plant.tanks - 1}; steady levels are given as setpoints=(...)"
         )
+    levels, inputs = _operating_point(plant, setpoints, levels, inputs)
+    A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
+    return control.ss(
+        A,
+        B,
+        np.eye(plant.tanks)[list(outputs)],
+        np.zeros((len(outputs), plant.pumps)),
+        states=[f"h{i + 1}" for i in range(plant.tanks)],
+        inputs=[f"pump{j + 1}" for j in range(plant.pumps)],
+        outputs=[f"y_h{i + 1}" for i in outputs],
+    )
+
+
+def _operating_point(plant, setpoints, levels, inputs):
+    """(levels (n,), inputs (m,)) of a steady state; InputError unless it is given in one way."""
     if (setpoints is None) == (levels is None) or (levels is None) != (inputs is None):
         raise InputError(
             "to_control: give setpoints=(...), steady levels of the controlled tanks, or both"
@@ -51,12 +77,9 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
             )
         levels, inputs = equilibrium(plant, setpoints)
     for name, value, size in (("levels", levels, plant.tanks), ("inputs", inputs, plant.pumps)):
-        if (
-            value is None
-            or np.shape(value) != (size,)
-            or not np.all(np.isfinite(np.asarray(value, dtype=float)))
-        ):
+        if np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")
+<<<<<<< HEAD
     A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
     return control.ss(
         A,
@@ -67,3 +90,60 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
         inputs=[f"pump{j + 1}" for j in range(plant.pumps)],
         outputs=[f"y_h{i + 1}" for i in outputs],
     )
+=======
+    return levels, inputs
+
+
+FIELDS = (
+    ("h", "x", "cm"),
+    ("y", "y", "cm"),
+    ("h_hat", "x_hat", "cm"),
+    ("r", "r", "cm"),
+    ("u", "u", "V"),
+    ("command", "command", "V"),
+    ("spilled", "spilled", "cm^3"),
+    ("d_hat", "d_hat", "cm/s"),
+)
+"""Columns of a run: (name, field of `Trajectory`, unit)."""
+
+
+def columns(run, units=("cm", "V"), dimension=None) -> dict[str, Any]:
+    """Return the columns of a Trajectory, for pandas or xarray.
+
+    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and the
+    volume that overflowed each rim.
+
+    Parameters
+    ----------
+    run : Trajectory, as `jaxtank.simulate` returns it.
+    units : (length, pump input) of the rig, `loop.units`.
+    dimension : None, or the name of the one dimension that all columns share in xarray.
+
+    Returns
+    -------
+    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
+    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
+    `xarray.Dataset(columns(run, dimension="t"))`.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> case = presets.find("cascaded/pi")
+    >>> run = jaxtank.simulate(case.loop, jaxtank.Clock(dt=4.0, duration=8.0))
+    >>> columns(run, case.loop.units)["t [s]"].tolist()
+    [0.0, 4.0, 8.0]
+    """
+    found = {("t", "s"): np.asarray(run.t)}
+    for name, field, unit in FIELDS:
+        values = np.asarray(getattr(run, field))
+        found |= {
+            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
+        }
+    if dimension is None:
+        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
+    return {
+        dimension if name == "t" else name: (dimension, values, {"units": unit})
+        for (name, unit), values in found.items()
+    }
+>>>>>>> main

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
-from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import (
@@ -243,11 +243,23 @@ def evaluate_compiled(
 
     carry: Any = (initial(loop, clock), ms.start(run, names))
     if checkpoint:
+<<<<<<< HEAD
         carry = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
     elif clock.samples > PIECE and is_pointwise(loop):
         whole, left = divmod(clock.samples, PIECE)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
         carry = batch(carry, whole, left)[0] if left else carry
+=======
+        state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
+    elif clock.samples > CHUNK and is_pointwise(loop):
+        whole, rest = divmod(clock.samples, CHUNK)
+        piece = lambda c, number, samples=CHUNK: (
+            scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0],
+            None,
+        )
+        carry = jax.lax.scan(piece, carry, jnp.arange(whole))[0]
+        state, acc = piece(carry, whole, rest)[0] if rest else carry
+>>>>>>> main
     else:
         carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
     state, acc = carry

@@ -1,5 +1,6 @@
-"""A run as a moving picture: the tanks of the rig filling and emptying, setpoints, what the pumps
-get, and the time.
+"""A run as an animation: levels of all tanks, setpoints, inputs of the pumps, and the time.
+
+Imported by reports and notebooks.
 """
 
 import hashlib
@@ -15,50 +16,78 @@ from matplotlib.patches import Rectangle
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
 from jaxtank.plots.layout import place
-from jaxtank.plots.responses import PUMPS, WATER, styled
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
+from jaxtank.plots.style import PUMPS, WATER, styled
 
 RATE = 12
-"""Pictures a second: enough for liquid, which moves slowly."""
+"""Pictures per second: enough for liquid, which moves slowly."""
 
 LONGEST = 60.0
-"""Of a moving picture [s]."""
+"""Of an animation [s]."""
 
 
 def animate(loop, trajectory, path, seconds=6):
-    """Write the run as a GIF of `seconds` [s] to `path`, whole or not at all; returns the path.
+    """Write a run as a GIF and return its path; the file is complete or not there.
 
-    trajectory: of `jaxtank.simulate(loop, ...)`. Needs Pillow, which matplotlib brings along.
-    Raises InputError for a length that is not between 1 and 60 s, for a trajectory of another rig,
-    and where `path` does not end in .gif.
+    It needs Pillow, which matplotlib installs.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    trajectory : of `jaxtank.simulate(loop, ...)`
+    path : ends in .gif
+    seconds : duration of the animation, 1 to 60 [s]
+
+    Raises
+    ------
+    InputError
+        For another duration or ending, and for a trajectory of another rig.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     animate(loop, run, Path(folder) / "run.gif", seconds=1).name
+    'run.gif'
     """
     path = Path(path)
     if path.suffix.lower() != ".gif":
-        raise InputError(f"animation {str(path)!r}: is written as a GIF; let its name end in .gif")
+        raise InputError(f"animation {str(path)!r}: is written as a GIF: its name must end in .gif")
     with tempfile.TemporaryDirectory() as folder, styled():
-        film = _film(loop, trajectory, seconds)
-        film.save(Path(folder) / "run.gif", writer=PillowWriter(fps=RATE), dpi=80)
-        plt.close(film._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
+        animation = _animation(loop, trajectory, seconds)
+        animation.save(Path(folder) / "run.gif", writer=PillowWriter(fps=RATE), dpi=80)
+        plt.close(animation._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
         write_atomic(path, (Path(folder) / "run.gif").read_bytes())
     return path
 
 
 def to_html(loop, trajectory, seconds=6):
-    """The run as an HTML fragment with buttons to play, stop and step, for a notebook:
-    `IPython.display.HTML(to_html(...))`.
+    """Return a run as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook.
 
-    Everything is in it: no network is asked for fonts or scripts. Arguments and errors as in
-        `animate`.
+    It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
+    `animate`.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
+    >>> "<link" in to_html(loop, run, seconds=1)
+    False
     """
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
-        film = _film(loop, trajectory, seconds)
-        page = film.to_jshtml(fps=RATE)
-        plt.close(film._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
+        animation = _animation(loop, trajectory, seconds)
+        page = animation.to_jshtml(fps=RATE)
+        plt.close(animation._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
     # matplotlib takes the pictures on its buttons from the network
     page = re.sub(r"<link\b[^>]*>\s*", "", page)
     for name, sign in SIGNS.items():
         page = re.sub(rf'<i class="fa [^"]*{name}"></i>', sign, page)
-    # ids by content and not by chance, so that the same run gives the same page
+    # ids from the content instead of random ones, so that the same run gives the same page
     for chance in sorted(set(re.findall(r"[0-9a-f]{32}", page))):
         if f"anim{chance}" in page:
             page = page.replace(
@@ -78,10 +107,10 @@ SIGNS = {
     "fa-fast-forward": "&gt;|",
     "fa-plus": "+",
 }
-"""What stands on the buttons of `to_html`."""
+"""Labels of the buttons of `to_html`."""
 
 
-def _film(loop, trajectory, seconds):
+def _animation(loop, trajectory, seconds):
     """A FuncAnimation of about seconds * RATE pictures, evenly spaced in time."""
     if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
         raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
@@ -99,8 +128,8 @@ def _film(loop, trajectory, seconds):
     figure = plt.figure(figsize=(4.6, min(6.0, 4.6 * high / wide + 0.4)))
     ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
     schematic(ax, loop.plant)
-    for words in ax.texts:
-        words.set_path_effects(HALO)
+    for text in ax.texts:
+        text.set_path_effects(HALO)
     clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=10)
     water, marks, bars = _moving(ax, loop, where)
     low, top = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
@@ -126,7 +155,7 @@ BAR = 0.6
 
 
 def _moving(ax, loop, where):
-    """The artists that move: water in each tank, the marks of the setpoints, a bar for each pump."""
+    """The artists that move: water in each tank, marks of setpoints, a bar for each pump."""
     water, bars = [], []
     for box in where.boxes:
         water.append(

@@ -1,22 +1,38 @@
-"""Pictures of what lies behind a run and its limits: one function each, drawn on given matplotlib
-axes and returning them.
+"""Pictures of phase planes, saturation, estimates, margins and trade-offs.
+
+Each function draws on given matplotlib axes and returns them.
 """
 
 import numpy as np
 
-from jaxtank.plots.responses import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240
-"""Slices of time in the strips of `saturation`; each is as dark as the share of it that was spent
-at a limit.
-"""
+"""Intervals of time in a strip of `saturation`."""
 
 
 def phase(ax, trajectories, tanks, rims=None, unit="cm"):
-    """Level of one tank over that of another [unit], one line per {name: (Trajectory, colour,
-    style)}; dots where they begin, squares where
-    they end. tanks: (across, up); rims: (tanks,) [unit], what lies past them shaded where a line
-        comes near.
+    """Draw the level of one tank over that of another; dots at the start, squares at the end.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    trajectories : {name: (Trajectory, colour, line style)}
+    tanks : (index on the horizontal axis, index on the vertical axis)
+    rims : (tanks,) [unit] or None; what lies past them is shaded where a line comes near
+    unit : of levels
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from types import SimpleNamespace
+    >>> run = SimpleNamespace(x=np.ones((3, 2)))
+    >>> phase(Figure().gca(), {"run": (run, "C0", "-")}, (0, 1)).get_title()
+    'tanks 1 and 2'
     """
     across, up = tanks
     for name, (run, colour, style) in trajectories.items():
@@ -49,17 +65,37 @@ def phase(ax, trajectories, tanks, rims=None, unit="cm"):
 
 
 def saturation(ax, runs, low, high):
-    """When each pump was commanded past its limits: a strip per pump and run, up for the upper
-    limit, down for the lower, as tall as the share of each slice of time; the shares of the whole
-    run beside it. runs: {name: Trajectory}; low, high: (pumps,) [rig's unit].
+    """Draw when each pump was commanded past its limits, in a strip per pump and run.
+
+    A strip goes up for the upper limit and down for the lower one; its height is the share of each
+    interval of time, and the label gives the shares of the whole run.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    runs : {name: Trajectory}
+    low, high : (pumps,) limits [unit of the inputs]
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from types import SimpleNamespace
+    >>> run = SimpleNamespace(t=np.arange(4.0), command=np.array([[5.0], [15.0], [15.0], [5.0]]))
+    >>> ax = saturation(Figure().gca(), {"run": run}, [0.0], [12.0])
+    >>> [label.get_text() for label in ax.get_yticklabels()]
+    ['pump 1\\n50 % up, 0 % down']
     """
-    names, places = [], []
+    names, heights = [], []
     for j in range(len(low)):
         for k, (name, run) in enumerate(runs.items()):
             y = -(j * (len(runs) + 0.4) + k)
-            places.append(y)
-            asked, t = np.asarray(run.command)[:, j], np.asarray(run.t)
-            over, under = asked > float(high[j]), asked < float(low[j])
+            heights.append(y)
+            command, t = np.asarray(run.command)[:, j], np.asarray(run.t)
+            over, under = command > float(high[j]), command < float(low[j])
             names.append(
                 "pump"
                 f" {j + 1}{f', {plain(name)}' if len(runs) > 1 else ''}\n{_percent(over.mean())}"
@@ -76,14 +112,14 @@ def saturation(ax, runs, low, high):
                     color=colour,
                     linewidth=0,
                 )
-    for colour, words in ((AFTER, "past the upper limit"), (BEFORE, "past the lower limit")):
-        ax.fill_between([], [], color=colour, label=words)
-    ax.set_yticks(places, names)
+    for colour, label in ((AFTER, "past the upper limit"), (BEFORE, "past the lower limit")):
+        ax.fill_between([], [], color=colour, label=label)
+    ax.set_yticks(heights, names)
     ax.grid(False, axis="y")
     ax.set(
         xlabel="time [s]",
         title="commands that the pumps could not follow",
-        ylim=(min(places) - 0.6, max(places) + 0.6),
+        ylim=(min(heights) - 0.6, max(heights) + 0.6),
     )
     return ax
 
@@ -93,7 +129,7 @@ def _percent(share):
 
 
 def _slices(t, mask):
-    """(edges [s], share of each slice of time in which the mask holds)."""
+    """(edges of intervals [s], share of each in which the mask holds)."""
     count = min(SLICES, len(t))
     edges = np.linspace(t[0], t[-1], count + 1)
     index = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, count - 1)
@@ -103,8 +139,27 @@ def _slices(t, mask):
 
 
 def estimate(ax, run, tank, unit="cm"):
-    """What the observer believes of one level, over what is measured and what is true [unit], over
-    time [s].
+    """Draw the estimate of one level, with the measured and the true one.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    run : Trajectory
+    tank : index of the tank
+    unit : of levels
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from types import SimpleNamespace
+    >>> h = np.ones((3, 1))
+    >>> run = SimpleNamespace(t=np.arange(3.0), x=h, y=h + 0.1, x_hat=h)
+    >>> len(estimate(Figure().gca(), run, 0).lines)
+    3
     """
     if np.any(run.y[:, tank] != run.x[:, tank]):
         ax.plot(
@@ -125,12 +180,30 @@ def estimate(ax, run, tank, unit="cm"):
 
 
 def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
-    """Estimated disturbance of one level's rate [unit] over time [s], which lumps all that the
-    observer's model leaves out, and what flows in
-    unasked, inflow: (rows,) [unit], where it is known.
+    """Draw the estimated disturbance of one level's rate, which holds all model errors.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    run : Trajectory
+    tank : index of the tank
+    inflow : (rows,) true inflow disturbance [unit] where it is known, or None
+    unit : of the rate
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from types import SimpleNamespace
+    >>> run = SimpleNamespace(t=np.arange(3.0), d_hat=np.zeros((3, 1)))
+    >>> disturbance(Figure().gca(), run, 0).get_title()
+    'disturbance of tank 1'
     """
     if inflow is not None:
-        ax.plot(run.t, inflow, color=REFERENCE, linewidth=1.3, label="disturbing inflow")
+        ax.plot(run.t, inflow, color=REFERENCE, linewidth=1.3, label="inflow disturbance")
     ax.plot(
         run.t,
         run.d_hat[:, tank],
@@ -145,14 +218,29 @@ def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
 
 
 MANY = 16
-"""Limits in a picture of margins at most: those with the least room."""
+"""Limits in a picture of margins at most: those with the smallest margins."""
 
 
 def margins(ax, rows):
-    """How far each limit is off, as a share of it [%], the nearest at the top; broken ones to the
-    left of zero.
+    """Draw the margin of each limit as a share of it, the smallest at the top.
 
-    rows: dicts with name, limit, value, margin, unit, as `TuningResult.constraints` gives them.
+    Violated limits are to the left of zero.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    rows : list of {"name", "limit", "value", "margin", "unit"}, as `TuningResult.constraints`
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> row = {"name": "max_level", "limit": 30.0, "value": 27.0, "margin": 3.0, "unit": "cm"}
+    >>> float(margins(Figure().gca(), [row]).patches[0].get_width())
+    10.0
     """
     shares = [100.0 * r["margin"] / (abs(r["limit"]) or 1.0) for r in rows]
     order = np.argsort(shares, kind="stable")[:MANY]
@@ -177,42 +265,60 @@ def margins(ax, rows):
     ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
     ax.grid(False, axis="y")
     ax.set_axisbelow(True)
-    more = f"; {len(rows) - len(order)} with more room not shown" if len(rows) > len(order) else ""
-    ax.set(xlabel="room left, share of the limit [%]", title=f"room to each limit{more}")
+    more = (
+        f"; {len(rows) - len(order)} with larger margins not shown"
+        if len(rows) > len(order)
+        else ""
+    )
+    ax.set(xlabel="margin, share of the limit [%]", title=f"margin of each limit{more}")
     return ax
 
 
 def tradeoff(ax, points, measure, unit, cost_unit):
-    """The least objective [cost_unit] over the limit of `measure` [unit]; crosses: no point was
-    found that keeps it.
+    """Draw the best objective over the limit of a measure; crosses: none that holds it was found.
 
-    points: dicts with limit, status ("converged", "not_converged", "infeasible") and objective, as
-        `tuning.tradeoff` gives them.
+    Parameters
+    ----------
+    ax : matplotlib axes
+    points : list of {"limit", "status": "converged", "not_converged" or "infeasible", "objective"},
+        as `tuning.tradeoff` gives them
+    measure, unit, cost_unit : the measure, its unit, the unit of the objective
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> point = {"limit": 30.0, "status": "converged", "objective": 1.5}
+    >>> tradeoff(Figure().gca(), [point], "max_level", "cm", "cm").get_xlabel()
+    'limit of max_level [cm]'
     """
     points = sorted(points, key=lambda p: p["limit"])
     kept = [p for p in points if p["status"] != "infeasible"]
     ax.plot(
         [p["limit"] for p in kept], [p["objective"] for p in kept], "-", color=AFTER, linewidth=1.3
     )
-    for status, marker, colour, words in (
+    for status, marker, colour, label in (
         ("converged", "o", AFTER, "converged"),
         ("not_converged", "s", OTHER, "not converged"),
-        ("infeasible", "x", FORBIDDEN, "limit cannot be kept"),
+        ("infeasible", "x", FORBIDDEN, "limit cannot be held"),
     ):
-        mine = [p for p in points if p["status"] == status]
-        if mine:
+        found = [p for p in points if p["status"] == status]
+        if found:
             ax.plot(
-                [p["limit"] for p in mine],
-                [p["objective"] for p in mine],
+                [p["limit"] for p in found],
+                [p["objective"] for p in found],
                 marker,
                 color=colour,
                 markersize=5,
-                label=words,
+                label=label,
             )
     ax.set(
         xlabel=f"limit of {measure} [{unit}]",
         ylabel=f"objective [{cost_unit}]",
-        title="what the limit costs",
+        title="objective against limit",
     )
     ax.legend()
     return ax

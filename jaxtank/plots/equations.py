@@ -1,4 +1,9 @@
-"""The equations of a rig in plain text, read from its topology: with letters, and in numbers."""
+"""The equations of a rig in plain text, read from its topology: with letters, and in numbers.
+
+Imports no matplotlib; imported by reports.
+"""
+
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -6,102 +11,119 @@ from jaxtank.core.units import local
 
 
 def equations(plant, disturbed=False):
-    """Lines of a `TankNetwork`'s equations: A_i h_i' of every tank by letters, what the letters
-    are, and h_i' in numbers.
+    """Return the lines of a rig's equations.
 
-    disturbed: with the inflow d_i that no pump brings. Units as the rig counts. An outlet that is
-        closed (0) is left out.
+    They are A_i h_i' of every tank with letters, the meaning of the letters, and h_i' in numbers. A
+    closed outlet (0) is left out.
+
+    Parameters
+    ----------
+    plant : TankNetwork
+    disturbed : whether there is an inflow d_i that no pump brings
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> lines = equations(presets.find("cascaded/pi").loop.plant)
+    >>> print(lines[1])
+    A2 h2' = s12 q(h1) - a2 q(h2)
+    >>> print(lines[-1])
+    h2' = 0.03864 sqrt(h1) - 0.04081 sqrt(h2)
     """
     letters, numbers = [], []
     for i in range(plant.tanks):
-        flows, rates = _terms(plant, i)
-        flows += [("+", f"d{i + 1}")] if disturbed else []
-        rates += [("+", f"d{i + 1}/A{i + 1}")] if disturbed else []
+        area, terms = float(plant.area[i]), list(_terms(plant, i))
+        flows = [(sign, letter) for sign, letter, _, _ in terms]
+        rates = [(sign, f"{value / area:.4g} {variable}") for sign, _, value, variable in terms]
+        if disturbed:
+            flows.append(("+", f"d{i + 1}"))
+            rates.append(("+", f"d{i + 1}/A{i + 1}"))
         letters.append(f"A{i + 1} h{i + 1}' = {_sum(flows)}")
         numbers.append(f"h{i + 1}' = {_sum(rates)}")
-    length, drive = plant.units
-    words = [
-        f"A cross-sections, h levels [{length}], u pump inputs [{drive}], k pump gains, a outlets"
-        " to the basin"
-    ]
-    words += ["s outlets from tank to tank (s31: of tank 3 into tank 1)"] if plant.links else []
-    words += ["p pipes between tanks (p12: of tanks 1 and 2)"] if plant.pipes else []
-    words += (
-        ["gamma share of a pump that goes to its first tank"]
-        if any(second is not None for _, second in plant.feeds)
-        else []
-    )
-    words += [f"d inflow that no pump brings [{local('cm^3/s', plant.units)}]"] if disturbed else []
-    meant = [f"q(h) = sqrt(2 g h), flow per area of an outlet [{local('cm/s', plant.units)}]"]
-    meant += ["w(x) = sgn(x) sqrt(2 g |x|)"] if plant.pipes else []
+    rate = local("cm/s", plant.units)
     return [
         *letters,
-        *(f"  {line}" for line in meant),
-        f"  {'; '.join(words)}",
-        f"in numbers [{local('cm/s', plant.units)}]:",
+        f"  q(h) = sqrt(2 g h), flow per area of an outlet [{rate}]",
+        *(["  w(x) = sgn(x) sqrt(2 g |x|)"] if plant.pipes else []),
+        f"  {'; '.join(_meanings(plant, disturbed))}",
+        f"in numbers [{rate}]:",
         *numbers,
     ]
 
 
-def _terms(plant, i):
-    """([(sign, flow into tank i by letters)], [(sign, rate of its level in numbers)])."""
-    root, area = np.sqrt(2.0 * float(plant.gravity)), float(plant.area[i])
-    flows, rates = [], []
+def _meanings(plant, disturbed):
+    """What the letters mean."""
+    length, drive = plant.units
+    yield (
+        f"A cross-sections, h levels [{length}], u pump inputs [{drive}], k pump gains, a outlets"
+        " to the basin"
+    )
+    if plant.links:
+        yield "s outlets from tank to tank (s31: of tank 3 into tank 1)"
+    if plant.pipes:
+        yield "p pipes between tanks (p12: of tanks 1 and 2)"
+    if any(second is not None for _, second in plant.feeds):
+        yield "gamma share of a pump that goes to its first tank"
+    if disturbed:
+        yield f"d inflow that no pump brings [{local('cm^3/s', plant.units)}]"
 
-    def add(sign, words, value, of):
-        flows.append((sign, words))
-        rates.append((sign, f"{value / area:.4g} {of}"))
 
-    for j, (first, second) in enumerate(plant.feeds):
-        gain, share = float(plant.pump_gain[j]), float(plant.split[j])
-        if second is None and first == i:
-            add("+", f"k{j + 1} u{j + 1}", gain, f"u{j + 1}")
-        elif first == i:
-            add("+", f"gamma{j + 1} k{j + 1} u{j + 1}", share * gain, f"u{j + 1}")
-        elif second == i:
-            add("+", f"(1 - gamma{j + 1}) k{j + 1} u{j + 1}", (1.0 - share) * gain, f"u{j + 1}")
+def _terms(plant, i) -> Iterator[tuple[str, str, float, str]]:
+    """(sign, flow with letters, coefficient, variable of the flow) of each flow of tank i."""
+    yield from _pump_flows(plant, i)
+    root = float(np.sqrt(2.0 * float(plant.gravity)))
     for k, (source, sink) in enumerate(plant.links):
         if sink == i:
-            add(
-                "+",
-                f"s{source + 1}{sink + 1} q(h{source + 1})",
-                float(plant.orifice[k]) * root,
-                f"sqrt(h{source + 1})",
-            )
+            letters = f"s{source + 1}{sink + 1} q(h{source + 1})"
+            yield "+", letters, float(plant.orifice[k]) * root, f"sqrt(h{source + 1})"
     for k, (one, other) in enumerate(plant.pipes):
         if i in (one, other):
-            there = other if one == i else one
-            words = f"p{one + 1}{other + 1} w(h{i + 1} - h{there + 1})"
-            add(
-                "-",
-                words,
-                float(plant.pipe[k]) * root,
-                f"sgn(h{i + 1} - h{there + 1}) sqrt|h{i + 1} - h{there + 1}|",
-            )
-    out = [
-        (f"s{i + 1}{sink + 1}", float(plant.orifice[k]))
+            difference = f"h{i + 1} - h{(other if one == i else one) + 1}"
+            letters = f"p{one + 1}{other + 1} w({difference})"
+            variable = f"sgn({difference}) sqrt|{difference}|"
+            yield "-", letters, float(plant.pipe[k]) * root, variable
+    yield from _outlets(plant, i, root)
+
+
+def _pump_flows(plant, i):
+    for j, (first, second) in enumerate(plant.feeds):
+        gain, share, u = float(plant.pump_gain[j]), float(plant.split[j]), f"u{j + 1}"
+        if first == i and second is None:
+            yield "+", f"k{j + 1} {u}", gain, u
+        elif first == i:
+            yield "+", f"gamma{j + 1} k{j + 1} {u}", share * gain, u
+        elif second == i:
+            yield "+", f"(1 - gamma{j + 1}) k{j + 1} {u}", (1.0 - share) * gain, u
+
+
+def _outlets(plant, i, root):
+    """The outlets of tank i, which all depend on its level, as one term."""
+    areas = {
+        f"s{i + 1}{sink + 1}": float(plant.orifice[k])
         for k, (source, sink) in enumerate(plant.links)
         if source == i
-    ]
-    out += [(f"a{i + 1}", float(plant.drain[i]))] if float(plant.drain[i]) != 0.0 else []
-    if out:
-        names = " + ".join(name for name, _ in out)
-        add(
-            "-",
-            f"{f'({names})' if len(out) > 1 else names} q(h{i + 1})",
-            sum(value for _, value in out) * root,
-            f"sqrt(h{i + 1})",
-        )
-    return flows, rates
+    }
+    if float(plant.drain[i]) != 0.0:
+        areas[f"a{i + 1}"] = float(plant.drain[i])
+    if areas:
+        names = f"({' + '.join(areas)})" if len(areas) > 1 else next(iter(areas))
+        yield "-", f"{names} q(h{i + 1})", sum(areas.values()) * root, f"sqrt(h{i + 1})"
 
 
 def _sum(terms):
-    text = " ".join(f"{sign} {words}" for sign, words in terms)
+    text = " ".join(f"{sign} {term}" for sign, term in terms)
     return text.removeprefix("+ ") or "0"
 
 
 def physics(plant):
-    """Sentences on what the rig's walls do: rims, bottoms, what passes a rim, laminar flow."""
+    """Return sentences on rims, empty tanks, overflow and laminar flow.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> physics(presets.find("cascaded/pi").loop.plant)[1]
+    '92.81 % of what passes the rim of tank 1 falls into tank 2.'
+    """
     length = plant.units[0]
     rims = ", ".join(f"{v:g}" for v in np.asarray(plant.rim))
     found = [

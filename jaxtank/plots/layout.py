@@ -1,5 +1,6 @@
-"""Where the parts of a rig go in a drawing of it: tanks in rows by what pours into what, pumps
-below, pipework between.
+"""Positions of the parts of a rig in a drawing: tanks in rows, pumps below, pipework between.
+
+Imported by `schematic` and `animation`, and by reports for the size of a figure.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,13 @@ STOREY = 1.75
 
 
 class Box(NamedTuple):
-    """A tank: its left lower corner, its width and its height, in heights of the tallest tank."""
+    """A tank: its left lower corner, its width and its height, in heights of the tallest tank.
+
+    Examples
+    --------
+    >>> Box(1.0, 0.0, 0.5, 1.0, 0.1).middle
+    1.25
+    """
 
     x: float
     y: float
@@ -28,9 +35,18 @@ class Box(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Places of everything: boxes one per tank, pumps one (x, y) each, risers one path ((x, y),
-    ...) per pump and tank that it fills, drawn from the pump to where the jet ends; left, right,
-    bottom, top: what the drawing needs.
+    """Positions of all parts of a rig.
+
+    boxes : one Box per tank
+    pumps : one (x, y) each
+    risers : (pump, tank, path ((x, y), ...)) of each pump and tank that it fills
+    left, right, bottom, top : ends of the drawing
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> len(place(presets.find("cascaded/pi").loop.plant).boxes)
+    2
     """
 
     boxes: tuple
@@ -43,10 +59,16 @@ class Layout(NamedTuple):
 
 
 def storeys(plant):
-    """(n,) which row each tank stands in, 0 the lowest: above every tank that it pours into, level
-    with those that it is piped to.
+    """Return the row (n,) of each tank, 0 the lowest.
 
-    Tanks that pour in a circle, which no rig of bricks and gravity can do, stand as they come.
+    A tank is above every tank that it flows into, and level with those that a pipe joins to it.
+    Tanks that flow in a circle, which gravity does not allow, have the rows that they reach.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> storeys(presets.find("cascaded/pi").loop.plant)
+    (1, 0)
     """
     row = [0] * plant.tanks
     for _ in range(plant.tanks):
@@ -59,8 +81,15 @@ def storeys(plant):
 
 
 def place(plant):
-    """The Layout of a `TankNetwork`. Heights are to scale within the rig; widths follow the roots
-    of the areas, within limits.
+    """Return the Layout of a `TankNetwork`.
+
+    Heights are to scale within the rig; widths follow the roots of the areas, within limits.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> [round(box.height, 2) for box in place(presets.find("cascaded/pi").loop.plant).boxes]
+    [1.0, 1.0]
     """
     rims, areas = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
     heights = np.clip(rims / rims.max(), 0.3, 1.0)
@@ -69,9 +98,9 @@ def place(plant):
     wide = max(rows.count(r) for r in set(rows))
     boxes = [None] * plant.tanks
     for row in sorted(set(rows)):
-        mine = [i for i in range(plant.tanks) if rows[i] == row]
-        for k, i in enumerate(mine):
-            x = PITCH * (k + (wide - len(mine)) / 2) + PITCH / 2
+        tanks = [i for i in range(plant.tanks) if rows[i] == row]
+        for k, i in enumerate(tanks):
+            x = PITCH * (k + (wide - len(tanks)) / 2) + PITCH / 2
             boxes[i] = Box(
                 x - widths[i] / 2,
                 row * STOREY,
@@ -83,13 +112,14 @@ def place(plant):
 
 
 def _with_pumps(plant, boxes, rows, width):
-    """Pumps stand in the basin at the nearer side of the first tank that they fill; each has a
-    riser and a height of its own above a row.
+    """The Layout with pumps in the basin, at the nearer side of the first tank that they fill.
+
+    Each has a riser and a height of its own above a row.
     """
     sides = [_side(plant, boxes, width, j) for j in range(plant.pumps)]
     pumps, risers, above = [], [], {}
     for j, feed in enumerate(plant.feeds):
-        order = sides[:j].count(sides[j])  # the how-manieth on this side
+        order = sides[:j].count(sides[j])  # its number on this side
         x = -0.35 - 0.5 * order if sides[j] == "left" else width + 0.35 + 0.5 * order
         pumps.append((x, -0.78))
         targets = [i for i in feed if i is not None]

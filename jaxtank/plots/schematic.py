@@ -1,5 +1,6 @@
-"""The rig drawn from its own topology: tanks, pumps and their splits, orifices, pipes, spills and
-the basin, on given matplotlib axes.
+"""A rig drawn from its topology: tanks, pumps and their splits, outlets, pipes, overflow, basin.
+
+Draws on given matplotlib axes. Imported by `animation`, reports and notebooks.
 """
 
 import numpy as np
@@ -7,23 +8,39 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.plots.layout import place
-from jaxtank.plots.responses import AFTER, GLASS, PUMPS, REFERENCE, WATER
+from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
-"""Water in free fall."""
+"""Style of water in free fall."""
 
 HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
-"""Around words that a water line may pass behind."""
+"""Outline of text that a level may pass behind."""
 
 
 def schematic(ax, plant, levels=None, setpoints=None):
-    """Draw the rig `plant` (TankNetwork): the tanks of each row beside each other, above those that
-    they pour into, heights to scale.
+    """Draw a rig: each tank above those that it flows into, heights to scale.
 
-    levels: (tanks,) [cm] to fill the tanks to, or None for empty ones; setpoints: (outputs,) [cm],
-    marked on the controlled tanks, which have a heavier outline. A closed orifice (area 0) is not
-    drawn. Dashes fall freely, dots pass a rim, double lines lie below the surface. Returns the
-    axes.
+    Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
+    are free jets, dotted lines overflow, double lines pipes below the surface.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    plant : TankNetwork
+    levels : (tanks,) [cm], or None for empty tanks
+    setpoints : (outputs,) [cm] to mark on the controlled tanks, or None
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from jaxtank import presets
+    >>> ax = schematic(Figure().gca(), presets.find("cascaded/pi").loop.plant, levels=[4.0, 5.0])
+    >>> [text.get_text() for text in ax.texts if "tank" in text.get_text()]
+    ['tank 1\\n4 V', 'tank 2\\n5 V']
     """
     where, unit = place(plant), plant.units[0]
     _basin(ax, where)
@@ -37,9 +54,9 @@ def schematic(ax, plant, levels=None, setpoints=None):
             _pipe(ax, where.boxes[one], where.boxes[other])
     _jets(ax, plant, where)
     for source, sink in plant.spills:
-        _spill(ax, where.boxes[source], where.boxes[sink])
+        _overflow(ax, where.boxes[source], where.boxes[sink])
     for i, box in enumerate(where.boxes):
-        held = i in plant.outputs
+        controlled = i in plant.outputs
         ax.add_patch(
             Rectangle(
                 (box.x, box.y),
@@ -65,8 +82,8 @@ def schematic(ax, plant, levels=None, setpoints=None):
         ax.plot(
             [box.x, box.x, x, x],
             [y, box.y, box.y, y],
-            color=REFERENCE if held else GLASS,
-            linewidth=2.2 if held else 1.4,
+            color=REFERENCE if controlled else GLASS,
+            linewidth=2.2 if controlled else 1.4,
             zorder=3,
         )
         _label(ax, plant, i, box, None if levels is None else float(levels[i]), unit)
@@ -83,8 +100,15 @@ def schematic(ax, plant, levels=None, setpoints=None):
 
 
 def mark(ax, box, setpoint):
-    """The setpoint [cm] as a triangle and a short line at the right wall of a tank, clear of its
-    name; returns the two artists.
+    """Mark a setpoint [cm] with a line and a triangle at the right of a tank; return both artists.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from jaxtank.plots.layout import Box
+    >>> line, triangle = mark(Figure().gca(), Box(0.0, 0.0, 1.0, 1.0, 0.1), 5.0)
+    >>> float(triangle.get_ydata()[0])
+    0.5
     """
     y, x = mark_height(box, setpoint), box.x + box.width
     (line,) = ax.plot([x - 0.1 * box.width, x], [y, y], color=REFERENCE, linewidth=1.3, zorder=4)
@@ -93,12 +117,26 @@ def mark(ax, box, setpoint):
 
 
 def mark_height(box, setpoint):
-    """Where the mark of a setpoint [cm] stands; one above the rim just over it."""
+    """Return the height of the mark of a setpoint [cm], at most 5 % above the rim.
+
+    Examples
+    --------
+    >>> from jaxtank.plots.layout import Box
+    >>> mark_height(Box(0.0, 0.0, 1.0, 1.0, 0.1), 50.0)
+    1.05
+    """
     return box.y + min(max(setpoint, 0.0) * box.scale, 1.05 * box.height)
 
 
 def depth(box, level):
-    """Drawn depth of a level [cm]; one past the rim just over it."""
+    """Return the drawn depth of a level [cm], at most 5 % above the rim.
+
+    Examples
+    --------
+    >>> from jaxtank.plots.layout import Box
+    >>> depth(Box(0.0, 0.0, 1.0, 1.0, 0.1), 4.0)
+    0.4
+    """
     return min(max(float(level), 0.0) * box.scale, 1.05 * box.height)
 
 
@@ -136,7 +174,7 @@ def _basin(ax, where):
     )
 
 
-def _pump(ax, x, y, pump, words):
+def _pump(ax, x, y, pump, label):
     ax.add_patch(
         Circle((x, y), 0.17, facecolor="white", edgecolor=_colour(pump), linewidth=1.8, zorder=4)
     )
@@ -148,11 +186,11 @@ def _pump(ax, x, y, pump, words):
         )
     )
     away, side = (-0.23, "right") if x > 0 else (0.23, "left")
-    ax.text(x + away, y + 0.12, words, fontsize=8, ha=side, va="center", zorder=5)
+    ax.text(x + away, y + 0.12, label, fontsize=8, ha=side, va="center", zorder=5)
 
 
 def _shares(ax, plant, where):
-    """What share of a pump goes where, beside each branch of a pump that has two."""
+    """The share of a pump beside each of its two branches."""
     for pump, tank, path in where.risers:
         first, second = plant.feeds[pump]
         if second is None:
@@ -179,19 +217,19 @@ def _label(ax, plant, tank, box, level, unit):
         if level is not None
         else ("controlled" if tank in plant.outputs else "")
     )
-    words = "\n".join(w for w in (f"tank {tank + 1}", what) if w)
+    label = "\n".join(line for line in (f"tank {tank + 1}", what) if line)
     small = box.width < 0.7
-    said = ax.text(
+    text = ax.text(
         box.middle,
         box.y + 0.5 * box.height,
-        words,
+        label,
         ha="center",
         va="center",
         fontsize=7 if small else 8,
         zorder=5,
     )
     if level is not None:
-        said.set_path_effects(HALO)
+        text.set_path_effects(HALO)
     ax.text(
         box.x + box.width + 0.05,
         box.y + box.height,
@@ -251,7 +289,7 @@ def _pipe(ax, one, other):
         )
 
 
-def _spill(ax, source, sink):
+def _overflow(ax, source, sink):
     x = source.x - 0.13
     path = [
         (source.x, source.y + source.height),

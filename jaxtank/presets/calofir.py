@@ -209,7 +209,7 @@ def measured(run):
             f" {ACCURATE:g} m)",
         ),
         "reacts rapidly to faults": Claim(
-            verdict(reacts),
+            verdict(bool(reacts)),
             f"by its end, the partly closed outlet has moved h1 by {shift[0]:.5f} m and the leak by"
             f" {shift[1]:.5f} m; with a constant flow {open_shift[0]:.4f} and {open_shift[1]:.4f}"
             f" m. The controller has changed the flow by {push[0]:.1e} and {push[1]:.1e} m^3/s"

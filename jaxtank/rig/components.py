@@ -23,31 +23,6 @@ from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 
-LAWS: dict[str, type] = {
-    "pid": controllers.PID,
-    "state-feedback": controllers.StateFeedback,
-    "lqi": controllers.LQI,
-    "ngpc": controllers.NGPC,
-    "backstepping": controllers.Backstepping,
-    "enmpc": controllers.ENMPC,
-    "two-tank-backstepping": controllers.TwoTankBackstepping,
-    "sliding-mode": controllers.SlidingMode,
-    "fuzzy": controllers.FuzzyBlend,
-    "gpc": controllers.GPC,
-    "laguerre": controllers.Laguerre,
-    "open-loop": controllers.OpenLoop,
-}
-OBSERVERS: dict[str, type] = {
-    "direct": Direct,
-    "disturbance": DisturbanceObserver,
-    "kalman": Kalman,
-    "extended-kalman": ExtendedKalman,
-}
-SENSORS: dict[str, type] = {"level": LevelSensor}
-ACTUATORS: dict[str, type] = {"pumps": PumpBank}
-REGISTERED: set[str] = set()
-"""Kinds that were added by `register`."""
-
 
 class Role(NamedTuple):
     """What a section of a rig file describes: field of the loop, abstract class, {kind: class},
@@ -63,11 +38,43 @@ class Role(NamedTuple):
 
 
 ROLES = {
-    "law": Role("controller", controllers.Controller, LAWS),
-    "observer": Role("observer", Observer, OBSERVERS),
-    "sensor": Role("sensor", Sensor, SENSORS, ("noise",), LevelSensor),
-    "actuator": Role("actuator", Actuator, ACTUATORS, ("low", "high", "initial"), PumpBank),
+    "law": Role(
+        "controller",
+        controllers.Controller,
+        {
+            "pid": controllers.PID,
+            "state-feedback": controllers.StateFeedback,
+            "lqi": controllers.LQI,
+            "ngpc": controllers.NGPC,
+            "backstepping": controllers.Backstepping,
+            "enmpc": controllers.ENMPC,
+            "two-tank-backstepping": controllers.TwoTankBackstepping,
+            "sliding-mode": controllers.SlidingMode,
+            "fuzzy": controllers.FuzzyBlend,
+            "gpc": controllers.GPC,
+            "laguerre": controllers.Laguerre,
+            "open-loop": controllers.OpenLoop,
+        },
+    ),
+    "observer": Role(
+        "observer",
+        Observer,
+        {
+            "direct": Direct,
+            "disturbance": DisturbanceObserver,
+            "kalman": Kalman,
+            "extended-kalman": ExtendedKalman,
+        },
+    ),
+    "sensor": Role("sensor", Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
+    "actuator": Role(
+        "actuator", Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank
+    ),
 }
+"""{section: Role}; `register` adds classes."""
+
+REGISTERED: set[str] = set()
+"""Kinds that were added by `register`."""
 
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _FIELDS = (bool, int, float, str, tuple)
@@ -119,6 +126,21 @@ def register(kind: str, cls: type) -> type:
     if not (isinstance(kind, str) and _KIND.fullmatch(kind)):
         allowed = 'a text of letters, digits, "-", "_" and "."'
         raise InputError(f"kind = {shortened(kind)}: must be {allowed}")
+    known = _checked(cls)
+    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
+    if taken not in (None, cls):
+        raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
+    other = next((k for k, c in known.items() if c is cls and k != kind), None)
+    if other is not None:
+        raise InputError(f"{cls.__name__} has a name in rig files already: {other!r}")
+    if taken is None:
+        known[kind] = cls
+        REGISTERED.add(kind)
+    return cls
+
+
+def _checked(cls):
+    """The {kind: class} of the role of `cls`; InputError for what a rig file cannot describe."""
     name = getattr(cls, "__name__", shortened(cls))
     known = _table_of(cls)
     if known is None or "__dataclass_fields__" not in vars(cls) or inspect.isabstract(cls):
@@ -131,16 +153,7 @@ def register(kind: str, cls: type) -> type:
         why = _unwritable(field)
         if why:
             raise InputError(f"{name}.{field.name}: {why}")
-    taken = next((r.classes[kind] for r in ROLES.values() if kind in r.classes), None)
-    if taken not in (None, cls):
-        raise InputError(f"kind {kind!r} is taken, by {taken.__name__}: choose another name")
-    other = next((k for k, c in known.items() if c is cls and k != kind), None)
-    if other is not None:
-        raise InputError(f"{name} has a name in rig files already: {other!r}")
-    if taken is None:
-        known[kind] = cls
-        REGISTERED.add(kind)
-    return cls
+    return known
 
 
 def _table_of(cls):
@@ -205,7 +218,7 @@ def _key(cls, field, own, units):
     return Key.of(cls, field.name, doc, default=default, **changes)
 
 
-def law_of(table, plant, levels, initial):
+def controller_of(table, plant, levels, initial):
     """Return the controller of a [law] table.
 
     Parameters
@@ -225,7 +238,7 @@ def law_of(table, plant, levels, initial):
 
 
 def observer_of(table, plant, levels, initial):
-    """Return the observer of an [observer] table; arguments as in `law_of`, levels of all tanks."""
+    """Return the observer of an [observer] table; as `controller_of`, levels of all tanks."""
     offered = {"levels": levels, "inputs": initial, "measured": list(range(1, plant.tanks + 1))}
     return component("observer", table, plant, offered)
 

@@ -284,21 +284,17 @@ def is_numeric(value):
         return np.issubdtype(value.dtype, np.number)
     if isinstance(value, (list, tuple)):
         return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
     try:
-        return (
-            isinstance(value, (int, float))
-            and not isinstance(value, bool)
-            and float(value) is not None
-        )
+        return float(value) is not None
     except OverflowError:
         return False
 
 
 def is_finite(value, ndim=None):
-    """True for what `is_numeric` is true for, if every number is finite; ndim: number of axes that
-    it must have. A whole number is taken as the float next to it: numpy's own answer to one of 2^64
-    and more is a TypeError.
-    """
+    """Whether a value is numeric and every number finite; ndim: number of axes it must have."""
+    # as floats: numpy's own answer to a whole number of 2^64 and more is a TypeError
     finite = is_numeric(value) and bool(np.all(np.isfinite(np.asarray(value, dtype=float))))
     return finite and ndim in (None, np.ndim(value))
 
@@ -338,7 +334,7 @@ def unit(meta):
 
 
 def allowed(meta, value=0.0):
-    """The range in `meta` in words, "above 0" for one; value: tells a whole number from another.
+    """The range in `meta` in words, "above 0" for one; value: whether numbers are whole.
     Empty where all numbers are allowed.
     """
     if meta.get("choices") is not None:

@@ -17,7 +17,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.rig.components import law_of, observer_of
+from jaxtank.rig.components import controller_of, observer_of
 from jaxtank.rig.entry import Sizes, different, name_of, read_entries, read_entry
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.signals.base import Constant
@@ -114,7 +114,7 @@ def _loop(plant, columns, law, observer):
         plant=plant,
         sensor=LevelSensor(**_numbers({**sensor, **_fields(columns, "sensor")})),
         observer=Direct() if observer is None else observer_of(observer, plant, levels, initial),
-        controller=law_of(law, plant, start, initial),
+        controller=controller_of(law, plant, start, initial),
         actuator=PumpBank(**_numbers(bank)),
         reference=ramps(start, [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,
@@ -145,8 +145,8 @@ def _check_names(tanks):
 
 
 def _check_links(table, entries):
-    """Raise InputError for an orifice or a spill from a tank to itself, and for spills of a tank of
-    which one has no share and whose sum is above 1: which falls where cannot be known.
+    """Raise InputError for an orifice or a spill from a tank to itself, and where one of several
+    spills of a tank has no share and the sum is above 1: the flows are then not defined.
     """
     for name in ("orifice", "spill"):
         for i, (entry, given) in enumerate(zip(entries[name], table[name])):

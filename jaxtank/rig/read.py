@@ -200,8 +200,8 @@ FIELDS = {"scenario": "scenarios"}
 
 
 def start_of(table):
-    """Return the Case of the tables that build: case or tanks, law, observer, reference, what
-    disturbs; before any value is set.
+    """Return the Case of the tables that build: case or tanks, controller, observer,
+    instruments, reference, disturbance and faults; before any value is set.
     """
     top = _top(table)
     case = (
@@ -264,14 +264,14 @@ def _check_sections(table):
 
 
 def _with_parts(case, table):
-    """A case with the law or observer of a table in the place of its own. What its own could be
-    tuned by goes with a law.
+    """A case with the controller or observer of a table in the place of its own. What its own
+    could be tuned by goes with a controller.
     """
     loop, changed = case.loop, {}
     levels, initial = np.asarray(loop.x0), loop.actuator.initial
     if "law" in table:
         start = [float(levels[i]) for i in loop.plant.outputs]
-        changed["controller"] = components.law_of(table["law"], loop.plant, start, initial)
+        changed["controller"] = components.controller_of(table["law"], loop.plant, start, initial)
         if type(changed["controller"]) is not type(loop.controller):
             case = case.replace(symmetry=None)
     if "observer" in table:

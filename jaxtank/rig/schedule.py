@@ -1,5 +1,5 @@
 """Turning gains of a case into a schedule, and back: what rig files and the command line do with
-`controllers.Scheduled`.
+`controllers.Scheduled`.  Imported by `values`, `sections` and users.
 """
 
 import dataclasses
@@ -21,29 +21,42 @@ from jaxtank.core.tree import (
 from jaxtank.rig.entry import read_entry, sizes_of
 from jaxtank.rig.schema import SECTIONS
 
-LAW = "controller."
+START = "controller."
 
 
 def schedule(case, gains, knots):
-    """A copy of `case` whose law has `gains` scheduled: the same run, until the values at the knots
-    are changed.
-
-    gains: {dotted name of a gain of the law: operating variable}, as {"controller.k": "r1",
-    "controller.k1": "r1"}; an array stands for all its entries; the variable, a setpoint ("r1") or
-    a level estimate ("h2"), counted from 1, is one for all. knots: (K,) increasing positions of the
-    variable, in the rig's length unit.
+    """Return a copy of `case` whose controller has scheduled gains: the same run, until the values
+    at the knots are changed.
 
     The values, controller.values (gains, K), are the gain's present one at every knot. What was
     free of a scheduled gain becomes free at every knot, within the same range; other names of the
-    law are now controller.law.*. Raises InputError for an unknown gain (with the nearest), a static
-    one, one that the law uses outside its step (see `Scheduled`), a variable that the rig does not
-    have, and knots that do not increase.
+    controller are now controller.law.*.
+
+    Parameters
+    ----------
+    case : Case
+    gains : {dotted name of a gain: operating variable}; an array stands for all its entries; the
+        variable, a setpoint ("r1") or a level estimate ("h2"), counted from 1, is one for all
+    knots : (K,) increasing positions of the variable, in the rig's unit of length
+
+    Raises
+    ------
+    InputError for an unknown gain (with the nearest), a static one, one that the controller uses
+    outside its step (see `Scheduled`), a variable that the rig does not have, and knots that do not
+    increase.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = schedule(presets.find("gouta2015/ngpc"), {"controller.Tp": "r1"}, [5.0, 10.0])
+    >>> list(case.free)
+    ['controller.values[0,0]', 'controller.values[0,1]']
     """
-    loop, law = case.loop, case.loop.controller
-    if isinstance(law, Scheduled):
-        raise InputError("the law has a schedule already: name all its gains in one")
+    loop, part = case.loop, case.loop.controller
+    if isinstance(part, Scheduled):
+        raise InputError("the controller has a schedule already: name all its gains in one")
     names = [entry for name in gains for entry in _entries(loop, name)]
-    check_gains(law, tuple(names))
+    check_gains(part, tuple(names))
     if len(set(gains.values())) != 1:
         raise InputError(
             f"schedule variables {', '.join(map(str, gains.values()))}: must be one for all gains"
@@ -52,11 +65,11 @@ def schedule(case, gains, knots):
     check_variable(variable, len(loop.plant.outputs), loop.plant.tanks)
     check_knots(knots)
     knots = number(knots)
-    values = number([[float(get_value(law, name))] * knots.size for name in names])
+    values = number([[float(get_value(part, name))] * knots.size for name in names])
     numbers = [name for name in names if not split_index(name)[1]]
-    law = _emptied(law, numbers)
+    part = _emptied(part, numbers)
     controller = Scheduled(
-        law=law, knots=knots, values=values, gains=tuple(names), variable=variable
+        law=part, knots=knots, values=values, gains=tuple(names), variable=variable
     )
     controller.check(loop.reference)
     free = _free(case, names, knots.size)
@@ -64,54 +77,54 @@ def schedule(case, gains, knots):
 
 
 def unscheduled(loop):
-    """`loop` with the law that a schedule was made for, its gains those of the first knot; `loop`
-    itself where there is none.
+    """Return `loop` with the controller that a schedule was made for, its gains those of the first
+    knot; `loop` itself where there is none.
     """
-    law = loop.controller
-    if not isinstance(law, Scheduled):
+    part = loop.controller
+    if not isinstance(part, Scheduled):
         return loop
-    first = dict(zip(law.gains, np.asarray(law.values)[:, 0]))
-    return dataclasses.replace(loop, controller=with_values(law.law, first))
+    first = dict(zip(part.gains, np.asarray(part.values)[:, 0]))
+    return dataclasses.replace(loop, controller=with_values(part.law, first))
 
 
 def check_not_scheduled(loop, name):
-    """Raise InputError if `name` is a gain that a schedule gives, and not the law's own value."""
-    law, inner = loop.controller, name.removeprefix(f"{LAW}law.")
-    if isinstance(law, Scheduled) and name.startswith(f"{LAW}law.") and inner in law.gains:
+    """Raise InputError if `name` is a gain that a schedule gives, and not the controller's own."""
+    part, inner = loop.controller, name.removeprefix(f"{START}law.")
+    if isinstance(part, Scheduled) and name.startswith(f"{START}law.") and inner in part.gains:
         raise InputError(
-            f"{name} is scheduled: it is controller.values[{law.gains.index(inner)},j] at knot j,"
+            f"{name} is scheduled: it is controller.values[{part.gains.index(inner)},j] at knot j,"
             " counted from 0"
         )
 
 
 def names_of(loop, name):
-    """Where `name`, as the law has it without a schedule, is found in `loop`: at every knot of a
-    scheduled gain, else under its new name.
+    """Where `name`, as the controller has it without a schedule, is found in `loop`: at every knot
+    of a scheduled gain, else under its new name.
     """
-    law, inner = loop.controller, name.removeprefix(LAW)
+    part, inner = loop.controller, name.removeprefix(START)
     if (
-        not isinstance(law, Scheduled)
-        or not name.startswith(LAW)
+        not isinstance(part, Scheduled)
+        or not name.startswith(START)
         or inner.split("[")[0].split(".")[0] in ("law", "values", "knots")
     ):
         return [name]
-    rows = [i for i, gain in enumerate(law.gains) if gain == inner or gain.split("[")[0] == inner]
+    rows = [i for i, gain in enumerate(part.gains) if gain == inner or gain.split("[")[0] == inner]
     if rows:
-        return [f"{LAW}values[{i},{j}]" for i in rows for j in range(np.size(law.knots))]
-    return [f"{LAW}law.{inner}"]
+        return [f"{START}values[{i},{j}]" for i in rows for j in range(np.size(part.knots))]
+    return [f"{START}law.{inner}"]
 
 
 def table_of(loop):
     """{"gains", "variable", "knots"} of a scheduled loop, as in a rig file; empty where there is no
     schedule.
     """
-    law = loop.controller
-    if not isinstance(law, Scheduled):
+    part = loop.controller
+    if not isinstance(part, Scheduled):
         return {}
     return {
-        "gains": [LAW + g for g in law.gains],
-        "variable": law.variable,
-        "knots": np.asarray(law.knots).tolist(),
+        "gains": [START + g for g in part.gains],
+        "variable": part.variable,
+        "knots": np.asarray(part.knots).tolist(),
     }
 
 
@@ -143,13 +156,13 @@ def known(loop, values):
 
 def _entries(loop, name):
     """The scalars that a name stands for, without the "controller."."""
-    if not name.startswith(LAW):
-        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(LAW)])
-    inner = name.removeprefix(LAW)
+    if not name.startswith(START):
+        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(START)])
+    inner = name.removeprefix(START)
     try:
         found = describe(loop, name)
     except InputError:
-        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(LAW)]) from None
+        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(START)]) from None
     if found["kind"] == "static" or split_index(name)[1]:
         return [inner]
     return [
@@ -158,11 +171,11 @@ def _entries(loop, name):
     ]
 
 
-def _emptied(law, names):
-    """`law` without the leaves `names`."""
+def _emptied(part, names):
+    """`part` without the leaves `names`."""
     for name in names:
-        law = _without(law, name.split("."))
-    return law
+        part = _without(part, name.split("."))
+    return part
 
 
 def _without(tree, path):
@@ -177,26 +190,15 @@ def _free(case, gains, knots):
     """
     free = {}
     for name, spec in case.free.items():
-        if not name.startswith(LAW):
+        if not name.startswith(START):
             free[name] = spec
             continue
         entries = _entries(case.loop, name)
         untouched = not set(entries) & set(gains)
-        for entry in [name.removeprefix(LAW)] if untouched else entries:
+        for entry in [name.removeprefix(START)] if untouched else entries:
             if entry in gains:
                 row = gains.index(entry)
-                free |= {f"{LAW}values[{row},{j}]": Free(*spec) for j in range(knots)}
+                free |= {f"{START}values[{row},{j}]": Free(*spec) for j in range(knots)}
             else:
-                free[f"{LAW}law.{entry}"] = spec
+                free[f"{START}law.{entry}"] = spec
     return free
-
-
-__all__ = [
-    "check_not_scheduled",
-    "from_table",
-    "known",
-    "names_of",
-    "schedule",
-    "table_of",
-    "unscheduled",
-]

@@ -35,9 +35,6 @@ class Key:
     default : value, as in a file, where the key is left out; None: it is then absent
     target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
         ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
-
-    >>> Key.of(PumpBank, "stop", target="actuator.stop").unit
-    'V'
     """
 
     name: str
@@ -97,9 +94,6 @@ class Section:
     prose : sentence that `init` prints above it where a case has none
     per : field of TankNetwork with an entry for each table of the list
     elsewhere : (part of the loop, class) whose other fields are in [values], for all tables at once
-
-    >>> SECTIONS["tank"].title, SECTIONS["tank"]["area"].unit
-    ('[[tank]]', 'cm^2')
     """
 
     name: str

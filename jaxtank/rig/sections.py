@@ -78,8 +78,8 @@ def _none(name, doc="none"):
 
 def _reachable(case, base):
     """The line `reachable` where it is not as in `base`. A file whose plateaus have no steady state
-    is only read with `false`, and a plant that was identified or tuned may have lost one: the file
-    then has false, and why.
+    is only read with `false`, and an identified or tuned plant may have none: the file then has
+    false, and why.
     """
     why, section = unreachable(case) if case.reachable else None, SECTIONS[""]
     if why:

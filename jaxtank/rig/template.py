@@ -198,7 +198,9 @@ def _observer(case):
     small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
     kind = "extended-kalman"
     keys = components.section_of("observer", kind).keys
-    prose = f"Another observer than the preset's: {', '.join(components.OBSERVERS)}."
+    prose = (
+        f"Another observer than the preset's: {', '.join(components.ROLES['observer'].classes)}."
+    )
     return {
         "section": Section("observer", keys, prose=prose),
         "kind": kind,

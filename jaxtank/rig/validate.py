@@ -1,4 +1,4 @@
-"""Input validation of what a rig file says of a tuning: limits, objective, what is free and
+"""Input validation of the sections on tuning: limits, objective, what is free and
 uncertain, covariance, scenarios, columns of experiment data.  Imported by `read` and `jaxtank.rig`.
 """
 
@@ -66,7 +66,7 @@ def unreachable(case: Case) -> str | None:
     >>> from jaxtank import presets, rig
     >>> case = presets.find("gouta2015/backstepping")
     >>> rig.unreachable(rig.set_values(case, {"reference.initial": [16.0, 3.0]}))[:40]
-    'reference: setpoints (16, 3) cm have no '
+    'reference: outputs (16, 3) cm have no st'
     """
     plant, reference = case.loop.plant, case.loop.reference
     if isinstance(reference, Ramps) and plant.pumps == len(plant.outputs):
@@ -253,7 +253,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
 
 def free_of(loop, table):
     """{name: Free} of a [free] table. A gain that a schedule gives is free at every knot, and other
-    names of the scheduled law are found.
+    names of the scheduled controller are found.
     """
     found = {}
     for name, spec in table.items():

@@ -1,4 +1,7 @@
-"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios."""
+"""Setting what a case has by dotted name: leaves, static fields, the clock; scenarios.
+
+Imported by `read`, `validate` and `jaxtank.rig`.
+"""
 
 import dataclasses
 import re
@@ -52,10 +55,24 @@ def by_dotted_name(table, where):
 
 
 def set_values(case: Case, values: Mapping[str, Any]) -> Case:
-    """A copy of `case` with leaves, static fields and clock fields set by dotted name.
+    """Return a copy of `case` with leaves, static fields and clock fields set by dotted name.
 
-    values: {name: number, list, text or truth value}. Raises InputError for an unknown name (with
-    the nearest), a value of the wrong kind or shape, and a value out of range.
+    Parameters
+    ----------
+    case : Case
+    values : {name: number, list, text or truth value}, numbers in the parameter's unit
+
+    Raises
+    ------
+    InputError for an unknown name (with the nearest), a value of the wrong kind or shape, and a
+    value out of range.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 400.0, "x0[1]": 3.0})
+    >>> case.clock.duration, case.loop.x0[1].item()
+    (400.0, 3.0)
     """
     clock = {name: value for name, value in values.items() if name.startswith("clock.")}
     if clock:
@@ -142,6 +159,8 @@ def set_scenario(case: Case, values: Mapping[str, Any]) -> Case:
 def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, list[str]]]:
     """Let values that were set in a case take the place of those of its scenarios.
 
+    A factor ("x1.3") or an offset ("by -0.5") of a scenario stays, and is applied to what is set.
+
     Parameters
     ----------
     case : Case in which `values` are set
@@ -149,8 +168,16 @@ def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, l
 
     Returns
     -------
-    (Case, {name in `values`: names of the scenarios that had their own}). A factor ("x1.3") or an
-    offset ("by -0.5") of a scenario stays, and is applied to what is set.
+    (Case, {name in `values`: names of the scenarios that had their own}).
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> from jaxtank.case import Scenario
+    >>> noisy = Scenario("noisy", {"sensor.noise": 0.1})
+    >>> case = presets.find("cascaded/pi").replace(scenarios=(noisy,))
+    >>> rig.overridden(case, {"sensor.noise": 0.0})[1]
+    {'sensor.noise': ['noisy']}
     """
     scenarios, replaced = [], {}
     for s in case.scenarios:
@@ -167,12 +194,32 @@ def overridden(case: Case, values: Mapping[str, Any]) -> tuple[Case, dict[str, l
 
 
 def overlap(one: str, other: str) -> bool:
-    """Whether two dotted names have an entry in common."""
+    """Return whether two dotted names have an entry in common.
+
+    Parameters
+    ----------
+    one, other : dotted names, each of a leaf or of an entry of it
+
+    Examples
+    --------
+    >>> overlap("x0", "x0[1]"), overlap("x0[0]", "x0[1]")
+    (True, False)
+    """
     return one == other or split_index(one)[0] == other or one == split_index(other)[0]
 
 
 def is_change(value: Any) -> bool:
-    """Whether the value of a scenario is a factor or an offset on the case's own."""
+    """Return whether the value of a scenario is a factor or an offset on the case's own.
+
+    Parameters
+    ----------
+    value : number, list, or text as in `set_scenario`
+
+    Examples
+    --------
+    >>> is_change("x1.3"), is_change("by -0.5"), is_change("0.02 if zero"), is_change(1.3)
+    (True, True, False, False)
+    """
     found = _RELATIVE.fullmatch(value.strip()) if isinstance(value, str) else None
     return found is not None and found["default"] is None
 
@@ -220,9 +267,28 @@ def _meta(case, name):
 
 
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
-    """`set_values`, and a schedule of gains made of `table` (that of a rig file; {} for none). What
-    the case has by name is set before the schedule is made, which starts from it; what only the
-    scheduled case has, as controller.values, after.
+    """Return `set_values` of a case with a schedule of gains.
+
+    What the case has by name is set before the schedule is made, which starts from it; what only
+    the scheduled case has, as controller.values, after.
+
+    Parameters
+    ----------
+    case : Case
+    values : {dotted name: value}
+    table : {"gains", "variable", "knots"} as [schedule] of a rig file; {} for no schedule
+
+    Raises
+    ------
+    InputError as `set_values`, and for gains, a variable or knots that make no schedule.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> table = {"gains": ["controller.Tp"], "variable": "r1", "knots": [5.0, 10.0]}
+    >>> case = presets.find("gouta2015/ngpc")
+    >>> rig.set_and_schedule(case, {"controller.Tp": 3.0}, table).loop.controller.values.tolist()
+    [[3.0, 3.0]]
     """
     if table:
         before, values = schedule.known(case.loop, values)
@@ -231,7 +297,19 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
 
 
 def has(loop: ClosedLoop, name: str) -> bool:
-    """Whether a loop has the leaf `name`, an entry of it for "name[i]"."""
+    """Return whether a loop has a leaf.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    name : dotted name of a leaf, or of an entry of it, "name[i]"
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> has(presets.find("cascaded/pi").loop, "x0[2]")
+    False
+    """
     try:
         get_value(loop, name)
     except InputError:

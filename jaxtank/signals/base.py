@@ -36,11 +36,11 @@ class Signal(abc.ABC):
         """Return the samples of a run, evaluated before the time loop.
 
         A method whose every sample follows from `sample_times(clock)` alone may be marked
-        `core.clock.pointwise`: a long run then calls it chunk by chunk.
+        `jaxtank.core.clock.pointwise`: a long run then calls it chunk by chunk.
 
         Parameters
         ----------
-        clock : Clock, or a Piece of one
+        clock : Clock, or a Chunk of one
 
         Returns
         -------

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import Clock, Piece, indices, pointwise, sample_times
+from jaxtank.core.clock import Chunk, Clock, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.signals.base import Signal
@@ -215,10 +215,10 @@ def _course(level, delta, start, duration, shape):
 
 
 def _join(pieces, clock):
-    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Piece`,
+    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Chunk`,
     which may lie anywhere, on all.
     """
-    if isinstance(clock, Piece):
+    if isinstance(clock, Chunk):
         k, t = indices(clock), sample_times(clock)
         found = pieces[0][1](t)
         for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):

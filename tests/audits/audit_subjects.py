@@ -153,9 +153,12 @@ def _(rng):
 def small_network(rng, overflow=True):
     """Three tanks with all that a network has: an orifice, pipes, a split pump, spills."""
     return network(
-        area=rng.uniform(20, 200, 3), drain=rng.uniform(0.05, 0.3, 3), links=((2, 0), (1, 0)), orifice=rng.uniform(0.05, 0.2, 2),
-        pipes=((0, 1), (1, 2)), pipe=rng.uniform(0.05, 0.2, 2), pump_gain=rng.uniform(2, 10, 2), split=rng.uniform(0.1, 0.9, 2),
-        feeds=((0, 2), (1, None)), spills=((2, 0), (0, 1)), caught=rng.uniform(0.1, 0.9, 2), rim=rng.uniform(18, 22, 3),
+        area=rng.uniform(20, 200, 3), drain=rng.uniform(0.05, 0.3, 3), links=((2, 0), (1, 0)),
+        orifice=rng.uniform(0.05, 0.2, 2),
+        pipes=((0, 1), (1, 2)), pipe=rng.uniform(0.05, 0.2, 2), pump_gain=rng.uniform(2, 10, 2),
+        split=rng.uniform(0.1, 0.9, 2),
+        feeds=((0, 2), (1, None)), spills=((2, 0), (0, 1)), caught=rng.uniform(0.1, 0.9, 2),
+        rim=rng.uniform(18, 22, 3),
         outputs=(0, 1), overflow=overflow, bottom=True,
     )  # fmt: skip
 
@@ -289,8 +292,10 @@ def _(rng):
     ) + 0.05 * rng.standard_normal((2, T))
     e[:, -4:] *= 0.2
     tree = {  # not the setpoint: the time measures ask whether it has changed, to the last bit
-        "e": e, "x_hat": r + e + 0.1 * rng.standard_normal((2, T)), "command": rng.uniform(-2, 14, (2, T)),
-        "u": rng.uniform(0, 12, (2, T)), "spilled": rng.uniform(0, 2, (2, T)), "rest": rng.uniform(2, 5, (2, T)),
+        "e": e, "x_hat": r + e + 0.1 * rng.standard_normal((2, T)),
+        "command": rng.uniform(-2, 14, (2, T)),
+        "u": rng.uniform(0, 12, (2, T)), "spilled": rng.uniform(0, 2, (2, T)),
+        "rest": rng.uniform(2, 5, (2, T)),
         "low": np.array([0.5, 0.4]), "high": np.array([11.0, 12.0]), "rim": np.array([8.5, 9.1]),
     }  # fmt: skip
     names = tuple(measures.MEASURES)
@@ -316,7 +321,8 @@ def _(rng):
             window = tuple((pair["r"][i], step[i], now["since"], 0.3) for i in range(2))
             x = tuple(a + b for a, b in zip(pair["r"], pair["e"]))
             sample = Sample(
-                t=now["t"], x=x, y=x, x_hat=pair["x_hat"], d_hat=(), r=pair["r"], e=pair["e"], command=pair["command"],
+                t=now["t"], x=x, y=x, x_hat=pair["x_hat"], d_hat=(), r=pair["r"], e=pair["e"],
+                command=pair["command"],
                 applied=pair["u"], u=pair["u"], spilled=pair["spilled"],
             )  # fmt: skip
             return measures.update(
@@ -335,7 +341,8 @@ def _(rng):
 def bank(rng, **more):
     return actuators.PumpBank(
         **{
-            "low": np.array([0.2, 0.1]), "high": np.array([10.0, 11.0]), "dead_zone": None, "stop": np.array([1.0, 1.1]),
+            "low": np.array([0.2, 0.1]), "high": np.array([10.0, 11.0]), "dead_zone": None,
+            "stop": np.array([1.0, 1.1]),
             "pulse": np.array([4.0, 4.1]), "lag": None, "initial": np.array([2.0, 2.2]), **more,
         }
     )  # fmt: skip
@@ -396,7 +403,7 @@ def matrices(rng, n=3, m=2):
 
 
 def weights(p):
-    """Symmetric weights of their roots: a one-sided change of an entry leaves the symmetric ones."""
+    """Symmetric weights from their roots: a one-sided change of an entry is not symmetric."""
     return p[2] @ p[2].T + 0.1 * jnp.eye(3), p[3] @ p[3].T + jnp.eye(2)
 
 

@@ -29,9 +29,12 @@ COMMANDS = {
     "tune": ["tune", *SHORT, "--starts", "2", "--screening", "4", "--validation", "4", "--quiet"],
     "uncertainty": ["uncertainty", *SHORT, "--samples", "3000", "--quiet"],
     "identify": [
-        *["identify", "cascaded/pi", "--data", "log/trajectory.csv", "--start", "case", "--starts", "4", "--hold-back", "0", "--quiet"],
-        *["--column", "t=t [s]", "--column", "pump1=u1 [V]", "--column", "h1=y1 [V]", "--column", "h2=y2 [V]"],
-        *["--free", "plant.pump_gain[0]=0.02:0.1", "--free", "plant.orifice[0]=0.02:0.08", "--free", "plant.drain[1]=0.02:0.08"],
+        *["identify", "cascaded/pi", "--data", "log/trajectory.csv", "--start", "case", "--starts",
+        "4", "--hold-back", "0", "--quiet"],
+        *["--column", "t=t [s]", "--column", "pump1=u1 [V]", "--column", "h1=y1 [V]", "--column",
+        "h2=y2 [V]"],
+        *["--free", "plant.pump_gain[0]=0.02:0.1", "--free", "plant.orifice[0]=0.02:0.08", "--free",
+        "plant.drain[1]=0.02:0.08"],
     ],
 }  # fmt: skip
 AFRESH = re.compile(r"no evaluations\.jsonl|no ensemble to go on with|had ended")
@@ -182,7 +185,7 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                 mine, theirs = contents(folder), whole[name][3]
                 told["wrong"].append(
                     f"{name}: differs in"
-                    f" {sorted(n for n in mine.keys() | theirs.keys() if mine.get(n) != theirs.get(n))}"
+                    f" {sorted(n for n in mine | theirs if mine.get(n) != theirs.get(n))}"
                 )
                 if os.environ.get("KEEP"):
                     shutil.copytree(folder, Path(os.environ["KEEP"]) / f"{name}{told['trials']}")

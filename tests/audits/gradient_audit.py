@@ -1,14 +1,14 @@
 """Gradients by audit: forward and reverse derivatives of what is public and differentiable against
 central differences at random points.
 
-    python tests/audits/gradient_audit.py            all of it (1,000 points and more; many minutes)
+    python tests/audits/gradient_audit.py            all of it (1,000 points, many minutes)
     python tests/audits/gradient_audit.py --quick    what the default test run does
     python tests/audits/gradient_audit.py law qp     subjects whose name has one of these words
-    python tests/audits/gradient_audit.py --record   also keeps each subject's row in gradient_audit.json,
-    and count and worst error in data/survived.json;
-                                              with words the rows of the others stay, so that it can
-                                              be done in pieces
+    python tests/audits/gradient_audit.py --record   also keeps each subject's row in tests/data
     python tests/audits/gradient_audit.py --record --missing     those without a row
+
+--record writes gradient_audit.json, and count and worst error to survived.json; where subjects are
+named, the rows of the others stay, so that it can be done in pieces.
 
 How a difference is judged. Every direction is scaled by the parameter itself, so steps and slopes
 are relative. Central differences are taken at eight steps, each a quarter of the last, and

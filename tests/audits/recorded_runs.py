@@ -2,8 +2,7 @@
 number.
 
 python tests/audits/recorded_runs.py            compare every case with the record
-python tests/audits/recorded_runs.py --record   record them again (after a change that is meant to change
-numbers)
+python tests/audits/recorded_runs.py --record   record them again: after a change of numbers
 
 On a machine with the recorded processor and versions, runs agree to the last bit; elsewhere
 samples of them agree to 1e-12 of their size (1e-6 where quadratic programmes end their iterations).

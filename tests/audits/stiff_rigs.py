@@ -1,8 +1,9 @@
 """Random stiff rigs with negative inflows into tanks that run empty, against small steps of numpy.
 
-    python tests/audits/stiff_rigs.py 120             120 rigs of each of the four kinds: how many are off,
-    and how many of these in silence python tests/audits/stiff_rigs.py 120 --record    also keeps that in
-    survived.json
+    python tests/audits/stiff_rigs.py 120             120 rigs of each of the four kinds
+    python tests/audits/stiff_rigs.py 120 --record    also keeps the counts in data/survived.json
+
+Printed: how many are off, and how many of these without a warning.
 
 A rig is off where a level differs from the reference by more than 5 % of its rim at any sample, in
 silence where no StepWarning was given. The reference is the projected Euler rule on the equations
@@ -197,12 +198,15 @@ def main(words):
         off += (here := sum(error > OFF for error, _ in found))
         silent += (unsaid := sum(error > OFF for error in quiet))
         worst = max(worst, *quiet)
-        print(f"{kind}: {count - len(found)} refused, {len(found) - len(quiet)} reported, {here} off, {unsaid} in silence, "
-              f"worst in silence {100 * max(quiet):.2g} %")  # fmt: skip
+        print(
+            f"{kind}: {count - len(found)} refused, {len(found) - len(quiet)} reported,"
+            f" {here} off, {unsaid} in silence, worst in silence {100 * max(quiet):.2g} %"
+        )
     if "--record" in words:
         from survived import record
 
-        record("stiff rigs", 4 * count, f"{silent} off by more than {100 * OFF:.0f} % of the rim without a warning "
+        record("stiff rigs", 4 * count,
+               f"{silent} off by more than {100 * OFF:.0f} % of the rim without a warning "
                f"({off} with one or without; worst without {100 * worst:.1f} %)")  # fmt: skip
 
 

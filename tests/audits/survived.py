@@ -2,9 +2,8 @@
 the drills recorded.
 
     python tests/audits/survived.py                 the table of what is recorded
-    python tests/audits/survived.py --markdown      the same into benchmarks/README.md, between its marks
-    python tests/audits/survived.py fuzz kills ...  runs these drills first (all: hours), and records what
-    they find
+    python tests/audits/survived.py --markdown      the same into benchmarks/README.md
+    python tests/audits/survived.py fuzz kills ...  runs these drills first (all: hours)
 
 A drill that fails is recorded as what it is. survived.json holds {drill: {"count", "outcome"}}.
 """

@@ -68,7 +68,7 @@ def say(words, capsys):
 
 @contextlib.contextmanager
 def small_disk(size):
-    """No file may grow past `size` bytes: what is written past it fails, as on a disk that is full."""
+    """No file may grow past `size` bytes: writing more fails, as on a disk that is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -204,7 +204,7 @@ DRAWERS = [
 
 @pytest.mark.parametrize("name", DRAWERS)
 def test_a_picture_that_fails_costs_itself_and_not_the_answer(name, tmp_path, capsys, monkeypatch):
-    """A text that matplotlib cannot set, in one kind of picture; then a function that cannot draw."""
+    """A text that matplotlib cannot set, in one kind of picture; then a function that fails."""
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     whole = old_result(folder, words, capsys)
@@ -463,7 +463,8 @@ def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folde
 ENTRY = """
 import os, signal, sys
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started the tests with it ignored
+# a shell may have started the tests with it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 class Interrupting:
     def find_spec(self, name, path, target=None):

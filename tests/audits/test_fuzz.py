@@ -1,8 +1,8 @@
 """Ten thousand broken rig files, command lines and logs: an answer in one line, no traceback,
 nothing left behind.
 
-The default run does a few hundred of each; `pytest -m slow tests/audits/test_fuzz.py` does the rest and
-prints what was tried.
+The default run does a few hundred of each; `pytest -m slow tests/audits/test_fuzz.py` does the
+rest, and prints what was tried.
 """
 
 import importlib
@@ -21,8 +21,10 @@ from tuning.cli import main
 from tuning.identification.csv_log import read_log
 
 WORDS = [
-    "nan", "inf", "-inf", "1e400", "-1", "0", "1e-300", "true", "''", '"x"', "[]", "{}", "[[1.0]]", "[1.0, 2.0]", "9" * 400, "0x10", "1_000",
-    '"rim"', '"\\u0000"', '"../../etc/passwd"', "1979-05-27", "[nan]", "[true, false]", '["a", 1]', "-0.0", "1e18", "0.5",
+    "nan", "inf", "-inf", "1e400", "-1", "0", "1e-300", "true", "''", '"x"', "[]", "{}", "[[1.0]]",
+    "[1.0, 2.0]", "9" * 400, "0x10", "1_000",
+    '"rim"', '"\\u0000"', '"../../etc/passwd"', "1979-05-27", "[nan]", "[true, false]", '["a", 1]',
+    "-0.0", "1e18", "0.5",
 ]  # fmt: skip
 PATIENCE = 5.0  # s
 
@@ -126,15 +128,21 @@ def test_broken_rig_files(tmp_path):
 
 
 OPTIONS = [
-    "--set", "--dt", "--seed", "--out", "--free", "--limit", "--objective", "--scenario", "--choose", "--tradeoff", "--starts",
-    "--robust", "--samples", "--spread", "--vary", "--shard", "--resume", "--data", "--column", "--gap", "--start", "--lang",
-    "--precision", "--name", "--schedule", "--method", "--batch", "--validation", "--iterations", "--screening", "--devices",
+    "--set", "--dt", "--seed", "--out", "--free", "--limit", "--objective", "--scenario",
+    "--choose", "--tradeoff", "--starts",
+    "--robust", "--samples", "--spread", "--vary", "--shard", "--resume", "--data", "--column",
+    "--gap", "--start", "--lang",
+    "--precision", "--name", "--schedule", "--method", "--batch", "--validation", "--iterations",
+    "--screening", "--devices",
     "--measure", "--draws", "--noise", "--hold-back", "--loss", "--duration",
 ]  # fmt: skip
 VALUES = [
-    "", "nan", "-1", "0", "1e400", "x", "controller.k=1", "controller.k=nan", "controller.q=1", "clock.dt=0", "max_level=",
-    "max_level=x", "a=b=c", "=", "plant.drain[9]=1", "plant.drain[=1", "1:2", "controller.k=2:1", "r1:1,2", "controller.k=r9:1,2",
-    "../..", "\0", "é", "9" * 50, "uniform:5%", "plant.drain=uniform:x", "3/2", "0/0", "none", "h1=level", "🙂", "--", "[1,2",
+    "", "nan", "-1", "0", "1e400", "x", "controller.k=1", "controller.k=nan", "controller.q=1",
+    "clock.dt=0", "max_level=",
+    "max_level=x", "a=b=c", "=", "plant.drain[9]=1",
+    "plant.drain[=1", "1:2", "controller.k=2:1", "r1:1,2", "controller.k=r9:1,2",
+    "../..", "\0", "é", "9" * 50, "uniform:5%", "plant.drain=uniform:x", "3/2", "0/0", "none",
+    "h1=level", "🙂", "--", "[1,2",
     "true", "actuator.delay=1e9", "sensor.noise=-1", "x0=[1]",
 ]  # fmt: skip
 COMMANDS = [

@@ -2,9 +2,9 @@
 difference is a derivative.
 
 The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow
--s tests/audits/test_gradient_audit.py` audits everything, every case of `jaxtank list` too, and prints the
-count and the worst error; that takes half an hour of a processor, so in pieces:
--k law, -k case, -k sensitivities, ... (2 GB at a time).
+-s tests/audits/test_gradient_audit.py` audits everything, every case of `jaxtank list` too, and
+prints the count and the worst error; that takes half an hour of a processor, so in pieces: -k law,
+-k case, -k sensitivities, ... (2 GB at a time).
 """
 
 import dataclasses
@@ -149,7 +149,8 @@ def limited(one, other):
 
 BOX = ((2.0, 0.5, 1.0), np.array([0.0, 0.0]), np.array([10.0, 10.0]))
 PUMP = actuators.PumpBank(
-    low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1), pulse=np.full(1, 4.0), lag=None,
+    low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1),
+    pulse=np.full(1, 4.0), lag=None,
     initial=np.zeros(1), dead_zone_kind="offset",
 )  # fmt: skip
 KINKS = [  # what, f, where, the slope by convention (None: any between)
@@ -267,7 +268,8 @@ def test_pulses_have_the_slope_of_the_mean_flow():
     the gradient has it.
     """
     pumps = actuators.PumpBank(
-        low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1), pulse=np.full(1, 4.0), lag=None,
+        low=np.zeros(1), high=np.full(1, 10.0), dead_zone=np.full(1, 3.0), stop=np.ones(1),
+        pulse=np.full(1, 4.0), lag=None,
         initial=np.zeros(1), dead_zone_kind="pulse",
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ import jaxtank
 import tuning
 from jaxtank import presets
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.clock import PIECE, Clock, is_pointwise
+from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.tree import component
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -71,7 +71,8 @@ def tank(reference, x0=REST, rim=30.0, volts=2.0, overflow=False):
 def moving():
     """A setpoint that swings about the level at rest."""
     return Sine(
-        amplitude=np.array(1.0), offset=np.array(REST), period=977.0, zero=0.0, start=0.0, end=1e9, channel=0, width=1
+        amplitude=np.array(1.0), offset=np.array(REST), period=977.0, zero=0.0, start=0.0, end=1e9,
+        channel=0, width=1
     )  # fmt: skip
 
 
@@ -144,7 +145,8 @@ import test_long_runs as here
 run, peaks = {"run": here.one_long_run, "draws": here.drained}[sys.argv[2]], []
 for size in sys.argv[3:]:
     run(int(size))
-    peaks.append(next(1024 * int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmHWM")))
+    (line,) = (line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+    peaks.append(1024 * int(line.split()[1]))
 print(json.dumps(peaks))
 """
 
@@ -187,7 +189,7 @@ def noisy(reference=None):
     """
     case = presets.find("gouta2015/backstepping-ff")
     loop, dt = case.loop, case.clock.dt
-    late = [PIECE * dt - 2.0, PIECE * dt + 3.0]
+    late = [CHUNK * dt - 2.0, CHUNK * dt + 3.0]
     return dataclasses.replace(
         loop,
         reference=reference
@@ -203,18 +205,18 @@ def noisy(reference=None):
 
 @pytest.mark.parametrize("rest", [0, 1000])
 def test_a_run_in_pieces_is_the_run(rest):
-    """Longer runs are made in pieces of PIECE samples: measures against the trajectory of the same
+    """Longer runs are made in pieces of CHUNK samples: measures against the trajectory of the same
     run, made in one.
     """
-    loop, long = noisy(), Clock(dt=0.01, duration=(PIECE * (1 if rest else 2) + rest - 1) * 0.01)
+    loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK * (1 if rest else 2) + rest - 1) * 0.01)
     key = jax.random.key(3)
-    assert is_pointwise(loop) and long.samples > PIECE
+    assert is_pointwise(loop) and long.samples > CHUNK
     found = jaxtank.evaluate(
         loop, long, ["ise", "max_level", "input_travel", "rms_input", "recovery_time"], key
     )
     run = jaxtank.simulate(loop, long, key)
     e, u = np.asarray(run.e), np.asarray(run.u)
-    assert np.ptp(np.asarray(run.r)[PIECE:]) > 0.5  # something happens in the second piece
+    assert np.ptp(np.asarray(run.r)[CHUNK:]) > 0.5  # something happens in the second piece
     np.testing.assert_allclose(found["ise"], (e**2).sum(axis=0) * 0.01, rtol=1e-9)
     np.testing.assert_allclose(found["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-9)
     np.testing.assert_allclose(
@@ -225,8 +227,8 @@ def test_a_run_in_pieces_is_the_run(rest):
 
 @pytest.mark.slow
 def test_slopes_through_pieces():
-    """Forward, in pieces of PIECE samples, against reverse, whose pieces are of another kind."""
-    loop, long = noisy(), Clock(dt=0.01, duration=(PIECE + 999) * 0.01)
+    """Forward, in pieces of CHUNK samples, against reverse, whose pieces are of another kind."""
+    loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK + 999) * 0.01)
 
     def cost(evaluate, k):
         return evaluate(

@@ -1,7 +1,7 @@
 """Physics by property: what must hold of every rig, on random ones (random_rigs.py), whatever joins
 the tanks.
 
-A default run tries a few rigs of each; `pytest -m slow tests/audits/test_properties.py` tries hundreds.
+A default run tries a few rigs of each, `pytest -m slow tests/audits/test_properties.py` hundreds.
 Examples are the same in every run. All rigs are of one compiled shape, so that none is compiled for
 an example.
 """
@@ -157,7 +157,7 @@ def test_tanks_run_dry_and_never_below(seed, tanks, kind):
 
 
 def never_lower(plant, x, more_x, u, more_u):
-    """How far below the one run the other comes anywhere, which starts higher and is fed more [cm]."""
+    """How far the run that starts higher and is fed more comes below the other anywhere [cm]."""
     low, high = (course(plant, a, v, STILL)[0] for a, v in ((x, u), (more_x, more_u)))
     return (low - high).max()
 

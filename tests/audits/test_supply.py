@@ -30,7 +30,8 @@ PACKAGES = {p.__name__: Path(p.__file__).parent for p in (jaxtank, tuning)}
 SUSPECT = {
     "pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib",
     "code", "codeop", "runpy", "imp",
-    "socket", "socketserver", "ssl", "urllib", "http", "ftplib", "smtplib", "telnetlib", "xmlrpc", "requests", "httpx", "aiohttp", "asyncio",
+    "socket", "socketserver", "ssl", "urllib", "http", "ftplib", "smtplib", "telnetlib", "xmlrpc",
+    "requests", "httpx", "aiohttp", "asyncio",
     "websockets", "webbrowser", "sentry_sdk", "posthog", "analytics",
     "subprocess", "ctypes", "cffi", "multiprocessing", "pty",
 }  # fmt: skip

@@ -6,7 +6,8 @@ import survived
 
 REPORT = """<testsuites><testsuite>
 <testcase name="a[200]"/><testcase name="b[8]"><failure message="x"/></testcase>
-<testcase name="c"><skipped message="no"/></testcase><testcase name="d"><error message="y"/></testcase>
+<testcase name="c"><skipped message="no"/></testcase>
+<testcase name="d"><error message="y"/></testcase>
 </testsuite></testsuites>"""
 
 

@@ -140,7 +140,8 @@ def c_run(function, case, samples, single=False):
 
     def run():
         function(
-            ctypes.c_long(rows.shape[1]), at(rows), at(own), gravity, knee, at(nominal), ctypes.c_long(clock.samples), dt,
+            ctypes.c_long(rows.shape[1]), at(rows), at(own), gravity, knee, at(nominal),
+            ctypes.c_long(clock.samples), dt,
             int(clock.integrator == "rk4"), *rest, at(x0), at(r), at(found),
         )  # fmt: skip
         return np.sqrt(found[:samples, 0] / clock.samples), found[:samples, 1:]
@@ -176,11 +177,13 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", devices)
 from jaxtank import presets, rig
 case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": dt})
-run = lambda n: tuning.ensemble(case, samples=n, measures=("rms_error_total", "max_level"), fan=False, devices=devices)
+names = ("rms_error_total", "max_level")
+run = lambda n: tuning.ensemble(case, samples=n, measures=names, fan=False, devices=devices)
 run(512)
 began = time.perf_counter()
 run(samples)
-print(time.perf_counter() - began, int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1]) / 1024)
+peak = int(re.search(r"VmHWM:\\s*(\\d+)", open("/proc/self/status").read())[1])
+print(time.perf_counter() - began, peak / 1024)
 """
 
 

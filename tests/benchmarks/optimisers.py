@@ -14,7 +14,8 @@ of them found. Counted are
                   over that of one without, a pass at a tenth of the samples as its own measured
                   time over the same
 
-Compile time is apart. Nothing is asserted here; tests/unit/search/test_optimisers.py pins the structural cause,
+Compile time is apart. Nothing is asserted here;
+tests/unit/search/test_optimisers.py pins the structural cause,
 the few evaluations.
 """
 

@@ -15,7 +15,7 @@ SIZES, LANES, ROUNDS, CALLS = (48, 60, 100), 16, 5, 4
 
 
 def programme(n):
-    """(H, f, G, l, u) of a predictive controller: n increments, limits on each and on their sums."""
+    """(H, f, G, l, u) of a predictive controller: n increments, limits on them and their sums."""
     response = 1.0 - 0.95 ** np.arange(1, 2 * n + 1)
     ahead = np.array([[response[i - j] if i >= j else 0.0 for j in range(n)] for i in range(2 * n)])
     H, f = 2.0 * (ahead.T @ ahead + 0.05 * np.eye(n)), -2.0 * ahead.sum(axis=0)

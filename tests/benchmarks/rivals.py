@@ -46,7 +46,8 @@ def constants(case):
     A, d, o, g = (np.asarray(getattr(p, n)) for n in ("area", "drain", "orifice", "pump_gain"))
     c = np.array(
         [
-            d[0] * w / A[0], o[0] * w / A[0], o[2] * w / A[0], d[1] * w / A[1], o[1] * w / A[1], o[3] * w / A[1],
+            d[0] * w / A[0], o[0] * w / A[0], o[2] * w / A[0], d[1] * w / A[1], o[1] * w / A[1],
+            o[3] * w / A[1],
             (o[0] + o[1]) * w / A[2], g[0] / A[2], (o[2] + o[3]) * w / A[3], g[1] / A[3],
         ]
     )  # fmt: skip

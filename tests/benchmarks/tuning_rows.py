@@ -172,7 +172,7 @@ def quadruple():
 
 
 def two_tank():
-    """{name: Row} of gouta2022: the whole run, noise of 0.02 cm, with delays between pump and tank."""
+    """{name: Row} of gouta2022: the whole run, noise of 0.02 cm, delays between pump and tank."""
     rows = {}
     for delay, target in {0.0: "0.505", 0.2: "0.534", 0.5: "0.579", 1.0: "0.657"}.items():
         values, name = {"actuator.delay": delay}, f"gouta2022-delay-{delay:g}"

@@ -9,12 +9,12 @@ import math
 import os
 import subprocess
 import sys
-from typing import NamedTuple
 
 import jax
 import matplotlib.image
 import numpy as np
 import pytest
+from helpers import command as say
 
 import jaxtank
 import tuning
@@ -63,25 +63,6 @@ MEASURES = {
     "recovery_time",
     "estimation_rms",
 }
-
-
-class Said(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self):
-        """The one object on stdout; refuses NaN and infinity, which are not JSON."""
-        return json.loads(self.out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-
-
-def say(*args):
-    """Run the command here, in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(args))
-    return Said(code, out.getvalue(), err.getvalue())
 
 
 def done(*args):
@@ -556,6 +537,8 @@ def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
         "--quiet",
         "--iterations",
         "20",
+        "--validation",
+        "0",
     )
     assert said.code in (0, 3) and said.err == "", said.err
     found = said.json
@@ -618,6 +601,7 @@ NOISY = (
 NOISY += ("--set", "clock.duration=60", "--set", "sensor.noise=0.005")
 
 
+@pytest.mark.slow
 def test_what_is_set_holds_in_the_scenarios_of_the_case():
     said = say(*NOISY, "--json")
     own = {"clock.duration": 60.0, "sensor.noise": 0.005}
@@ -720,6 +704,8 @@ def test_too_few_iterations_end_with_3():
         "1",
         "--iterations",
         "1",
+        "--validation",
+        "0",
         "--json",
         "--quiet",
     )

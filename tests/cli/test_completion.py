@@ -138,7 +138,9 @@ def test_it_knows_what_the_parser_and_the_library_have():
         "python -c 'from tuning.cli.completion import refresh; refresh()'"
     )
     found = completion.commands_of(parser())
-    assert set(found) - {""} == COMMANDS == set(parser().commands) and all(c.help for n, c in found.items() if n)
+    assert set(found) - {""} == COMMANDS == set(parser().commands) and all(
+        c.help for n, c in found.items() if n
+    )
     for (command, option), values in completion.FEW.items():
         assert any(
             option in o.flags and o.value == " ".join(values) for o in found[command].options

@@ -102,6 +102,6 @@ def test_a_plan_has_no_log(refused):
     ("option", "value"), [("--duration", "300"), ("--voltage", "3,3"), ("--measure", "h1")]
 )
 def test_a_log_has_no_plan(refused, option, value):
-    assert f"{option} {value!r}: is of an experiment that is planned" in refused(
+    assert f"{option} {value!r}: belongs to a planned experiment, with --plan" in refused(
         *IDENTIFY, "--data", "nope.csv", option, value
     )

@@ -79,7 +79,7 @@ def test_everything_of_a_case_is_on_its_page(name):
     for kind in ("leaf", "static"):
         for leaf, value, _ in walk(case.loop, kind=kind):
             if not (
-                isinstance(value, tuple) or np.size(value) == 0 or leaf.startswith(manual.BELIEFS)
+                isinstance(value, tuple) or np.size(value) == 0 or leaf.startswith(manual.MODELS)
             ):
                 # a longer name may be broken where its column ends
                 assert squeeze(leaf)[:20] in every, leaf
@@ -96,7 +96,7 @@ def test_everything_of_a_case_is_on_its_page(name):
     for heading in (
         "The rig:",
         "The loop",
-        "The law:",
+        "The controller:",
         "The observer:",
         "What is tuned",
         "Every parameter",
@@ -144,7 +144,7 @@ def test_a_rig_of_ones_own_is_shown(capsys):
     page = capsys.readouterr().out
     assert (
         "A2 h2' = s12 q(h1) - a2 q(h2)" in page
-        and "The law: PID" in page
+        and "The controller: PID" in page
         and "departures" not in page
     )
 

@@ -51,8 +51,14 @@ def open_loop(loop):
     return dataclasses.replace(loop, controller=law)
 
 
-@pytest.mark.parametrize("h1, h3, z3, u", [(0.48, 0.1237217, 0.5968905, 0.6068586), (0.30, 0.0773260, 0.4718834, 0.4797638),
-                                           (0.60, 0.1546521, 0.6673439, 0.6784886)])  # fmt: skip
+@pytest.mark.parametrize(
+    "h1, h3, z3, u",
+    [
+        (0.48, 0.1237217, 0.5968905, 0.6068586),
+        (0.30, 0.0773260, 0.4718834, 0.4797638),
+        (0.60, 0.1546521, 0.6673439, 0.6784886),
+    ],
+)
 def test_equilibria(h1, h3, z3, u):
     """Notes S2.2, by the law's own plan and by the balance of the network."""
     law = CASES["backstepping"].loop.controller
@@ -264,8 +270,13 @@ def test_permanent_faults(fault, r, offsets):
     np.testing.assert_allclose(found, offsets, atol=0.5e-3)
 
 
-@pytest.mark.parametrize("K, printed, rest, near", [((0.02, 0.1), -0.003, -0.0024795, [0.478, 0.08]),
-                                                    ((0.05, 0.05), 0.082, 0.0814987, [0.56, 0.09])])  # fmt: skip
+@pytest.mark.parametrize(
+    "K, printed, rest, near",
+    [
+        ((0.02, 0.1), -0.003, -0.0024795, [0.478, 0.08]),
+        ((0.05, 0.05), 0.082, 0.0814987, [0.56, 0.09]),
+    ],
+)
 def test_offsets_of_a_narrowed_pipe(K, printed, rest, near):
     """The two numbers of notes S7.2 where the prototype's last digit is not ours: the balance at
     rest (scipy, exact roots, the law as in notes S4.2) gives others.
@@ -413,8 +424,16 @@ def test_the_rig_in_centimetres():
     """
     case = CASES["backstepping"]
     m = case.loop.plant
-    cm = dataclasses.replace(m, area=m.area * 1e4, drain=m.drain * 1e4, pipe=m.pipe * 1e4, gravity=m.gravity * 100, rim=m.rim * 100,
-                             units=("cm", "cm^3/s"), knee=m.knee * 100)  # fmt: skip
+    cm = dataclasses.replace(
+        m,
+        area=m.area * 1e4,
+        drain=m.drain * 1e4,
+        pipe=m.pipe * 1e4,
+        gravity=m.gravity * 100,
+        rim=m.rim * 100,
+        units=("cm", "cm^3/s"),
+        knee=m.knee * 100,
+    )
     law = case.loop.controller
     # same sum; product less the difference of the two a^2
     K = np.sort(np.roots([1.0, -0.4, 0.1 * 0.3 + A**2 * (1 - 100)]))
@@ -428,10 +447,13 @@ def test_the_rig_in_centimetres():
     )
     bank, ref = case.loop.actuator, case.loop.reference
     in_cm = dataclasses.replace(
-        case.loop, plant=cm, controller=law_cm, x0=case.loop.x0 * 100,
+        case.loop,
+        plant=cm,
+        controller=law_cm,
+        x0=case.loop.x0 * 100,
         actuator=dataclasses.replace(bank, high=bank.high * 1e6),
         reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100),
-    )  # fmt: skip
+    )
     a = jaxtank.simulate(with_values(case.loop, gains(0.1, 0.3)), case.clock)
     b = jaxtank.simulate(in_cm, case.clock)
     np.testing.assert_allclose(b.x, 100 * a.x, atol=1e-9)
@@ -440,8 +462,21 @@ def test_the_rig_in_centimetres():
 
 def test_the_tanks_in_the_other_order():
     m = calofir.rig()
-    turned = network(area=m.area[::-1], drain=m.drain[::-1], pipes=((0, 1),), pipe=m.pipe, pump_gain=m.pump_gain, feeds=[(1, None)],
-                     gravity=m.gravity, rim=m.rim[::-1], outputs=(1,), overflow=True, bottom=True, units=m.units, knee=m.knee)  # fmt: skip
+    turned = network(
+        area=m.area[::-1],
+        drain=m.drain[::-1],
+        pipes=((0, 1),),
+        pipe=m.pipe,
+        pump_gain=m.pump_gain,
+        feeds=[(1, None)],
+        gravity=m.gravity,
+        rim=m.rim[::-1],
+        outputs=(1,),
+        overflow=True,
+        bottom=True,
+        units=m.units,
+        knee=m.knee,
+    )
     one, other = (
         np.array(p.derivative(0.0, x, (5e-5,), None))
         for p, x in ((m, (0.3, 0.1)), (turned, (0.1, 0.3)))
@@ -480,15 +515,33 @@ def test_what_is_measured():
     assert "-0.0395 and -0.0490 m" in found["some steady state errors"].text
 
 
-@pytest.mark.parametrize("always, instead, changed", [
-    # notes S7.2: the offset by a closed outlet grows to -0.107 m
-    (gains(0.1, 0.1), None, {"reacts": "not reproduced"}),
-    (gains(0.004, 0.004), None, {"steady state": "not reproduced", "reacts": "not reproduced", "same performance": "reproduced"}),
-    ({"controller.model.drain": [0.0, 0.9 * calofir.C2 / calofir.SPEED]}, None,
-     {"steady state": "not reproduced", "same performance": "not reproduced"}),
-    ({"controller.difference_floor": 1e-4}, None, {"globally": "reproduced"}),
-    (None, {"backstepping-perturbed": "backstepping"}, {"reacts": "not reproduced", "some steady state errors": "not reproduced"}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "always, instead, changed",
+    [
+        # notes S7.2: the offset by a closed outlet grows to -0.107 m
+        (gains(0.1, 0.1), None, {"reacts": "not reproduced"}),
+        (
+            gains(0.004, 0.004),
+            None,
+            {
+                "steady state": "not reproduced",
+                "reacts": "not reproduced",
+                "same performance": "reproduced",
+            },
+        ),
+        (
+            {"controller.model.drain": [0.0, 0.9 * calofir.C2 / calofir.SPEED]},
+            None,
+            {"steady state": "not reproduced", "same performance": "not reproduced"},
+        ),
+        ({"controller.difference_floor": 1e-4}, None, {"globally": "reproduced"}),
+        (
+            None,
+            {"backstepping-perturbed": "backstepping"},
+            {"reacts": "not reproduced", "some steady state errors": "not reproduced"},
+        ),
+    ],
+)
 def test_verdicts_follow_the_numbers(always, instead, changed):
     found = verdicts(always, instead)
     for words, verdict in changed.items():

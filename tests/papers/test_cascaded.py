@@ -98,10 +98,19 @@ def test_a_fit_from_elsewhere_comes_back():
 
 
 @pytest.mark.slow_for("pi-names0")
-@pytest.mark.parametrize("name, names", [
-    ("pi", ["controller.Kc[0]", "controller.Ti[0]", "controller.Tt[0]", "controller.bias[0]"]),
-    ("open-loop", ["controller.signal.initial[0]", *(f"controller.signal.targets[{i}]" for i in range(3))]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, names",
+    [
+        ("pi", ["controller.Kc[0]", "controller.Ti[0]", "controller.Tt[0]", "controller.bias[0]"]),
+        (
+            "open-loop",
+            [
+                "controller.signal.initial[0]",
+                *(f"controller.signal.targets[{i}]" for i in range(3)),
+            ],
+        ),
+    ],
+)
 def test_gradients_against_central_differences(name, names):
     case = CASES[name]
     if name == "pi":

@@ -40,7 +40,7 @@ def law(kind, **changes):
 
 @functools.cache
 def closed(kind, where="S2", mode="unconstrained", du=0.5, r_w=1e-2):
-    """(loop, Trajectory as host arrays) of a scenario; what is not static shares one compiled run."""
+    """(loop, Trajectory in numpy) of a scenario; what is not static shares one compiled run."""
     loop = with_values(
         khalid.build(kind, where, mode), {"controller.du_limit": du, "controller.r_w": r_w}
     )
@@ -185,7 +185,7 @@ def test_laguerre_functions_are_impulse_responses(a):
 @pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("pole", [0.0, 0.4])
 def test_slopes_of_laguerre_functions_by_their_pole(pole):
-    """At a = 0 too, where a power would have none: the one-sided limit is that of the polynomial."""
+    """At a = 0 too, where a power would have none: the one-sided limit is the polynomial's."""
     f = lambda a: laguerre_functions(a, 4, 12)
     slope, step = jax.jacfwd(f)(jnp.float64(pole)), 1e-6
     np.testing.assert_allclose(
@@ -568,8 +568,15 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
         if limited:
             least = np.concatenate([np.full(ahead * pumps, -du), np.tile(-u, ahead)])
             most = np.concatenate([np.full(ahead * pumps, du), np.tile(3.0 - u, ahead)])
-            bounds = [{"type": "ineq", "fun": lambda z, most=most, least=least: np.concatenate([most - rows @ z, rows @ z - least]),
-                       "jac": lambda z: np.concatenate([-rows, rows])}]  # fmt: skip
+            bounds = [
+                {
+                    "type": "ineq",
+                    "fun": lambda z, most=most, least=least: np.concatenate(
+                        [most - rows @ z, rows @ z - least]
+                    ),
+                    "jac": lambda z: np.concatenate([-rows, rows]),
+                }
+            ]
             cost, slope = (
                 (lambda z, pull=Psi @ error: z @ Omega @ z + 2 * z @ pull),
                 (lambda z, pull=Psi @ error: 2 * (Omega @ z + pull)),
@@ -670,13 +677,26 @@ def test_a_programme_whose_limits_are_far_is_the_linear_law(kind):
 def in_centimetres(loop):
     """The same loop in cm: every leaf by its own unit."""
     plant = dataclasses.replace(
-        loop.plant, area=loop.plant.area * 1e4, drain=loop.plant.drain * 1e4, pipe=loop.plant.pipe * 1e4, knee=1e-2, units=("cm", "U0"),
-        pump_gain=loop.plant.pump_gain * 1e6, gravity=loop.plant.gravity * 100, rim=loop.plant.rim * 100)  # fmt: skip
+        loop.plant,
+        area=loop.plant.area * 1e4,
+        drain=loop.plant.drain * 1e4,
+        pipe=loop.plant.pipe * 1e4,
+        knee=1e-2,
+        units=("cm", "U0"),
+        pump_gain=loop.plant.pump_gain * 1e6,
+        gravity=loop.plant.gravity * 100,
+        rim=loop.plant.rim * 100,
+    )
     ours, ref = loop.controller, loop.reference
     return dataclasses.replace(
-        loop, plant=plant, x0=loop.x0 * 100,
-        controller=dataclasses.replace(ours, model=plant, operating_point=ours.operating_point * 100, r_w=ours.r_w * 1e4),
-        reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100))  # fmt: skip
+        loop,
+        plant=plant,
+        x0=loop.x0 * 100,
+        controller=dataclasses.replace(
+            ours, model=plant, operating_point=ours.operating_point * 100, r_w=ours.r_w * 1e4
+        ),
+        reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100),
+    )
 
 
 @pytest.mark.slow_for("laguerre-unconstrained")
@@ -700,7 +720,7 @@ def test_centimetres_change_nothing(kind, mode):
     "kind, mode", [("laguerre-mimo", UNC), pytest.param("gpc-mimo", QP, marks=LATER)]
 )
 def test_exchanged_tanks_give_exchanged_answers(kind, mode):
-    """Tanks made unlike, then exchanged with all that belongs to them; the pipe joins the same two."""
+    """Tanks made unlike, then exchanged with all that is theirs; the pipe joins the same two."""
     drain = np.array([78.5e-6, 60e-6])
     values = {
         "plant.drain": drain,

@@ -44,14 +44,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.plants.rigs import johansson
 from jaxtank.plants.runge_kutta import integrate
 from jaxtank.presets import load
-from jaxtank.presets.loops.mirakhorli import (
-    GAIN,
-    RELAY,
-    SETPOINT,
-    UNROUNDED_SPLIT,
-    plant,
-    sliding,
-)
+from jaxtank.presets.loops.mirakhorli import GAIN, RELAY, SETPOINT, UNROUNDED_SPLIT, plant, sliding
 from jaxtank.presets.mirakhorli import measured, response
 
 PLANT = plant()
@@ -1327,15 +1320,15 @@ def test_names_of_the_contract():
 
 
 def test_every_published_number_that_can_be_measured_is():
-    measured = measured(
+    found = measured(
         lambda name, values=None, save_every=1: run(
             name, **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()}
         )
     )
     published = load("mirakhorli").published
-    assert set(measured) <= set(published)
+    assert set(found) <= set(published)
     verdicts = {
-        name: claim.verdict for name, claim in measured.items() if hasattr(claim, "verdict")
+        name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")
     }
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3

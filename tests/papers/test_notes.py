@@ -20,7 +20,8 @@ HEADING = re.compile(r"^###? (S\d+(?:\.\d+)?) ", re.M)  # a section
 ENTRY = re.compile(r"(?:^\| |\*\*)([AEH]\d+)(?: \||\*\*)", re.M)
 LABEL = r"[SAEH]\d+(?:\.\d+)?"
 REFERENCE = re.compile(
-    rf"(?:\b({'|'.join(presets.PAPERS)})[\s#]+)?\b[Nn]otes[\s#]+({LABEL}(?:(?:, | and | to |-){LABEL})*)"
+    rf"(?:\b({'|'.join(presets.PAPERS)})[\s#]+)?\b[Nn]otes[\s#]+"
+    rf"({LABEL}(?:(?:, | and | to |-){LABEL})*)"
 )
 
 

@@ -27,7 +27,7 @@ def everything():
 
 @pytest.fixture(scope="module")
 def errors(everything):
-    """{(law, spread): (N,) total RMS errors [cm]}, and those of the nominal plant as {law: number}."""
+    """{(law, spread): (N,) total RMS errors [cm]}, and of the nominal plant {law: number}."""
     found, nominal = everything
     return {key: f.measures["rms_error_total"] for key, f in found.items()}, nominal
 

@@ -184,7 +184,8 @@ def test_integral_action_beats_tuned_state_feedback_before_it_is_tuned():
         ("khalid-constrained-priced", 6.1),
         ("khalid-mimo", 31.0),
         ("khalid-mimo-constrained", 1.5),
-        # prototype: 23 %, from a first value of 14.40 that its own table rules out (test_khalid.py); its last value is met by `test_target`
+        # prototype: 23 %, from a first value of 14.40 that its own table rules out
+        # (test_khalid.py); its last value is met by `test_target`
         ("khalid-mimo-constrained-M3", 1.7),
     ],
 )
@@ -193,7 +194,7 @@ def test_gains_of_the_predictive_laws(name, least):
 
 
 def test_the_table_is_that_of_the_store():
-    """Every row that is stored is one of ours, its limits hold, and benchmarks/README.md shows it."""
+    """Every stored row is one of ours, its limits hold, and benchmarks/README.md shows it."""
     stored = json.loads(tuning_table.STORE.read_text())
     assert set(stored["rows"]) <= set(ROWS) and set(stored["bounds"]) <= set(BOUNDS)
     limits = [row["limits"]["after"] for row in stored["rows"].values()]

@@ -79,9 +79,9 @@ QUICK = FEW | dict(validation=0)
 def own():
     """The case of RIG; the registry of rig files is put back after these tests."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("LAWS", "OBSERVERS", "REGISTERED"):
-            known = getattr(components, name)
-            patch.setattr(components, name, type(known)(known))
+        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
+        for name, role in components.ROLES.items():
+            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
         rig.register("proportional", Proportional)
         rig.register("offset", Offset)
         yield rig.loads(RIG)
@@ -464,10 +464,9 @@ def results(own, tuned):
     """{name: result of each kind}, of a case whose name is hostile, under a class of one's own."""
     with pytest.MonkeyPatch.context() as patch:  # a class that has no name in a file
         patch.setattr(components, "REGISTERED", {})
-        for name in ("LAWS", "OBSERVERS"):
-            table = getattr(components, name)
-            left = {k: v for k, v in table.items() if v not in (Proportional, Offset)}
-            patch.setattr(components, name, type(table)(left))
+        for name, role in components.ROLES.items():
+            left = {k: v for k, v in role.classes.items() if v not in (Proportional, Offset)}
+            patch.setitem(components.ROLES, name, role._replace(classes=left))
         case = own.replace(name=NASTY)
         spread = {"plant.pump_gain": tuning.Normal(relative=0.05)}
         t = np.arange(0.0, 60.0, 2.0)

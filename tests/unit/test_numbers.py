@@ -26,15 +26,19 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 from jaxtank import presets, rig
-case = rig.set_values(presets.find("gouta2022/chadpc"), {"clock.duration": 20.0, "sensor.noise": 0.02, "actuator.delay": 0.2})
+values = {"clock.duration": 20.0, "sensor.noise": 0.02, "actuator.delay": 0.2}
+case = rig.set_values(presets.find("gouta2022/chadpc"), values)
 names, device = ["rms_error_total", "input_travel", "max_level"], jax.devices()[-1]
 def run(value, noise):
-    return jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.Tp": value}), case.clock, names, jax.random.key(noise))
+    loop = jaxtank.with_values(case.loop, {"controller.Tp": value})
+    return jaxtank.evaluate(loop, case.clock, names, jax.random.key(noise))
 at = jax.device_put(1.3, device)
 found = {"one": run(at, 5), "slope": jax.jacfwd(lambda v: run(v, 5))(at)}
-found["lanes"] = jax.vmap(run)(jax.device_put(np.array([0.9, 1.3, 2.0]), device), np.array([4, 5, 6], dtype=np.uint32))
+many = jax.device_put(np.array([0.9, 1.3, 2.0]), device)
+found["lanes"] = jax.vmap(run)(many, np.array([4, 5, 6], dtype=np.uint32))
 places = {d.id for v in jax.tree.leaves(found) for d in v.devices()}
-print(json.dumps([{f"{k} {n}": [x.hex() for x in np.ravel(v).tolist()] for k, t in found.items() for n, v in t.items()}, sorted(places)]))
+flat = {f"{k} {n}": np.ravel(v).tolist() for k, t in found.items() for n, v in t.items()}
+print(json.dumps([{n: [x.hex() for x in v] for n, v in flat.items()}, sorted(places)]))
 """
 
 
@@ -92,7 +96,8 @@ FLOAT32 = """
 import jaxtank, tuning
 from jaxtank import presets
 case = presets.find("cascaded/pi")
-for run in (lambda: tuning.tune(case), lambda: tuning.identify(case, None), lambda: tuning.tune_robust(case)):
+calls = [lambda: tuning.tune(case), lambda: tuning.identify(case, None)]
+for run in (*calls, lambda: tuning.tune_robust(case)):
     try:
         run()
         print("ran")

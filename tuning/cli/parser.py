@@ -28,5 +28,4 @@ def parser():
     commands, parents = top.add_subparsers(dest="command", metavar="COMMAND"), shared()
     for module in (case, tuning, studies, identification, tools):
         module.add(commands, parents)
-    commands.choices["identify"].set_defaults(run=identification.run_interruptibly)
     return top

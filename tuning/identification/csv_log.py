@@ -1,4 +1,7 @@
-"""Logs as CSV files: a header that names columns and units, or a rig's [log] table that does."""
+"""CSV files of experiment data: columns and units from the header, or from a rig's [log] table.
+
+Imported by the command `identify` and as `tuning.read_log`.
+"""
 
 import csv
 import io
@@ -6,7 +9,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +17,8 @@ from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.files import refusal
 from jaxtank.core.text import printable
 from jaxtank.loop.closed_loop import ClosedLoop
-from tuning.identification.experiment import FLOWS, LENGTHS, VOLTS, Log, log
+from tuning.identification.data_checks import FLOWS, LENGTHS, VOLTS
+from tuning.identification.experiment import Log, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
@@ -29,98 +33,110 @@ NAMES = {
 }
 
 
+class _Column(NamedTuple):
+    """A column of the file: its index, what it holds, and the factor to the rig's unit."""
+
+    index: int
+    kind: str  # "time", "pump" or "level"
+    number: int  # of the pump or the tank, counted from 0
+    header: str
+    unit: str
+    factor: float
+    in_volts: bool = False  # a level as the sensor's voltage
+
+
 def read_log(
     path: str | Path, loop: ClosedLoop, columns: Mapping[str, Any] | None = None, decimal: str = "."
 ) -> Log:
-    """The Log of a CSV file, for the rig of `loop` (a ClosedLoop).
+    """Read experiment data from a CSV file.
 
-    columns: {"t", "pump1", .., "h1", ..: a column's header, or (header, unit)}, where the header
-    does not say it in its own words ("h1 [cm]", "pump1_V", "time [s]"); "none" leaves a level out;
-    decimal: "." or ",". Comma or semicolon or tab between cells, "#" for lines to pass over, an
-    empty cell or "nan" for a reading that is missing. Raises DataError, naming line and column, for
-    anything else.
+    Cells are separated by comma, semicolon or tab; lines that begin with "#" are comments; an empty
+    cell or "nan" is a missing reading. A header such as "t [s]", "pump1_V" or "h1 (mm)" names
+    column and unit; values are converted to the rig's units.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, UTF-8.
+    loop : ClosedLoop
+        The rig that was measured.
+    columns : mapping, optional
+        Column of each of "t", "pump1", .., "h1", ..: a header, or (header, unit), where the header
+        is in other words; "none" leaves a level out.
+    decimal : str
+        Decimal sign, "." or ",".
+
+    Returns
+    -------
+    Log
+
+    Raises
+    ------
+    DataError
+        For a file that cannot be read so, naming line and column.
+    InputError
+        For `columns` or `decimal` that do not exist.
+
+    Examples
+    --------
+    >>> import pathlib, tempfile, tuning
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded").cases["open-loop"].loop
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = pathlib.Path(folder) / "run.csv"
+    ...     _ = path.write_text("t [s],pump1 [mV],h2 [V]\\n0,3000,1\\n4,3000,1.5\\n8,3500,\\n")
+    ...     data = tuning.read_log(path, loop)
+    >>> print(data.u[:, 0], data.y[:, 0], data.tanks)
+    [3.  3.  3.5] [1.  1.5 nan] (1,)
     """
     path = Path(path)
     if decimal not in (".", ","):
         raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
-    text, called = _text(path), printable(path.name)
-    rows = _rows(text, called)
+    text, name = _text(path), printable(path.name)
+    rows = _rows(text, name)
     first, header = next(rows, (0, None))
     if header is None:
-        raise DataError(f"{called}: is empty: a header line and samples are needed")
+        raise DataError(f"{name}: is empty: a header line and samples are needed")
     header = [cell.strip() for cell in header]
-    wanted = _columns(header, called, first, loop, columns or {})
-    lines, table = [], []
-    for line, cells in rows:
-        # a separator at the end of the line
-        while len(cells) > len(header) and not cells[-1].strip():
-            cells.pop()
-        if len(cells) != len(header):
-            hint = (
-                ": a comma within a number? Cells need another separator then, as ';' with"
-                " --decimal ,"
-                if len(cells) > len(header)
-                else ""
-            )
-            raise DataError(
-                f"{called}, line {line}: {len(cells)} cells under {len(header)} column names{hint}"
-            )
-        if len(table) >= MOST_ROWS:
-            raise DataError(f"{called}: more than {MOST_ROWS} samples")
-        table.append([_number(cells[w.index], decimal, called, line, w) for w in wanted])
-        lines.append(line)
-    if not table:
-        raise DataError(f"{called}: has a header, but no samples")
-    data = np.array(table) * [w.factor for w in wanted]
-    inputs = [i for i, w in enumerate(wanted) if w.kind == "pump"]
-    levels = [i for i, w in enumerate(wanted) if w.kind == "level"]
+    used = _columns(header, f"{name}, line {first}", loop, columns or {})
+    table, lines = _table(rows, header, used, decimal, name)
+    data = np.array(table) * [c.factor for c in used]
+    inputs = [i for i, c in enumerate(used) if c.kind == "pump"]
+    levels = [i for i, c in enumerate(used) if c.kind == "level"]
     return log(
         t=data[:, 0],
         u=data[:, inputs],
         y=data[:, levels],
-        tanks=[wanted[i].number for i in levels],
-        in_volts=[wanted[i].in_volts for i in levels],
-        name=called,
+        tanks=[used[i].number for i in levels],
+        in_volts=[used[i].in_volts for i in levels],
+        name=name,
         lines=lines,
-        headers=tuple(w.header for w in wanted),
-        units=tuple(w.unit for w in wanted),
+        headers=tuple(c.header for c in used),
+        units=tuple(c.unit for c in used),
     )
 
 
-class _Column:
-    """A column of the file: where it stands, what it is, what to multiply it with."""
-
-    def __init__(self, index, kind, number, header, unit, factor, in_volts=False):
-        self.index, self.kind, self.number, self.header, self.unit = (
-            index,
-            kind,
-            number,
-            header,
-            unit,
-        )
-        self.factor, self.in_volts = factor, in_volts
-
-
 def _text(path):
+    """Return the text of a file; raise DataError where it cannot be read."""
     try:
         if why := refusal(path, LARGEST):
-            raise DataError(f"log {str(path)!r} {why}")
+            raise DataError(f"file {str(path)!r} {why}")
         data = path.read_bytes()
     except FileNotFoundError:
-        raise DataError(f"log {str(path)!r} does not exist") from None
+        raise DataError(f"file {str(path)!r} does not exist") from None
     except OSError as error:  # a name that is too long for the disk, too
-        raise DataError(f"log {str(path)!r} cannot be read: {error.strerror}") from None
+        raise DataError(f"file {str(path)!r} cannot be read: {error.strerror}") from None
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"log {path.name!r} is not UTF-8 text (byte {error.start})") from None
+        raise DataError(f"file {path.name!r} is not UTF-8 text (byte {error.start})") from None
     if "\0" in text:
-        raise DataError(f"log {path.name!r} is not text: it has zero bytes")
+        raise DataError(f"file {path.name!r} is not text: it has zero bytes")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _rows(text, name):
-    """(line number, cells) of every line that is not empty and not a comment."""
+    """Yield (line number, cells) of every line that is not empty and not a comment."""
     first = next(
         (line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")),
         "",
@@ -141,7 +157,34 @@ def _rows(text, name):
         raise DataError(f"{name}, line {reader.line_num}: {error}") from None
 
 
+def _table(rows, header, used, decimal, name):
+    """Return (numbers of the used columns, line of each sample)."""
+    table, lines = [], []
+    for line, cells in rows:
+        # a separator at the end of the line
+        while len(cells) > len(header) and not cells[-1].strip():
+            cells.pop()
+        if len(cells) != len(header):
+            hint = (
+                ": a comma within a number? Cells need another separator then, as ';' with"
+                " --decimal ,"
+                if len(cells) > len(header)
+                else ""
+            )
+            raise DataError(
+                f"{name}, line {line}: {len(cells)} cells under {len(header)} column names{hint}"
+            )
+        if len(table) >= MOST_ROWS:
+            raise DataError(f"{name}: more than {MOST_ROWS} samples")
+        table.append([_number(cells[c.index], decimal, name, line, c) for c in used])
+        lines.append(line)
+    if not table:
+        raise DataError(f"{name}: has a header, but no samples")
+    return table, lines
+
+
 def _number(cell, decimal, name, line, column):
+    """Return the number in a cell, NaN for a missing reading."""
     text = cell.strip()
     where = f"{name}, line {line}, column {column.header!r}"
     if len(text) > LONGEST_CELL:
@@ -171,136 +214,136 @@ def _number(cell, decimal, name, line, column):
 
 
 def _is_number(cell):
+    """Return whether a cell of the header is a number."""
     return re.fullmatch(r"[-+]?[\d.,]+([eE][-+]?\d+)?", cell) is not None
 
 
 def split_header(header):
-    """(name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1"."""
+    """Return (name, unit or None) of a column's header: "h1 [cm]", "h1 (cm)", "pump1_V", "h1".
+
+    >>> split_header("h1 [cm]"), split_header("pump1_V"), split_header("level")
+    (('h1', 'cm'), ('pump1', 'V'), ('level', None))
+    """
     found = re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header)
     if found:
         return found.group(1).strip(), found.group(2)
     stem, line, tail = header.rpartition("_")
-    return (
-        (stem.strip(), tail)
-        if line and tail in KNOWN and not tail.isdigit()
-        else (header.strip(), None)
-    )
+    if line and tail in KNOWN and not tail.isdigit():
+        return stem.strip(), tail
+    return header.strip(), None
 
 
-def _columns(header, name, line, loop, given):
-    """The columns in use, time first, then pumps, then levels."""
+def _columns(header, where, loop, named):
+    """Return the columns in use: time, then pumps, then levels."""
     plant, (length, drive) = loop.plant, loop.units
-    slots = {"t": ("time", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
-    slots |= {f"h{i + 1}": ("level", i) for i in range(plant.tanks)}
     if all(_is_number(cell) for cell in header):
         raise DataError(
-            f"{name}, line {line}: has numbers where the columns' names should be: begin with a"
-            f" header, as 't [s],pump1 [{drive}],h1 [{length}]'"
+            f"{where}: has numbers where the columns' names should be: begin with a header, as"
+            f" 't [s],pump1 [{drive}],h1 [{length}]'"
         )
-    found, taken = [], {}
-    for slot, spec in given.items():
-        if slot not in slots:
-            raise InputError(f"unknown log column {slot!r}{nearest(slot, slots)}")
-        wanted, unit = (spec, None) if isinstance(spec, str) else spec
-        if wanted.strip() == "none" and wanted not in header:
-            if slots[slot][0] != "level":
-                raise InputError(
-                    f"log column {slot} = none: only a level may be left out, as h1=none"
-                )
-            continue
-        if wanted not in header:
-            raise DataError(
-                f"{name}, line {line}: there is no column {wanted!r} for"
-                f" {slot}{nearest(wanted, header)}"
-            )
-        index = header.index(wanted)
-        if other := next((known for known, (column, _) in taken.items() if column == index), None):
-            raise DataError(
-                f"{name}, line {line}: column {wanted!r} is given for {other} and for {slot}: name"
-                " one column for each"
-            )
-        taken[slot] = (index, unit or split_header(wanted)[1])
-    used = {index for index, _ in taken.values()}
-    for index, cell in enumerate(header):
-        stem, unit = split_header(cell)
-        slot = _slot(stem, plant)
-        if index in used or slot is None or slot in given:
-            continue
-        if slot in taken:
-            raise DataError(
-                f"{name}, line {line}: columns {header[taken[slot][0]]!r} and {cell!r} both look"
-                f" like {slot}; say which with --column"
-            )
-        taken[slot] = (index, unit)
+    slots = {"t": ("time", 0), **{f"pump{j + 1}": ("pump", j) for j in range(plant.pumps)}}
+    slots |= {f"h{i + 1}": ("level", i) for i in range(plant.tanks)}
+    taken = _named_columns(header, where, slots, named)
+    taken |= _recognised_columns(header, where, plant, taken, named)
+    found = []
     for slot, (kind, number) in slots.items():
-        if slot not in taken:
-            if kind != "level":
-                raise DataError(
-                    f"{name}, line {line}: no column for {slot}"
-                    f" ({'time' if kind == 'time' else f'pump {number + 1}'}) among"
-                    f" {_listed(header)}; name it with --column {slot}=HEADER"
-                )
-            continue
-        index, unit = taken[slot]
-        if header.count(header[index]) > 1:
-            raise DataError(f"{name}, line {line}: two columns are called {header[index]!r}")
-        factor, in_volts = _factor(
-            kind, unit, length, drive, f"{name}, line {line}, column {header[index]!r}"
-        )
-        found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
+        if slot in taken:
+            index, unit = taken[slot]
+            if header.count(header[index]) > 1:
+                raise DataError(f"{where}: two columns are called {header[index]!r}")
+            place = f"{where}, column {header[index]!r}"
+            factor, in_volts = _factor(kind, unit, length, drive, place)
+            found.append(_Column(index, kind, number, header[index], unit, factor, in_volts))
+        elif kind != "level":
+            raise DataError(
+                f"{where}: no column for {slot}"
+                f" ({'time' if kind == 'time' else f'pump {number + 1}'}) among"
+                f" {_listed(header)}; name it with --column {slot}=HEADER"
+            )
     if not any(c.kind == "level" for c in found):
         raise DataError(
-            f"{name}, line {line}: no column for a level among {_listed(header)}; name it with"
+            f"{where}: no column for a level among {_listed(header)}; name it with"
             " --column h1=HEADER"
         )
     return found
 
 
+def _named_columns(header, where, slots, named):
+    """Return {slot: (index, unit)} of the columns that --column or the rig file names."""
+    taken = {}
+    for slot, spec in named.items():
+        if slot not in slots:
+            raise InputError(f"unknown column {slot!r}{nearest(slot, slots)}")
+        wanted, unit = (spec, None) if isinstance(spec, str) else spec
+        if wanted.strip() == "none" and wanted not in header:
+            if slots[slot][0] != "level":
+                raise InputError(f"column {slot} = none: only a level may be left out, as h1=none")
+            continue
+        if wanted not in header:
+            raise DataError(
+                f"{where}: there is no column {wanted!r} for {slot}{nearest(wanted, header)}"
+            )
+        index = header.index(wanted)
+        if other := next((known for known, (column, _) in taken.items() if column == index), None):
+            raise DataError(
+                f"{where}: column {wanted!r} is given for {other} and for {slot}: name one column"
+                " for each"
+            )
+        taken[slot] = (index, unit or split_header(wanted)[1])
+    return taken
+
+
+def _recognised_columns(header, where, plant, taken, named):
+    """Return {slot: (index, unit)} of the other columns whose headers name a slot themselves."""
+    used, found = {index for index, _ in taken.values()}, {}
+    for index, cell in enumerate(header):
+        stem, unit = split_header(cell)
+        slot = _slot(stem, plant)
+        if index in used or slot is None or slot in named:
+            continue
+        if slot in found:
+            raise DataError(
+                f"{where}: columns {header[found[slot][0]]!r} and {cell!r} both look like {slot};"
+                " name one with --column"
+            )
+        found[slot] = (index, unit)
+    return found
+
+
 def _listed(header, most=20):
-    """The names of the columns, the first of them where there are many."""
+    """Return the names of the columns, the first of them where there are many."""
     more = f" and {len(header) - most} more" if len(header) > most else ""
     return ", ".join(map(repr, header[:most])) + more
 
 
 def _slot(stem, plant):
-    """The slot ("t", "pump1", "h2") that a column's name says, or None."""
+    """Return the slot ("t", "pump1", "h2") that a column's name means, or None."""
     # no rig has a tank of seven digits
     word = re.fullmatch(r"([a-z]+)[ _]?(\d{0,6})", stem.strip().lower())
-    if word is None:
+    kind = word and next((k for k, names in NAMES.items() if word.group(1) in names), None)
+    if not word or kind is None:
         return None
-    for kind, names in NAMES.items():
-        if word.group(1) in names:
-            if kind == "time":
-                return None if word.group(2) else "t"
-            count = plant.pumps if kind == "pump" else plant.tanks
-            number = int(word.group(2)) if word.group(2) else 1 if count == 1 else 0
-            return f"{'pump' if kind == 'pump' else 'h'}{number}" if 1 <= number <= count else None
-    return None
+    if kind == "time":
+        return None if word.group(2) else "t"
+    count = plant.pumps if kind == "pump" else plant.tanks
+    number = int(word.group(2)) if word.group(2) else 1 if count == 1 else 0
+    return f"{'pump' if kind == 'pump' else 'h'}{number}" if 1 <= number <= count else None
 
 
 def _factor(kind, unit, length, drive, where):
-    """(what a cell is multiplied with, whether it is a sensor's volts)."""
+    """Return (factor of a cell to the rig's unit, whether it is the sensor's voltage)."""
+    base = {"time": "s", "pump": drive, "level": length}[kind]
     if unit is None:
-        own = {"time": "s", "pump": drive, "level": length}[kind]
-        word = {"time": "t", "pump": "pump1", "level": "h1"}[kind]
+        slot = {"time": "t", "pump": "pump1", "level": "h1"}[kind]
         raise DataError(
-            f"{where}: has no unit: write it in the header, as '{word} [{own}]', or with --column"
+            f"{where}: has no unit: write it in the header, as '{slot} [{base}]', or with --column"
         )
-    if kind == "time":
-        table, own = TIMES, "s"
-    elif kind == "pump":
-        own = drive
-        table = next((t for t in (VOLTS, FLOWS, SHARES) if drive in t), {drive: 1.0})
-    else:
-        own, table = (
-            length,
-            (LENGTHS if length in LENGTHS else VOLTS if length in VOLTS else {length: 1.0}),
-        )
-        if unit in VOLTS and length not in VOLTS:
-            return VOLTS[unit], True
+    if kind == "level" and unit in VOLTS and length not in VOLTS:
+        return VOLTS[unit], True
+    choices = {"time": (TIMES,), "pump": (VOLTS, FLOWS, SHARES), "level": (LENGTHS, VOLTS)}[kind]
+    table = next((t for t in choices if base in t), {base: 1.0})
     if unit not in table:
         raise DataError(
-            f"{where}: unit {unit!r} cannot be that of a {'time' if kind == 'time' else kind}: must"
-            f" be one of {', '.join(table)}"
+            f"{where}: unit {unit!r} cannot be that of a {kind}: must be one of {', '.join(table)}"
         )
-    return table[unit] / table[own], False
+    return table[unit] / table[base], False

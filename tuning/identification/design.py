@@ -1,28 +1,33 @@
-"""Which experiment tells most: candidate inputs compared by the standard deviations they would
-leave.
+"""Experiment design: candidate inputs, the standard deviations that each would leave, and which
+experiment would identify what the data do not. Imported by `fit` and by `identify --plan`.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError
-from tuning.identification import simulation as pb
-from tuning.identification.parametrisation import coordinates, nominal, usual
+from jaxtank.plants.runge_kutta import advance
+from tuning.identification import simulation
+from tuning.identification.confidence import VAGUE
+from tuning.identification.parametrisation import coordinates, nominal, specification
+from tuning.problem.bounds import bounds
 
 REGISTER = 7
-"""Length of the shift register of the pseudo-random binary sequence: 127 bits, different for each
-pump.
-"""
+"""Length of the shift register of the pseudo-random binary sequence: 127 bits."""
 
 
 def prbs(bits, channel):
-    """(bits,) of +-1: a maximum-length sequence of x^7 + x^6 + 1, begun `channel` thirds of its
-    length later for each pump.
+    """Return (bits,) of +-1: a maximum-length sequence of x^7 + x^6 + 1.
+
+    Each further `channel` begins a third of its length later.
     """
     state, out = [1] * REGISTER, []
     for _ in range(2**REGISTER - 1):
@@ -33,72 +38,57 @@ def prbs(bits, channel):
 
 
 def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
-    """Inputs to compare, {words: (t (samples,) [s], u (samples, pumps), x0 (tanks,) levels to start
-    from)}: steps of all pumps at once and one after the other from empty tanks, and from rest a
-    small step of all, staggered steps and a pseudo-random binary sequence.
+    """Return inputs to compare, {description: (t (samples,) [s], u (samples, pumps), x0 (tanks,))}.
 
-    duration, dt: [s]; voltage: (pumps,) about which to work, the case's own operating point where
-    None; size: of the small changes, in the pumps' unit, a tenth of the voltage where None; bit:
-    length of a bit of the sequence [s], a twentieth of the duration where None. The inputs stay
-    within the pumps' limits.
+    From empty tanks steps of all pumps at once and one after the other; from steady state a small
+    step of all, staggered steps, and a pseudo-random binary sequence. The inputs stay within the
+    pumps' limits.
+
+    duration, dt: [s]; voltage: (pumps,) operating point, by default the case's own; size: of the
+    small changes, in the pumps' unit, by default a tenth of the voltage; bit: length of a bit of
+    the sequence [s], by default a twentieth of the duration.
     """
     plant = loop.plant
     t = np.arange(round(duration / dt) + 1) * dt
     low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
     if voltage is None:
-        voltage = _operating(loop)
+        voltage = _operating_point(loop)
     voltage = np.broadcast_to(np.asarray(voltage, dtype=float), (plant.pumps,))
-    rest = np.asarray(settled(plant, voltage), dtype=float)
+    steady = np.asarray(settled(plant, voltage), dtype=float)
     size = (
         0.1 * voltage
         if size is None
         else np.broadcast_to(np.asarray(size, dtype=float), (plant.pumps,))
     )
     bit = duration / 20 if bit is None else bit
-    empty, starts = np.zeros(plant.tanks), np.arange(plant.pumps) * duration / max(plant.pumps, 1)
-    later = (t[:, None] >= starts - 1e-9).astype(float)
-    signs = np.stack(
-        [
-            prbs(int(duration / bit) + 1, j)[
-                np.minimum((t / bit + 1e-9).astype(int), int(duration / bit))
-            ]
-            for j in range(plant.pumps)
-        ],
-        axis=1,
-    )
+    bits = int(duration / bit)
+    at = np.minimum((t / bit + 1e-9).astype(int), bits)
+    signs = np.stack([prbs(bits + 1, j)[at] for j in range(plant.pumps)], axis=1)
+    empty, pumps = np.zeros(plant.tanks), np.arange(plant.pumps)
+    later = (t[:, None] >= pumps * duration / max(plant.pumps, 1) - 1e-9).astype(float)
     third = duration / (plant.pumps + 1)
-    up = (t[:, None] >= np.arange(plant.pumps) * third - 1e-9) & (
-        t[:, None] < (np.arange(plant.pumps) + plant.pumps) * third - 1e-9
-    )
-    made = {
-        "step of every pump at once, from empty": (np.tile(voltage, (len(t), 1)), empty),
+    up = (t[:, None] >= pumps * third - 1e-9) & (t[:, None] < (pumps + plant.pumps) * third - 1e-9)
+    constant = np.ones((len(t), 1))
+    found = {
+        "step of every pump at once, from empty": (voltage * constant, empty),
         "steps one pump after the other, from empty": (voltage * later, empty),
-        "small step of every pump at once, from rest": (np.tile(voltage + size, (len(t), 1)), rest),
-        "small staggered steps, from rest": (voltage + size * up, rest),
-        "pseudo-random binary sequence about rest": (voltage + size * signs, rest),
+        "small step of every pump at once, from steady state": (
+            (voltage + size) * constant,
+            steady,
+        ),
+        "small staggered steps, from steady state": (voltage + size * up, steady),
+        "pseudo-random binary sequence about steady state": (voltage + size * signs, steady),
     }
-    return {words: (t, np.clip(u, low, high), x0) for words, (u, x0) in made.items()}
+    return {name: (t, np.clip(u, low, high), x0) for name, (u, x0) in found.items()}
 
 
 def settled(plant, voltage):
-    """(n,) levels at which a plant rests with voltages held: found by playing it until nothing
-    moves.
-    """
-    import jax.numpy as jnp
-
+    """Return (n,) steady levels at constant inputs, by simulation until nothing moves."""
     x, d = tuple(jnp.zeros(()) + 1.0 for _ in range(plant.tanks)), None
     u = tuple(jnp.asarray(v) for v in voltage)
-    import jax
-
-    from jaxtank.plants.runge_kutta import advance
-
     size = float(np.max(np.asarray(plant.rim)))
-    rate = max(
-        abs(float(v))
-        for v in plant.derivative(
-            0.0, tuple(jnp.asarray(0.5 * size) for _ in range(plant.tanks)), u, d
-        )
-    )
+    half = tuple(jnp.asarray(0.5 * size) for _ in range(plant.tanks))
+    rate = max(abs(float(v)) for v in plant.derivative(0.0, half, u, d))
     h = 0.02 * size / max(rate, 1e-12)
 
     def body(x, _):
@@ -108,9 +98,11 @@ def settled(plant, voltage):
     return np.array([max(float(v), 0.0) for v in x])
 
 
-def _operating(loop):
-    """(pumps,) inputs at which the case's pumps run before it starts, or those of its first
-    setpoint, or half of their range; less where a tank would come near its rim.
+def _operating_point(loop):
+    """Return (pumps,) inputs at which the case's pumps run before it starts.
+
+    Where they stand, those of its first setpoint, else half of their range; less where a tank would
+    come near its rim.
     """
     plant, high = loop.plant, np.asarray(loop.actuator.high, dtype=float)
     high = np.where(np.isfinite(high), high, 2.0)
@@ -145,161 +137,201 @@ def compare_experiments(
     bit: float | None = None,
     inputs: Mapping[str, Any] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """Predicted standard deviations of the free parameters for each candidate experiment (of
-    `candidates`, or `inputs`: {words: (t (samples,) [s], u (samples, pumps), x0 (tanks,))}).
+    """Predict the standard deviations of the free parameters that each candidate experiment leaves.
 
-    free: as in `identify`; noise: standard deviation of the readings in the rig's unit of length,
-    one or one per measured tank; levels: tanks that are measured, counted from 0, all where None;
-    start: "known" levels at the beginning, or "free" ones, estimated too. Returns
-    {words: {"sd" {name: value}, "condition", "open": [words of the directions it leaves open]}},
-    condition of J'J with every parameter counted as a share of itself.
+        covariance = (J' J / noise^2)^-1,   J the sensitivities of the readings (Fisher information)
+
+    Parameters
+    ----------
+    case : Case
+        The rig, with the values at which the sensitivities are taken.
+    free : mapping, optional
+        As in `identify`.
+    noise : float or (measured tanks,) array
+        Standard deviation of the readings in the rig's unit of length.
+    duration, dt : float
+        Length of an experiment and time between samples [s].
+    levels : sequence of int, optional
+        Tanks that are measured, counted from 0; all by default.
+    start : {"known", "free"}
+        Levels at the first sample: known, or estimated too.
+    voltage : (pumps,) array, optional
+        Inputs of the operating point; the case's own by default.
+    size : (pumps,) array, optional
+        Small changes of the inputs; a tenth of `voltage` by default.
+    bit : float, optional
+        Length of a bit of the pseudo-random sequence [s]; a twentieth of `duration` by default.
+    inputs : mapping, optional
+        {description: (t (samples,) [s], u (samples, pumps), x0 (tanks,))} in place of the
+        candidates.
+
+    Returns
+    -------
+    dict
+        {description: {"sd" {name: value or None}, "condition", "open": names that are not
+        identifiable}}, the condition number of J'J for parameters relative to their values.
+
+    Raises
+    ------
+    InputError
+        For unknown parameters, and where the simulation diverges.
+
+    Examples
+    --------
+    >>> import jax, numpy as np, tuning
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> case = presets.load("cascaded").cases["open-loop"]
+    >>> t = np.arange(0.0, 60.0, 4.0)
+    >>> step = {"step": (t, np.full((15, 1), 3.0), np.zeros(2))}
+    >>> found = tuning.compare_experiments(
+    ...     case, {"plant.pump_gain": (1.0, 9.0)}, noise=0.05, duration=56, dt=4, inputs=step
+    ... )
+    >>> found["step"]["open"], found["step"]["sd"]["plant.pump_gain[0]"] < 0.1
+    ([], True)
     """
     loop = case.loop
     tanks = tuple(range(loop.plant.tanks)) if levels is None else tuple(levels)
-    spec = (
-        usual(loop)
-        if free is None
-        else {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}
-    )
-    from tuning.problem.bounds import bounds
-
-    moved = coordinates(bounds(loop, spec))
-    made = (
-        candidates(loop, duration=duration, dt=dt, voltage=voltage, size=size, bit=bit)
-        if inputs is None
-        else inputs
-    )
+    moved = coordinates(bounds(loop, specification(loop, free)))
+    if inputs is None:
+        inputs = candidates(loop, duration=duration, dt=dt, voltage=voltage, size=size, bit=bit)
     values = nominal(loop, moved.names)
-    p, rig = moved.point(values), pb.rig_of(loop)
+    p, rig = moved.point(values), simulation.rig_of(loop)
+    count = max((_substeps(rig, t, u, x0, tanks) for t, u, x0 in inputs.values()), default=1)
     found = {}
-    count = max((_substeps(rig, t, u, x0, tanks) for t, u, x0 in made.values()), default=1)
-    for words, (t, u, x0) in made.items():
+    for name, (t, u, x0) in inputs.items():
         jacobian = (
             _jacobian(rig, moved, p, t, u, x0, tanks, start, count)
             / np.tile(np.broadcast_to(noise, (len(tanks),)), len(t))[:, None]
         )
         if not np.all(np.isfinite(jacobian)):
             raise InputError(
-                f"{words}: the integration breaks down with samples every {t[1] - t[0]:g} s; take a"
+                f"{name}: the simulation diverges with samples every {t[1] - t[0]:g} s; take a"
                 " shorter duration"
             )
-        _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
-        slopes = moved.slopes(p)
-        good = s > 1e-9 * s.max()
-        inverse = (vt[good].T / s[good] ** 2) @ vt[good]
-        sd = np.sqrt(np.diag(slopes @ inverse[: moved.size, : moved.size] @ slopes.T))
-        vague = np.abs(vt[~good]).max(axis=0, initial=0.0)[: moved.size] > 0.1
-        scaled = (
-            jacobian[:, : moved.size] @ np.linalg.inv(slopes) * [values[n] for n in moved.names]
-        )
-        singular = np.linalg.svd(scaled, compute_uv=False)
-        found[words] = {
-            "sd": {
-                n: None if vague[i] else float(v) for i, (n, v) in enumerate(zip(moved.names, sd))
-            },
-            "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
-            "open": [n for i, n in enumerate(moved.names) if vague[i]],
-        }
+        found[name] = _precision(moved, p, values, jacobian)
     return found
 
 
-def most_telling(found):
-    """The words of the experiment, of those `compare_experiments` compared, whose standard
-    deviations have the smallest product; None where each leaves something open.
+def _precision(moved, p, values, jacobian):
+    """Return {"sd", "condition", "open"} of the weighted sensitivities of one experiment."""
+    _, s, vt = np.linalg.svd(jacobian, full_matrices=False)
+    slopes = moved.slopes(p)
+    good = s > 1e-9 * s.max()
+    inverse = (vt[good].T / s[good] ** 2) @ vt[good]
+    sd = np.sqrt(np.diag(slopes @ inverse[: moved.size, : moved.size] @ slopes.T))
+    vague = np.abs(vt[~good]).max(axis=0, initial=0.0)[: moved.size] > 0.1
+    scaled = jacobian[:, : moved.size] @ np.linalg.inv(slopes) * [values[n] for n in moved.names]
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    return {
+        "sd": {n: None if vague[i] else float(v) for i, (n, v) in enumerate(zip(moved.names, sd))},
+        "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
+        "open": [n for i, n in enumerate(moved.names) if vague[i]],
+    }
+
+
+def most_informative(found):
+    """Return the experiment of `compare_experiments` with the least product of deviations.
+
+    None where none identifies every parameter.
+
+    >>> most_informative({"a": {"sd": {"k": 2.0}}, "b": {"sd": {"k": 0.5}}})
+    'b'
     """
     whole = {
-        words: np.sum(np.log(list(row["sd"].values())))
-        for words, row in found.items()
+        name: np.sum(np.log(list(row["sd"].values())))
+        for name, row in found.items()
         if None not in row["sd"].values()
     }
     return min(whole, key=whole.__getitem__) if whole else None
 
 
 def _substeps(rig, t, u, x0, tanks):
-    """How many steps each sample of an experiment needs."""
-    channels, own = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
-    blank = pb.Record(
-        np.append(np.diff(t), 0.0)[None], u[None], np.zeros((1, len(t), len(tanks))), channels
-    )
-    return pb.substeps_for(rig, blank, own, 1e-5 * float(np.max(np.asarray(rig.plant.rim))))[0]
+    """Return how many Runge-Kutta steps each sample of an experiment needs."""
+    channels, first = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
+    no_readings = np.zeros((1, len(t), len(tanks)))
+    data = simulation.PaddedData(np.append(np.diff(t), 0.0)[None], u[None], no_readings, channels)
+    error = 1e-5 * float(np.max(np.asarray(rig.plant.rim)))
+    return simulation.substeps_for(rig, data, first, error)[0]
 
 
-def _jacobian(rig, moved, p, t, u, x0, tanks, start, count=None):
-    """(samples * measured tanks, unknowns) derivative of the readings."""
-    dt = np.append(np.diff(t), 0.0)[None]
-    channels, own = tuple((i, False) for i in tanks), np.asarray(x0, dtype=float)[None]
-    count = _substeps(rig, t, u, x0, tanks) if count is None else count
-    _, slopes = pb.passes(
+def _jacobian(rig, moved, p, t, u, x0, tanks, start, count):
+    """Return (samples * measured tanks, unknowns) sensitivities of the readings."""
+    first = np.asarray(x0, dtype=float)[None]
+    _, slopes = simulation.sensitivities(
         rig,
-        dt,
+        np.append(np.diff(t), 0.0)[None],
         u[None],
         p,
-        own,
+        first,
         coordinates=moved,
-        tanks=tuple(range(own.shape[1])),
-        channels=channels,
+        tanks=tuple(range(first.shape[1])),
+        channels=tuple((i, False) for i in tanks),
         substeps=count,
     )
-    slopes = np.asarray(slopes)[0].reshape(-1, moved.size + own.shape[1])
+    slopes = np.asarray(slopes)[0].reshape(-1, moved.size + first.shape[1])
     return slopes if start == "free" else slopes[:, : moved.size]
 
 
-def alternatives(estimation, z):
-    """(words, (t, u, x0, tanks)) of experiments as long as the first log that could be made
-    instead.
-    """
-    log, plant = estimation.logs[0], estimation.case.loop.plant
-    seen = tuple(sorted({tank for tank, _ in estimation.record.channels}))
-    x0, every = estimation.levels(z)[0], tuple(range(plant.tanks))
-    rig = estimation.at(z)
-    hidden = [i for i in every if i not in seen]
-    found = []
-    if hidden:
-        found.append(
-            (f"log {', '.join(f'h{i + 1}' for i in hidden)} as well", (log.t, log.u, x0, every))
-        )
-    duration = log.t[-1] - log.t[0]
-    dt = max(float(np.median(np.diff(log.t))), duration / 2000)
-    mean = log.u.mean(axis=0)
-    loop = estimation.case.loop
-    voltage = np.where(mean > 0, mean, _operating(loop))
-    import dataclasses
+def remedies(estimation, fit, spread):
+    """Return sentences: which experiments would identify what is not identifiable from these data.
 
-    there = dataclasses.replace(loop, plant=rig.plant)
-    made = candidates(there, duration=duration, dt=dt, voltage=voltage, size=0.3 * voltage)
-    for words in ("small staggered steps, from rest", "steps one pump after the other, from empty"):
-        t, u, start = made[words]
-        found.append((words.replace("small ", ""), (t, u, start, seen)))
+    By the sensitivities of the fitted model.
+    """
+    z = estimation.unknowns(fit)
+    noise = np.sqrt(max(spread.scale, 1e-12))
+    found = []
+    for name, experiment in _alternatives(estimation, z):
+        sd = _largest_deviation(estimation, z, experiment, noise)
+        if sd is not None and sd < VAGUE:
+            found.append(f"{name} (largest standard deviation of a direction {100 * sd:.2g} %)")
+    names = [
+        n for n in estimation.coordinates.names for d in spread.directions() if n in d["parameters"]
+    ]
+    if names:
+        which = names[0] if len(set(names)) == 1 else f"one of them by itself, as {names[0]},"
+        found.append(f"measure {which} and leave it out of --free")
     return found
 
 
-def open_directions(estimation, z, experiment, noise):
-    """The largest standard deviation of a direction (of the coordinates) that an experiment would
-    leave; None where it cannot be told.
+def _alternatives(estimation, z):
+    """Return [(description, (t, u, x0, tanks))] of other experiments as long as the first log."""
+    log, plant = estimation.logs[0], estimation.case.loop.plant
+    measured = tuple(sorted({tank for tank, _ in estimation.data.channels}))
+    x0, every = estimation.first_levels(z)[0], tuple(range(plant.tanks))
+    hidden = [f"h{i + 1}" for i in every if i not in measured]
+    found = []
+    if hidden:
+        found.append((f"measure {', '.join(hidden)} as well", (log.t, log.u, x0, every)))
+    duration = log.t[-1] - log.t[0]
+    dt = max(float(np.median(np.diff(log.t))), duration / 2000)
+    mean, loop = log.u.mean(axis=0), estimation.case.loop
+    voltage = np.where(mean > 0, mean, _operating_point(loop))
+    fitted = dataclasses.replace(loop, plant=estimation.rig_at(z).plant)
+    others = candidates(fitted, duration=duration, dt=dt, voltage=voltage, size=0.3 * voltage)
+    for name in (
+        "small staggered steps, from steady state",
+        "steps one pump after the other, from empty",
+    ):
+        found.append((name.replace("small ", ""), (*others[name], measured)))
+    return found
+
+
+def _largest_deviation(estimation, z, experiment, scale):
+    """Return the largest standard deviation of a direction of the coordinates.
+
+    None where it is infinite. scale: factor on the noise of the channels.
     """
     t, u, x0, tanks = experiment
-    channels = estimation.record.channels
-    usual_noise = float(np.mean(estimation.noise)) * noise
-    by_tank = {
-        tank: float(estimation.noise[c]) * noise
-        for c, (tank, volts) in enumerate(channels)
-        if not volts
-    }
-    p, _ = estimation.parts(z)
-    jacobian = _jacobian(
-        estimation.rig, estimation.coordinates, p, t, u, x0, tanks, "known", 2 * estimation.substeps
-    )
-    jacobian = jacobian / np.tile([by_tank.get(i, usual_noise) for i in tanks], len(t))[:, None]
+    usual = float(np.mean(estimation.noise)) * scale
+    noise: dict[int, float] = {i: usual for i in tanks}
+    for c, (tank, volts) in enumerate(estimation.data.channels):
+        if not volts:
+            noise[tank] = float(estimation.noise[c]) * scale
+    p, _ = estimation.split(z)
+    steps = 2 * estimation.substeps
+    moved = estimation.coordinates
+    jacobian = _jacobian(estimation.rig, moved, p, t, u, x0, tanks, "known", steps)
+    jacobian = jacobian / np.tile([noise[i] for i in tanks], len(t))[:, None]
     s = np.linalg.svd(jacobian, compute_uv=False)
     return float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None
-
-
-__all__ = [
-    "alternatives",
-    "candidates",
-    "compare_experiments",
-    "most_telling",
-    "open_directions",
-    "prbs",
-    "settled",
-]

@@ -1,9 +1,7 @@
-"""Plant parameters from a log: output error, Gauss-Newton with exact sensitivities, and how far the
-answer is to be believed.
+"""`identify`: output-error estimation of plant parameters, by Gauss-Newton with exact sensitivities
+from several starts. Imported as `tuning.identify` and by the command `identify`.
 """
 
-import dataclasses
-import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -18,74 +16,29 @@ import jaxtank
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
-from tuning.identification import confidence as idf
-from tuning.identification import experiment as lg
-from tuning.identification.confidence import stopped
-from tuning.identification.identified_case import bare, proposed
-from tuning.identification.problem import Estimation, Fit, check_length
+from tuning.identification import experiment
+from tuning.identification.confidence import Spread, at_search_bounds
+from tuning.identification.data_checks import check_data, check_float64, check_length, first_samples
+from tuning.identification.design import remedies
+from tuning.identification.identified_case import bare
+from tuning.identification.least_squares import Fit, solve
+from tuning.identification.least_squares import profile_likelihood as _profile
+from tuning.identification.problem import Estimation
 from tuning.identification.proposal import check_law
-from tuning.problem.result import Result
+from tuning.identification.residuals import quality, validate
+from tuning.identification.result import Identification
 from tuning.problem.status import Status
 from tuning.storage.batch_store import digest
 from tuning.storage.evaluation_log import Log, Memo, folder_of
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001
-"""Two searches whose sums of squares differ by less than this factor have ended in the same place."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
-class Identification(Result):
-    """What `identify` found. See `jaxtank identify --json` for the same as a table; `save(folder)`,
-    `plot()`.
-    """
-
-    REPORT = "tuning.report.identification"
-
-    case: Any  # the case that was given
-    estimation: Estimation
-    fit: Fit
-    status: Status  # CONVERGED, NOT_CONVERGED, NOT_IDENTIFIABLE or INTERRUPTED
-    # {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable",
-    # "at_bound"}}
-    parameters: dict
-    levels: list  # of each log, of each tank: {"value", "interval95"}
-    covariance: tuple  # (names, (n, n)) of the parameters that have an interval, in their units
-    # {"rmse", "nrmse_percent", "residual_autocorrelation"}: per channel; and {"widened", "noise"}
-    quality: dict
-    # what the data cannot tell apart: {"words", "parameters" {name: factor}, "sd"}
-    directions: list
-    remedies: list  # words: what experiment would tell it
-    starts: list  # {"cost", "evaluations", "agrees"}
-    validation: dict | None
-    profile: dict | None
-    wall_s: float
-    seed: int
-    law: str | None = None  # controller that is proposed for the rig
-
-    @functools.cached_property
-    def proposed(self) -> tuple[Case, str | None]:
-        """(`identified`, why): why no controller of the kind `law` could be proposed, None where it
-        was, or none was asked for.
-        """
-        return proposed(self)
-
-    @property
-    def identified(self) -> Case:
-        """The case with the estimated plant in it, in the law's and the observer's models too, with
-        covariance and noise.
-        """
-        return self.proposed[0]
-
-    @property
-    def message(self) -> str:
-        """In words: how it ended."""
-        return self._report().message(self)
+"""Factor between the sums of squares of two searches below which they found the same minimum."""
 
 
 def identify(
     case: Case | Plant,
-    log: lg.Log | Sequence[lg.Log],
+    log: experiment.Log | Sequence[experiment.Log],
     free: Mapping[str, Any] | None = None,
     *,
     start: str = "free",
@@ -105,183 +58,198 @@ def identify(
     ready: Callable | None = None,
     law: str | None = None,
 ) -> Identification:
-    """Estimate parameters of a rig from one log or several, by least squares on the simulated
-    readings (output error).
+    """Estimate parameters of a rig from experiment data, by least squares on simulated readings.
 
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2
 
-    case: a Case, or a plant for one with ideal pumps and sensors; log: a `tuning.Log` (see
-    tuning.log, tuning.read_log), or a list of them, each with its own start; free: {name: (low,
-    high)} or (low, high, "log" or "linear"), of plant, sensor, actuator or a constant disturbance;
-    None: pump gains, splits, orifices and pipes; start: levels at the first sample of each log:
-    "free" (estimated, too), "measured" or "case"; starts: searches, the first from the case's own
-    values, the others from Sobol points of the ranges; hold_back: share of each log (below 1), or
-    number of samples, at its end on which a fit to the rest is judged before all is fitted; noise:
-    standard deviation of each channel in its unit, from the record where None; loss: "linear",
-    "soft_l1" or "huber" (beyond 3 standard deviations);
-    substeps: of Runge-Kutta per sample, found where None; profile: whether to trace the profile
-        likelihood of the worst parameter;
-    gap: longest step between samples, in median steps; checkpoint (or folder): where a log
-    of the searches is kept, with which resume=True goes on after a
-    kill, to the same bits; progress: called with the Fit of each search that has ended; if it
-    raises KeyboardInterrupt, the best of them is gone on with; ready: called with nothing once all
-    has been checked, before the first search;
-    law: "pi" for the identified rig under a PI controller with gains from its model
-        (`proposal.py`), None for the case's own.
+    Parameters
+    ----------
+    case : Case or Plant
+        The rig; a plant stands for one with ideal pumps and sensors.
+    log : Log or sequence of Log
+        Experiment data, of `tuning.log` or `tuning.read_log`; several have first levels each.
+    free : mapping, optional
+        {name: (low, high)} or {name: (low, high, "log" or "linear")} of plant, sensor, actuator or
+        a constant disturbance; by default pump gains, splits, orifices and pipes.
+    start : {"free", "measured", "case"}
+        Levels at the first sample: estimated, as measured, or those of the case.
+    starts : int
+        Number of searches: the first from the case's values, others from Sobol points of the box.
+    seed : int
+        Of the Sobol points.
+    hold_back : float
+        Share of each log (below 1), or number of samples, at its end that validates a fit to the
+        rest before all is fitted.
+    noise : (channels,) array, optional
+        Standard deviation of each channel in its unit; estimated from the data if omitted.
+    loss : {"linear", "soft_l1", "huber"}
+        Robust beyond 3 standard deviations.
+    substeps : int, optional
+        Runge-Kutta steps per sample; found by halving if omitted.
+    profile : bool
+        Whether to compute the profile likelihood of the least certain parameter.
+    iterations : int
+        Most evaluations of each search.
+    gap : float
+        Longest step between samples, in median steps.
+    checkpoint : path, optional
+        Folder of finished searches, from which `resume=True` continues to the same bits; `folder`
+        is its former name.
+    resume : bool
+        Continue from `checkpoint`.
+    progress : callable, optional
+        Called with the Fit of each search that has ended; if it raises KeyboardInterrupt, the best
+        of them is completed.
+    ready : callable, optional
+        Called once all inputs are checked, before the first search.
+    law : {"pi"}, optional
+        Propose a PI controller with gains from the identified model (`proposal.py`); the case's own
+        controller by default.
 
-    Returns an Identification. Raises InputError for what cannot be estimated, DataError for a log
-    that cannot be used.
+    Returns
+    -------
+    Identification
+
+    Raises
+    ------
+    InputError
+        For what cannot be estimated.
+    DataError
+        For experiment data that cannot be used.
+
+    Examples
+    --------
+    >>> import jax, numpy as np, tuning
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> case = presets.load("cascaded").cases["open-loop"]
+    >>> t = np.arange(30.0)
+    >>> data = tuning.log(t=t, u=0 * t + 3, y=t**2 / 200, tanks=[1])
+    >>> result = tuning.identify(
+    ...     case, data, {"plant.pump_gain": (0.01, 9.0)}, start="case", starts=1, substeps=1)
+    >>> result.status, list(result.parameters)
+    (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
     began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
-    if not jax.config.read("jax_enable_x64"):
-        raise InputError(
-            "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
-        )
+    check_float64()
+    _check_options(loss, starts=starts, iterations=iterations)
     case = bare(case) if isinstance(case, Plant) else case
     check_law(law, case)
-    logs = [log] if isinstance(log, lg.Log) else list(log)
-    if not logs:
-        raise InputError("no log is given")
-    if loss not in LOSSES:
-        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    for name, count in (("starts", starts), ("iterations", iterations)):
-        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
-    for one in logs:
-        lg.check_gaps(one, gap)
-        lg.check_fits(one, case.loop)
-    kept = [_kept(one, hold_back) for one in logs]
-    options = {
-        "free": free,
-        "start": start,
-        "noise": noise,
-        "substeps": substeps,
-        "samples": max(one.samples for one in logs),
-    }
-    begin = [one.part(0, n) for one, n in zip(logs, kept)]
-    longest, first = (max(np.diff(one.t).max() for one in side) for side in (logs, begin))
-    if substeps is None and longest > 1.01 * first:  # the longest step is in what is held back
-        options["substeps"] = Estimation(case, logs, **options).substeps
-    partial = Estimation(case, begin, **options)
+    logs = [log] if isinstance(log, experiment.Log) else list(log)
+    check_data(logs, case.loop, gap)
+    kept = [first_samples(one, hold_back) for one in logs]
+    options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
+    partial, options = _first_problem(case, logs, kept, options)
     check_length(logs)
     memo = Memo()
     if folder is not None:
-        memo = Log(
-            folder,
-            _problem(
-                case, logs, partial, {**options, "loss": loss, "iterations": iterations, "gap": gap}
-            ),
-            resume,
-        )
+        given = {**options, "loss": loss, "iterations": iterations, "gap": gap}
+        memo = Log(folder, _problem(case, logs, partial, given), resume)
     if ready is not None:
         ready()
-    fits, interrupted = [], False
-    try:
-        for z in partial.begin(starts, seed):
-            fits.append(_search(memo, partial, z, loss, iterations))
-            if progress is not None:
-                progress(fits[-1])
-    except KeyboardInterrupt:
-        if not fits:
-            raise
-        interrupted = True
-    ranked = sorted((f for f in fits if np.isfinite(f.cost)), key=lambda f: f.cost)
-    if not ranked:
+    fits, interrupted = _searches(memo, partial, starts, seed, loss, iterations, progress)
+    first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
+    if not np.isfinite(first.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
-    best, estimation, validation = (
-        partial.solve(partial.unknowns(ranked[0]), loss, iterations),
-        partial,
-        None,
-    )
-    if any(n < one.samples for n, one in zip(kept, logs)):
-        estimation = Estimation(
-            case, logs, **(options | {"substeps": partial.substeps, "noise": partial.noise})
-        )
-        validation = idf.held_back(estimation, partial, best, kept)
-        best = estimation.solve(partial.unknowns(best), loss, iterations)
-    # branch gains may leave the ranges of gain and split: the same search in these themselves
-    if not _within(estimation, best):
-        plain = estimation.plainly()
-        values = estimation.coordinates.values(best.p)
-        start_at = np.concatenate(
-            [plain.coordinates.point(values), best.own.ravel() / plain.level_scale]
-        )
-        estimation, best = plain, plain.solve(np.clip(start_at, *plain.box), loss, iterations)
-    if not np.isfinite(best.cost):
-        raise DataError(
-            f"{logs[0].name}: what fits the first {kept[0]} samples cannot be simulated over all of"
-            " them"
-        )
-    quality = idf.quality(estimation, best)
-    spread = idf.Spread(estimation, best, quality)
-    if spread.open.any():
-        best = _nearest(estimation, best, spread.scale, loss, iterations)
-        quality = idf.quality(estimation, best)
-        spread = idf.Spread(estimation, best, quality)
-    parameters, levels = spread.parameters(), spread.levels()
-    directions = spread.directions()
-    status = (
-        "converged" if best.status > 0 and not stopped(case.loop, parameters) else "not_converged"
-    )
-    if not all(
-        p["identifiable"] for p in parameters.values()
-    ):  # a level at the start that is not told costs nothing but its interval
-        status = "not_identifiable"
-    if interrupted:
-        status = "interrupted"
+    settings = {"loss": loss, "iterations": iterations}
+    estimation, best, validation = _final_fit(partial, first, logs, kept, options, settings)
+    best, spread, fit_quality = _spread(estimation, best, settings)
     return Identification(
         case=case,
         estimation=estimation,
         fit=best,
-        status=Status(status),
-        parameters=parameters,
-        levels=levels,
-        covariance=spread.covariance_of_values(),
-        quality=quality
+        **_estimates(case, estimation, best, spread, interrupted),
+        quality=fit_quality
         | {"widened": spread.widened, "noise": [float(v) for v in estimation.noise]},
-        directions=directions,
-        remedies=idf.remedies(estimation, best, spread) if status == "not_identifiable" else [],
-        starts=[
-            {
-                "cost": f.cost,
-                "evaluations": f.evaluations,
-                "agrees": bool(f.cost <= ranked[0].cost * AGREE + 1e-12),
-            }
-            for f in fits
-        ],
+        starts=_agreement(fits, first.cost),
         validation=validation,
-        profile=(
-            idf.profile(estimation, best, spread, loss) if profile and not interrupted else None
-        ),
+        profile=None if interrupted or not profile else _profile(estimation, best, spread, loss),
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
     )
 
 
+def _estimates(case, estimation, best, spread, interrupted):
+    """Return status, estimates with intervals, and what is not identifiable."""
+    parameters = spread.parameters()
+    status = _status(case, best, parameters, interrupted)
+    unclear = status is Status.NOT_IDENTIFIABLE
+    return {
+        "status": status,
+        "parameters": parameters,
+        "levels": spread.levels(),
+        "covariance": spread.covariance_of_parameters(),
+        "directions": spread.directions(),
+        "remedies": remedies(estimation, best, spread) if unclear else [],
+    }
+
+
+def _agreement(fits, least):
+    """Return {"cost", "evaluations", "agrees"} of each search; least: the lowest cost."""
+    return [
+        {
+            "cost": f.cost,
+            "evaluations": f.evaluations,
+            "agrees": bool(f.cost <= least * AGREE + 1e-12),
+        }
+        for f in fits
+    ]
+
+
+def _check_options(loss, **counts):
+    """Raise InputError for an unknown loss, or for a count below 1."""
+    if loss not in LOSSES:
+        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
+    for name, count in counts.items():
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
+
+
+def _first_problem(case, logs, kept, options):
+    """Return the Estimation of the first `kept` samples of each log, and all its options."""
+    options = options | {"samples": max(one.samples for one in logs)}
+    begin = [one.part(0, n) for one, n in zip(logs, kept)]
+    longest, first = (max(np.diff(one.t).max() for one in side) for side in (logs, begin))
+    if options["substeps"] is None and longest > 1.01 * first:  # the validation set needs more
+        options["substeps"] = Estimation(case, logs, **options).substeps
+    return Estimation(case, begin, **options), options
+
+
+def _searches(memo, estimation, starts, seed, loss, iterations, progress):
+    """Return (Fits of the searches that ended, whether they were interrupted)."""
+    fits = []
+    try:
+        for z in estimation.starts(starts, seed):
+            fits.append(_search(memo, estimation, z, loss, iterations))
+            if progress is not None:
+                progress(fits[-1])
+    except KeyboardInterrupt:
+        if not fits:
+            raise
+        return fits, True
+    return fits, False
+
+
 def _search(memo, estimation, z, loss, iterations):
-    """The Fit of a first search from z. One that a memo knows is where it ended, without its
-    residual and jacobian.
+    """Return the Fit of a first search from z.
+
+    One from the checkpoint has where it ended, not its residual and Jacobian.
     """
     made = []
 
     def compute():
-        made.append(estimation.solve(z, loss, iterations, tolerance=1e-8))
-        return (
-            made[0].p,
-            made[0].own,
-            made[0].cost,
-            float(made[0].evaluations),
-            float(made[0].status),
-        )
+        one = solve(estimation, z, loss, iterations, tolerance=1e-8)
+        made.append(one)
+        return one.p, one.levels, one.cost, float(one.evaluations), float(one.status)
 
-    p, own, cost, evaluations, status = memo.recall("search", [z], compute)
+    p, levels, cost, evaluations, status = memo.recall("search", [z], compute)
     if made:
         return made[0]
     none = np.zeros((0, estimation.size))
     return Fit(
         p=p,
-        own=own,
+        levels=levels,
         cost=cost,
         residual=none[:, 0],
         jacobian=none,
@@ -291,8 +259,77 @@ def _search(memo, estimation, z, loss, iterations):
     )
 
 
+def _final_fit(partial, first, logs, kept, options, settings):
+    """Return (Estimation, Fit, validation) to all samples, from the best of the first searches."""
+    best = solve(partial, partial.unknowns(first), **settings)
+    estimation, validation = partial, None
+    if any(n < one.samples for n, one in zip(kept, logs)):
+        same = {"substeps": partial.substeps, "noise": partial.noise}
+        estimation = Estimation(partial.case, logs, **(options | same))
+        validation = validate(estimation, partial, best, kept)
+        best = solve(estimation, partial.unknowns(best), **settings)
+    # branch gains may leave the ranges of gain and split: the same search in these themselves
+    if not _within(estimation, best):
+        plain = estimation.without_branch_gains()
+        p = plain.coordinates.point(estimation.coordinates.values(best.p))
+        begin = np.concatenate([p, best.levels.ravel() / plain.level_scale])
+        estimation, best = plain, solve(plain, np.clip(begin, *plain.box), **settings)
+    if not np.isfinite(best.cost):
+        raise DataError(
+            f"{logs[0].name}: the fit to the first {kept[0]} samples diverges when simulated over"
+            " all of them"
+        )
+    return estimation, best, validation
+
+
+def _within(estimation, fit):
+    """Return whether every value lies in its range."""
+    values = estimation.coordinates.values(fit.p)
+    return all(
+        b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
+        for b in estimation.bounds
+    )
+
+
+def _spread(estimation, best, settings):
+    """Return (Fit, Spread, quality): where something is not identifiable, of a fit near nominal."""
+    found = quality(estimation, best)
+    spread = Spread(estimation, best, found)
+    if spread.open.any():
+        best = _nearest(estimation, best, spread.scale, settings)
+        found = quality(estimation, best)
+        spread = Spread(estimation, best, found)
+    return best, spread, found
+
+
+def _nearest(estimation, best, scale, settings):
+    """Return a Fit in the 95 % region about `best` that is near the case's own values.
+
+    A search along an insensitive direction ends at an arbitrary point of it.
+    """
+    nominal = estimation.nominal()
+    most = best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
+    for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
+        prior = (nominal, strength)
+        near = solve(estimation, nominal, tolerance=1e-8, prior=prior, **settings)
+        if near.residual.size and near.residual @ near.residual <= most:
+            return near
+    return best
+
+
+def _status(case, best, parameters, interrupted):
+    """Return the Status; a first level that is not identifiable costs only its interval."""
+    if interrupted:
+        return Status.INTERRUPTED
+    if not all(p["identifiable"] for p in parameters.values()):
+        return Status.NOT_IDENTIFIABLE
+    if best.status > 0 and not at_search_bounds(case.loop, parameters):
+        return Status.CONVERGED
+    return Status.NOT_CONVERGED
+
+
 def _problem(case, logs, partial, options):
-    """What two runs must share for one to go on where the other ended: {what: text}."""
+    """Return {what: text} that two runs must share for one to continue from the other."""
     return {
         "command": "identify",
         "case": digest([np.asarray(leaf) for leaf in jax.tree.leaves(case.loop)]),
@@ -305,42 +342,3 @@ def _problem(case, logs, partial, options):
         "jaxtank": jaxtank.__version__,
         "jax": jax.__version__,
     }
-
-
-def _within(estimation, fit):
-    """Whether every value lies in its range."""
-    values = estimation.coordinates.values(fit.p)
-    return all(
-        b.low - 1e-9 * abs(b.high) <= values[b.name] <= b.high + 1e-9 * abs(b.high)
-        for b in estimation.bounds
-    )
-
-
-def _nearest(estimation, best, scale, loss, iterations):
-    """Of the points in the 95 % region about `best` one near to the case's own values: a search
-    that slides along a valley ends in a corner that says nothing.
-    """
-    origin, most = (
-        estimation.origin(),
-        best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale,
-    )
-    for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
-        near = estimation.solve(origin, loss, iterations, tolerance=1e-8, pull=(origin, strength))
-        if near.residual.size and near.residual @ near.residual <= most:
-            return near
-    return best
-
-
-def _kept(one, hold_back):
-    """Number of samples of a Log that the first fit sees."""
-    if not (
-        isinstance(hold_back, (int, float))
-        and not isinstance(hold_back, bool)
-        and 0 <= hold_back < one.samples
-    ):
-        raise InputError(
-            f"hold_back = {hold_back!r}: must be a share from 0 to below 1, or a number of samples"
-            f" below {one.samples}"
-        )
-    kept = one.samples - (round(hold_back * one.samples) if hold_back < 1 else int(hold_back))
-    return max(kept, 2)

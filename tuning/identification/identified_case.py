@@ -1,46 +1,48 @@
-"""The Case before an identification, where there is but a plant, and the one after it."""
+"""The case before an identification, where only a plant is given, and the one after it.
+
+Imported by `fit` and `result`.
+"""
 
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.case import Case
+from jaxtank.controllers import OpenLoop
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import with_values
+from jaxtank.core.tree import number, with_values
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.observers import Direct
+from jaxtank.signals.base import Constant
+from tuning.identification.proposal import with_pi
 
 
 def bare(plant):
-    """A Case around a plant: ideal pumps and sensors, empty tanks, no law."""
-    from jaxtank.case import Case
-    from jaxtank.controllers import OpenLoop
-    from jaxtank.core.clock import Clock
-    from jaxtank.core.tree import number
-    from jaxtank.instruments.actuators import PumpBank
-    from jaxtank.instruments.sensors import LevelSensor
-    from jaxtank.loop.closed_loop import ClosedLoop
-    from jaxtank.observers import Direct
-    from jaxtank.signals.base import Constant
-
+    """Return a Case around a plant: ideal pumps and sensors, empty tanks, no controller."""
     n, m = plant.tanks, plant.pumps
-    still = number(np.zeros(m))
+    zero = number(np.zeros(m))
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(
             gain=number(np.ones(n)), noise=number(np.zeros(n)), full_scale=number(np.max(plant.rim))
         ),
         observer=Direct(),
-        controller=OpenLoop(signal=Constant(level=still)),
+        controller=OpenLoop(signal=Constant(level=zero)),
         actuator=PumpBank(
-            low=still,
+            low=zero,
             high=number(np.full(m, np.inf)),
-            stop=still,
+            stop=zero,
             pulse=number(np.ones(m)),
-            initial=still,
+            initial=zero,
         ),
         reference=Constant(level=number(np.zeros(len(plant.outputs)))),
         x0=number(np.zeros(n)),
     )
     return Case(
         name="plant",
-        title="a plant without a law",
+        title="a plant without a controller",
         loop=loop,
         clock=Clock(),
         limits={},
@@ -50,14 +52,13 @@ def bare(plant):
 
 
 def proposed(result):
-    """(Case, why): `identified(result)` under the controller of result.law; why: the reason where
-    there is none, else None.
+    """Return (case, reason): `identified_plant` under a controller of the kind `result.law`.
+
+    The case's own controller and the reason where there is none.
     """
     case = identified_plant(result)
     if result.law is None:
         return case, None
-    from tuning.identification.proposal import with_pi
-
     logs = result.estimation.logs
     inputs = np.concatenate([one.u for one in logs]).mean(axis=0)
     try:
@@ -67,9 +68,10 @@ def proposed(result):
 
 
 def identified_plant(result):
-    """The Case of an Identification: its estimates in plant, sensor and pumps, and in the models of
-    law and observer; what its uncertainty is made of; noise of the residuals where they are white,
-    else of the record from sample to sample.
+    """Return the Case of an Identification, with the covariance of its estimates.
+
+    Estimates are set in plant, sensor and pumps, and in the models of controller and observer; the
+    sensor noise is that of the residuals where they are white, else that of the data.
     """
     case = result.case
     values = {n: p["value"] for n, p in result.parameters.items()}
@@ -82,13 +84,12 @@ def identified_plant(result):
             if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
                 loop = with_values(loop, {inner: value})
     noise = np.array(loop.sensor.noise, dtype=float)
-    for (tank, volts), rmse, seen in zip(
-        result.estimation.record.channels, result.quality["rmse"], result.quality["noise"]
+    white = result.quality["widened"] <= 1.05
+    for (tank, volts), rmse, sd in zip(
+        result.estimation.data.channels, result.quality["rmse"], result.quality["noise"]
     ):
-        white = result.quality["widened"] <= 1.05
-        noise[tank] = (rmse if white else min(rmse, seen)) * (
-            float(loop.sensor.gain[tank]) if volts else 1.0
-        )
+        gain = float(loop.sensor.gain[tank]) if volts else 1.0
+        noise[tank] = (rmse if white else min(rmse, sd)) * gain
     loop = with_values(loop, {"sensor.noise": noise})
     names, matrix = result.covariance
     covered = set(names)

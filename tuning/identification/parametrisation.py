@@ -1,10 +1,11 @@
-"""What a fit moves: logarithms of positive parameters, branch gains of a pump that feeds two tanks,
-the rest as shares of its range.
+"""Coordinates of a fit: logarithms of positive parameters, branch gains of pumps that feed two
+tanks, and shares of the range for the rest. Imported by the other modules of this folder.
 """
 
 import dataclasses
 from typing import Any, cast
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.tree import get_value, split_index
@@ -25,17 +26,16 @@ class Coordinates:
 
     @property
     def names(self):
-        """(size,) dotted name of the value that belongs to each coordinate: of a branch, gain then
-        split.
-        """
+        """(size,) dotted name of the value of each coordinate; of a branch, gain then split."""
         return tuple(
             n for kind, *rest in self.items for n in (rest[:2] if kind == "branch" else rest[:1])
         )
 
     @property
     def pairs(self):
-        """((i, i + 1), ...): which coordinates are the two branches of one pump, whose gain and
-        split neither tells alone.
+        """((i, i + 1), ...): coordinates that are the two branches of one pump.
+
+        Gain and split of the pump depend on both.
         """
         found, i = [], 0
         for kind, *_ in self.items:
@@ -66,8 +66,8 @@ class Coordinates:
         )
 
     def values(self, p):
-        """{name: value} at coordinates p (size,), of numpy or jax."""
-        exp = np.exp if isinstance(p, np.ndarray) else _jnp().exp
+        """Return {name: value} at coordinates p (size,), of numpy or jax."""
+        exp = np.exp if isinstance(p, np.ndarray) else jnp.exp
         found, i = {}, 0
         for kind, *rest in self.items:
             if kind == "log":
@@ -82,7 +82,7 @@ class Coordinates:
         return found
 
     def point(self, values):
-        """(size,) coordinates of {name: value}, pushed into the box."""
+        """Return (size,) coordinates of {name: value}, projected onto the bounds."""
         p = []
         for kind, *rest in self.items:
             if kind == "log":
@@ -95,7 +95,7 @@ class Coordinates:
         return np.clip(np.array(p, dtype=float), *self.box)
 
     def slopes(self, p):
-        """(size, size) derivative of the values, in the order of `names`, by the coordinates."""
+        """Return (size, size) derivatives of the values, ordered as `names`, by the coordinates."""
         out, i = np.zeros((self.size, self.size)), 0
         for kind, *rest in self.items:
             if kind == "log":
@@ -113,8 +113,10 @@ class Coordinates:
 
 
 def coordinates(bounds, branches=True):
-    """The Coordinates of a list of tuning.problem.bounds.Bound: a pump's gain and split, where both
-    are free, by their branch gains (or, without `branches`, by themselves).
+    """Return the Coordinates of a list of tuning.problem.bounds.Bound.
+
+    Gain and split of a pump, where both are free, become its branch gains; without `branches`, they
+    are coordinates themselves.
     """
     by_name = {b.name: b for b in bounds} if branches else {}
     items, done = [], set()
@@ -143,10 +145,11 @@ def coordinates(bounds, branches=True):
     return Coordinates(tuple(items))
 
 
-def usual(loop):
-    """{name: (low, high, scale)}: what an identification takes for unknown where nothing is said.
-    Areas are measured with a ruler; pump gains, splits between two tanks, open orifices, pipes and
-    what a lower tank catches of an overflow are not.
+def default_free(loop):
+    """Return {name: (low, high, scale)}: the default unknowns of an identification.
+
+    Pump gains, splits between two tanks, open orifices, pipes, the captured share of an overflow
+    and a constant disturbance; not areas, which are measured with a ruler.
     """
     plant, found = loop.plant, {}
     for name in ("pump_gain", "drain", "orifice", "pipe"):
@@ -172,11 +175,15 @@ def usual(loop):
 
 
 def nominal(loop, names):
-    """{name: value} of a loop as floats."""
+    """Return {name: value} of a loop as floats."""
     return {name: float(np.asarray(get_value(loop, name))) for name in names}
 
 
-def _jnp():
-    import jax.numpy as jnp
+def specification(loop, free):
+    """Return {name: (low, high, scale)} of `free`: logarithmic by default above 0.
 
-    return jnp
+    free: {name: (low, high)} or {name: (low, high, scale)}; None for `default_free`.
+    """
+    if free is None:
+        return default_free(loop)
+    return {n: (*v, "log" if v[0] > 0 else "linear")[:3] for n, v in free.items()}

@@ -1,4 +1,7 @@
-"""A first controller for an identified rig (`identify --law pi`): gains to start a tuning from."""
+"""A first controller for an identified rig (`identify --law pi`): gains from which to tune.
+
+Imported by `fit` and `identified_case`.
+"""
 
 import dataclasses
 import math
@@ -13,14 +16,14 @@ from jaxtank.analysis.steady_state import linearise
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number
-from jaxtank.rig.components import law_of
+from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 
 LAWS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)
-"""Setpoint of each output after its change, over its steady level; the first that the rig can hold
-is taken [-].
+"""Setpoint of each output after its change, over its steady level [-]: the first that the rig can
+hold is taken.
 """
 
 LONGEST = 1e8
@@ -48,8 +51,7 @@ def check_law(law, case):
 
 
 def with_pi(case, inputs):
-    """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges about
-    its gains.
+    """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges.
 
     T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2, with the gain K [cm/V] and the sum of time
     constants T [s] of each output's response to its own pump, linearised at the steady state for
@@ -58,36 +60,13 @@ def with_pi(case, inputs):
     from that steady state. Raises InputError where there is no such steady state, model or
     setpoint.
     """
-    loop, clock = case.loop, case.clock
-    plant, (length, drive) = loop.plant, loop.units
+    loop = case.loop
+    plant = loop.plant
     inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
     x = _steady(loop, inputs)
-    A, B, C = (np.asarray(M) for M in linearise(plant, x, inputs))
-    try:
-        once = np.linalg.solve(A, B)
-        gain, lag = -np.diag(C @ once), np.diag(C @ np.linalg.solve(A, once))
-    except np.linalg.LinAlgError:
-        gain = lag = np.zeros(plant.pumps)
-    for j, (k, area) in enumerate(zip(gain, lag)):
-        if not (k > 0 and area > 0 and math.isfinite(area / k)):
-            at = ", ".join(f"{v:g}" for v in inputs)
-            raise InputError(
-                f"pump {j + 1} does not settle tank {plant.outputs[j] + 1} at inputs ({at})"
-                f" {drive}: no PI of its own, use another [law]"
-            )
-    total = lag / gain + loop.actuator.delay
-    Kc, Ti = 0.5 / gain, 0.5 * total
-    for _ in range(8):
-        closed = np.block(
-            [[A - B * Kc @ C, B], [-(Kc / Ti)[:, None] * C, np.zeros((plant.pumps,) * 2)]]
-        )
-        if np.linalg.eigvals(closed).real.max() < 0:
-            break
-        Kc = 0.5 * Kc
-    else:
-        raise InputError(
-            "output i under a PI of pump i is not stable at any gain tried: use another [law]"
-        )
+    model = tuple(np.asarray(M) for M in linearise(plant, x, inputs))
+    gain, total = _gain_and_time(loop, model, inputs)
+    Kc, Ti = _stable(model, 0.5 / gain, 0.5 * total), 0.5 * total
     moving = not isinstance(loop.reference, Constant) and not (
         isinstance(loop.reference, Ramps) and not loop.reference.changes
     )
@@ -96,12 +75,12 @@ def with_pi(case, inputs):
     table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()} | (
         {} if moving else {"bias": inputs.tolist()}
     )
-    law = law_of(table, plant, start, loop.actuator.initial)
+    controller = controller_of(table, plant, start, loop.actuator.initial)
     free = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
     free |= {"controller.Kc": Free(float(Kc.min() / 30), float(Kc.max() * 30))}
     free |= {"controller.Ti": Free(float(Ti.min() / 10), float(Ti.max() * 10))}
-    proposed = case.replace(
-        loop=dataclasses.replace(loop, controller=law),
+    found = case.replace(
+        loop=dataclasses.replace(loop, controller=controller),
         free=free,
         symmetry=None,
         objective=case.objective or {"rms_error_total": 1.0},
@@ -109,63 +88,88 @@ def with_pi(case, inputs):
             s for s in case.scenarios if not any(n.startswith("controller.") for n in s.values)
         ),
     )
-    if moving:
-        return rigs.check(proposed)
-    pause = clock.dt * min(math.ceil(5 * total.max() / clock.dt), MOST // len(outputs))
-    clock = dataclasses.replace(clock, duration=pause * len(outputs))
-    changes = [
-        (round(0.1 * pause / clock.dt) * clock.dt + k * pause, k) for k in range(len(outputs))
-    ]
+    return rigs.check(found) if moving else _with_changes(found, x, start, inputs, total.max())
+
+
+def _gain_and_time(loop, model, inputs):
+    """Return (K (m,) [cm/V], T (m,) [s]) of each output's response to its own pump."""
+    A, B, C = model
+    pumps = loop.plant.pumps
+    try:
+        once = np.linalg.solve(A, B)
+        gain, area = -np.diag(C @ once), np.diag(C @ np.linalg.solve(A, once))
+    except np.linalg.LinAlgError:
+        gain = area = np.zeros(pumps)
+    for j, (k, a) in enumerate(zip(gain, area)):
+        if not (k > 0 and a > 0 and math.isfinite(a / k)):
+            at = ", ".join(f"{v:g}" for v in inputs)
+            raise InputError(
+                f"pump {j + 1} does not settle tank {loop.plant.outputs[j] + 1} at inputs ({at})"
+                f" {loop.units[1]}: no PI of its own, use another [law]"
+            )
+    return gain, area / gain + loop.actuator.delay
+
+
+def _stable(model, Kc, Ti):
+    """Return Kc, halved until the linear closed loop is stable."""
+    A, B, C = model
+    for _ in range(8):
+        closed = np.block(
+            [[A - B * Kc @ C, B], [-(Kc / Ti)[:, None] * C, np.zeros((Kc.size, Kc.size))]]
+        )
+        if np.linalg.eigvals(closed).real.max() < 0:
+            return Kc
+        Kc = 0.5 * Kc
+    raise InputError(
+        "output i under a PI of pump i is not stable at any gain tried: use another [law]"
+    )
+
+
+def _with_changes(case, x, start, inputs, slowest):
+    """Return `case` from the steady state x with a change of each setpoint that the rig can hold.
+
+    slowest: largest sum of time constants [s]; the changes are five of them apart.
+    """
+    loop, outputs = case.loop, range(len(start))
+    pause = case.clock.dt * min(math.ceil(5 * slowest / case.clock.dt), MOST // len(start))
+    clock = dataclasses.replace(case.clock, duration=pause * len(start))
+    times = [round(0.1 * pause / clock.dt) * clock.dt + k * pause for k in outputs]
     pumps = dataclasses.replace(loop.actuator, initial=number(inputs))
     for share in STEPS:
-        reference = ramps(start, [(t, k, share * start[k]) for t, k in changes], ramp=0.0)
-        whole = dataclasses.replace(
-            proposed.loop, reference=reference, x0=number(x), actuator=pumps
-        )
-        one = proposed.replace(loop=whole, clock=clock)
-        if not rigs.unreachable(one):
-            return rigs.check(one.replace(reachable=True))
+        reference = ramps(start, [(times[k], k, share * start[k]) for k in outputs], ramp=0.0)
+        moved = dataclasses.replace(loop, reference=reference, x0=number(x), actuator=pumps)
+        found = case.replace(loop=moved, clock=clock)
+        if not rigs.unreachable(found):
+            return rigs.check(found.replace(reachable=True))
     raise InputError(
-        f"no setpoints about {', '.join(f'{v:.4g}' for v in start)} {length} can be held: add [law]"
-        " and [reference]"
+        f"no setpoints about {', '.join(f'{v:.4g}' for v in start)} {loop.units[0]} can be held:"
+        " add [law] and [reference]"
     )
 
 
 def _steady(loop, inputs):
-    """(n,) levels at which the rig stands with `inputs` held. Raises InputError where there are
-    none below the rims.
-    """
+    """Return (n,) steady levels at constant `inputs`; raise InputError unless below the rims."""
     plant = loop.plant
-    inflow = (
-        tuple(np.asarray(loop.disturbance.level))
-        if isinstance(loop.disturbance, Constant)
-        else None
-    )
+    constant = isinstance(loop.disturbance, Constant)
+    inflow = tuple(np.asarray(loop.disturbance.level)) if constant else None
     derivative = jax.jit(
         lambda x: jnp.stack(
             plant.derivative(0.0, tuple(jnp.maximum(x, 0.0)), tuple(inputs), inflow)
         )
     )
     rate = lambda _, x: np.asarray(derivative(x))
-    x, span, rim = (
-        np.maximum(np.asarray(loop.x0, dtype=float), 1e-3 * np.asarray(plant.rim)),
-        100.0,
-        np.asarray(plant.rim),
-    )
+    rim, span = np.asarray(plant.rim), 100.0
+    x = np.maximum(np.asarray(loop.x0, dtype=float), 1e-3 * rim)
     while span <= LONGEST:
-        x = np.maximum(
-            solve_ivp(rate, (0.0, span), x, method="LSODA", rtol=1e-9, atol=1e-9 * rim.min()).y[
-                :, -1
-            ],
-            0.0,
-        )
+        run = solve_ivp(rate, (0.0, span), x, method="LSODA", rtol=1e-9, atol=1e-9 * rim.min())
+        x = np.maximum(run.y[:, -1], 0.0)
         if np.any(x > 10 * rim) or np.all(np.abs(rate(0.0, x)) * span <= 1e-6 * rim):
             break
         span *= 10
     at = ", ".join(f"{v:.4g}" for v in inputs)
     for i in np.flatnonzero((x >= rim) | (x <= 1e-3 * rim) | (span > LONGEST)):
         raise InputError(
-            f"tank {i + 1} has no steady level between 0 and its rim at the mean inputs of the log,"
-            f" ({at}) {loop.units[1]}: add [law], [reference] and [free]"
+            f"tank {i + 1} has no steady level between 0 and its rim at the mean inputs of the"
+            f" data, ({at}) {loop.units[1]}: add [law], [reference] and [free]"
         )
     return x

@@ -1,5 +1,6 @@
-"""A rig played by a log: what its sensors would have read, had the pumps been given what the log
-says.
+"""Simulated readings of a rig for the inputs of experiment data, and their sensitivities.
+
+Imported by the other modules of this folder.
 """
 
 import dataclasses
@@ -24,8 +25,9 @@ from jaxtank.xla.hoist import scan
 
 @component
 class Rig:
-    """What of a closed loop a log plays: everything but the law and its observer. Names are those
-    of the loop.
+    """The part of a closed loop that experiment data describe: all but controller and observer.
+
+    Names of its leaves are those of the loop.
     """
 
     plant: Plant
@@ -41,8 +43,10 @@ class Rig:
 
 
 def rig_of(loop):
-    """The Rig of a loop. A constant disturbance belongs to it; one that comes and goes belonged to
-    another run and does not. A transport delay is taken up by `shifted`.
+    """Return the Rig of a loop.
+
+    A constant disturbance belongs to it; one that varies belongs to another run and does not. The
+    transport delay of the pumps is applied by `padded`.
     """
     disturbance = loop.disturbance if isinstance(loop.disturbance, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
@@ -58,9 +62,10 @@ def rig_of(loop):
     )
 
 
-class Record(NamedTuple):
-    """Logs side by side, as arrays padded to the longest; the padding takes no time and counts for
-    nothing.
+class PaddedData(NamedTuple):
+    """Experiment data of several runs as arrays, padded to the longest.
+
+    The padding has steps of length zero and no readings.
     """
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
@@ -69,11 +74,12 @@ class Record(NamedTuple):
     channels: tuple  # ((tank, in volts), ...)
 
 
-def record(logs, delay=0.0, samples=0):
-    """The Record of Logs. delay: transport delay of the pumps [s]: an input reaches its tank at the
-    first sample that is at least as late;
-    samples: least length to pad to, so that logs cut short run through the program of the whole
-        ones.
+def padded(logs, delay=0.0, samples=0):
+    """Return the PaddedData of a list of Log.
+
+    delay: transport delay of the pumps [s]: an input reaches its tank at the first sample that is
+    at least as late. samples: least length to pad to, so that truncated data run through the same
+    compiled program as whole ones.
     """
     channels = tuple(sorted({pair for one in logs for pair in zip(one.tanks, one.in_volts)}))
     n = max(samples, *(one.samples for one in logs))
@@ -81,23 +87,23 @@ def record(logs, delay=0.0, samples=0):
     y = np.full((len(logs), n, len(channels)), np.nan)
     for e, one in enumerate(logs):
         dt[e, : one.samples - 1] = np.diff(one.t)
-        u[e, : one.samples] = shifted(one, delay)
+        u[e, : one.samples] = _delayed(one, delay)
         for c, pair in enumerate(zip(one.tanks, one.in_volts)):
             y[e, : one.samples, channels.index(pair)] = one.y[:, c]
-    return Record(dt, u, y, channels)
+    return PaddedData(dt, u, y, channels)
 
 
-def shifted(one, delay):
-    """(samples, pumps) inputs of a Log as they reach the tanks `delay` [s] later."""
+def _delayed(one, delay):
+    """Return (samples, pumps) inputs of a Log as they reach the tanks `delay` [s] later."""
     k = np.searchsorted(one.t, one.t - delay + 1e-9 * max(1.0, delay), side="right") - 1
     return one.u[np.maximum(k, 0)]
 
 
 def readings(rig, dt, u, channels, substeps):
-    """(samples, channels) what the sensors read, free of noise, in the channels' units.
+    """Return (samples, channels) readings without noise, in the channels' units.
 
-    dt: (samples,) [s]; u: (samples, pumps) held until the next sample; each step is `substeps`
-        steps of fourth-order Runge-Kutta.
+    dt: (samples,) [s]; u: (samples, pumps) held until the next sample; each sample takes `substeps`
+    steps of fourth-order Runge-Kutta.
     """
     x, d = tuple(rig.x0[i] + 0.0 * dt[0] for i in range(rig.plant.tanks)), None
     if rig.disturbance is not None:
@@ -111,11 +117,11 @@ def readings(rig, dt, u, channels, substeps):
         x, state = carry
         step, inputs = now
         out = tuple(_reading(rig, x, channel) for channel in channels)
-        # a command past its limits is what a saturated pump was asked for
+        # experiment data hold the command, which may lie beyond the pump's limits
         inputs = tuple(
             clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
         )
-        held = jnp.where(step > 0, step, 1.0)  # the padding at the end must not divide by nothing
+        held = jnp.where(step > 0, step, 1.0)  # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, held)
         driven = rig.actuator.driving(driven)
         found = advance(rig.plant, "rk4", 0.0, x, driven, d, step, substeps, rolled=True)
@@ -126,28 +132,29 @@ def readings(rig, dt, u, channels, substeps):
 
 
 def _reading(rig, x, channel):
+    """Return the reading of one channel at levels x."""
     tank, in_volts = channel
     y = x[tank] if rig.sensor.offset is None else x[tank] + rig.sensor.offset[tank]
     return y / rig.sensor.gain[tank] if in_volts else y
 
 
 @functools.partial(jax.jit, static_argnames=("coordinates", "tanks", "channels", "substeps"))
-def passes(rig, dt, u, p, own, *, coordinates, tanks, channels, substeps):
-    """(readings (logs, samples, channels), their derivatives (logs, samples, channels, shared +
-    own)) of every log at once.
+def sensitivities(rig, dt, u, p, first, *, coordinates, tanks, channels, substeps):
+    """Return readings and their derivatives by the unknowns, of all runs at once.
 
-    p: (shared,) coordinates of what all logs have in common; own: (logs, len(tanks)) levels of
-        `tanks` at the start of each log.
+    p: (shared,) coordinates common to all runs; first: (logs, len(tanks)) levels of `tanks` at the
+    first sample of each. Returns (logs, samples, channels) and (logs, samples, channels, shared +
+    len(tanks)).
     """
     shared = coordinates.size
 
-    def one(dt, u, own):
+    def one(dt, u, first):
         def predicted(q):
             r = with_values(rig, coordinates.values(q[:shared]))
             r = with_values(r, {f"x0[{tank}]": q[shared + i] for i, tank in enumerate(tanks)})
             return readings(r, dt, u, channels, substeps)
 
-        q = jnp.concatenate([p, own])
+        q = jnp.concatenate([p, first])
 
         def both(tangent):
             return jax.jvp(predicted, (q,), (tangent,))
@@ -155,36 +162,34 @@ def passes(rig, dt, u, p, own, *, coordinates, tanks, channels, substeps):
         y, slopes = jax.vmap(both, out_axes=(None, -1))(jnp.eye(q.size, dtype=q.dtype))
         return y, slopes
 
-    return jax.vmap(one)(dt, u, own)
+    return jax.vmap(one)(dt, u, first)
 
 
-@functools.partial(jax.jit, static_argnames=("channels", "substeps"))
-def play(rig, dt, u, own, *, channels, substeps):
-    """(logs, samples, channels) readings of a Rig whose levels start at own (logs, tanks)."""
+def _play(rig, dt, u, first, *, channels, substeps):
+    """Return (logs, samples, channels) readings of a Rig from levels `first` (logs, tanks)."""
     return jax.vmap(
         lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps)
-    )(dt, u, own)
+    )(dt, u, first)
 
+
+play = jax.jit(_play, static_argnames=("channels", "substeps"))
+_play_any = jax.jit(_play, static_argnames=("channels",))  # one program for any number of substeps
 
 MOST_SUBSTEPS = 64
 
 
-@functools.partial(jax.jit, static_argnames=("channels",))
-def _tried(rig, dt, u, own, substeps, *, channels):
-    """`play` with any number of steps: one program for all."""
-    return jax.vmap(
-        lambda dt, u, x0: readings(dataclasses.replace(rig, x0=x0), dt, u, channels, substeps)
-    )(dt, u, own)
+def substeps_for(rig, data, first, error):
+    """Return how many Runge-Kutta steps each sample needs, and the error that is left.
 
-
-def substeps_for(rig, rec, own, error):
-    """(how many steps each sample needs: twice as many move no reading by more than `error`
-    (channels,), in the channels' units, at most 64; (channels,) by how much they do: NaN or
-    infinite where the levels leave the numbers).
+    With twice as many no reading moves by more than `error` (channels,), in the channels' units; at
+    most 64. The second is (channels,) by how much they move: NaN or infinite where the simulation
+    diverges.
     """
-    own, before, count = np.asarray(own), None, 1
+    first, before, count = np.asarray(first), None, 1
     while count <= MOST_SUBSTEPS:
-        y = np.asarray(_tried(rig, rec.dt, rec.u, own, count, channels=rec.channels))
+        y = np.asarray(
+            _play_any(rig, data.dt, data.u, first, channels=data.channels, substeps=count)
+        )
         if before is not None:
             with np.errstate(invalid="ignore", over="ignore"):
                 moved = np.max(np.abs(y - before), axis=(0, 1))

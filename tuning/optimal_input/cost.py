@@ -1,5 +1,5 @@
-"""Inputs as unknowns: what a run costs as a function of every voltage it is given, with the exact
-gradient by checkpointed reverse mode.
+"""The cost of a run as a function of every input, with the exact gradient by checkpointed reverse
+mode. Imported by `problem` and `perfect_information`.
 """
 
 import dataclasses
@@ -20,37 +20,36 @@ from jaxtank.loop.step import step
 from jaxtank.observers import Direct
 from jaxtank.signals.base import Table
 
-RUNNING = {m: ms.MEASURES[m].sense for m in ("max_level", "min_level", "max_error")}
-"""Measures whose limit is held sample by sample: +1 for an upper limit, -1 for a lower one."""
+POINTWISE = {m: ms.MEASURES[m].sense for m in ("max_level", "min_level", "max_error")}
+"""Measures whose limit is held at every sample: +1 for an upper limit, -1 for a lower one."""
 
 
 class Terms(NamedTuple):
-    """What is made small and what must hold: the part that is compiled in."""
+    """What is minimised and what is limited: the part that is compiled in."""
 
     objective: tuple  # ((measure, weight), ...)
-    squared: bool  # the square of the cost is searched: smooth where the cost is a root alone
-    running: tuple  # ((measure, entry), ...) limits of RUNNING
-    whole: tuple  # ((measure, entry), ...) limits of measures that are sums over the run
+    squared: bool  # whether the square of the cost is minimised: smooth where the cost is a root
+    pointwise: tuple  # ((measure, entry), ...) limits of POINTWISE
+    integral: tuple  # ((measure, entry), ...) limits of measures that are sums over the run
 
 
-class Held(NamedTuple):
-    """An augmented Lagrangian: values, multipliers and weight of the limits, and what the cost
-    counts as 1.
-    """
+class Lagrangian(NamedTuple):
+    """Augmented Lagrangian: limits, multipliers, weight, and the scale of the cost."""
 
-    scale: Any  # () cost, or its square, that counts as 1
+    scale: Any  # () of the cost, or of its square
     weight: Any  # () of a squared excess [-]
-    running: Any  # (running,) values of the limits [cm]
-    forces: Any  # (running,) tuple of (samples,) multipliers [-]
-    whole: Any  # (whole,) values of the limits, in their measures' units
-    pulls: Any  # (whole,) multipliers [-]
-    room: Any  # ((running,), (whole,)) what an excess of each limit is a share of
-    knees: Any  # (input [V], error [cm]) below which a search sees an absolute value as a parabola
+    pointwise: Any  # (pointwise,) values of the limits [cm]
+    multipliers: Any  # (pointwise,) tuple of (samples,) multipliers [-]
+    integral: Any  # (integral,) values of the limits, in their measures' units
+    integral_multipliers: Any  # (integral,) multipliers [-]
+    sizes: Any  # ((pointwise,), (integral,)) of which an excess is a share
+    smoothing: Any  # (input [V], error [cm]) below which an absolute value is a parabola
 
 
 def open_loop(loop, u, interval):
-    """`loop` with its law replaced by the inputs u (pumps, intervals), each held for `interval`
-    [s], and without sensor noise.
+    """Return `loop` with the inputs u (pumps, intervals) in place of its controller.
+
+    Each is held for `interval` [s]; without sensor noise.
     """
     return dataclasses.replace(
         loop,
@@ -66,27 +65,38 @@ def open_loop(loop, u, interval):
     )
 
 
-def excess(terms, held, sample):
-    """How far each running limit is passed at a sample, negative inside, as a share of its room
-    [-].
+def _pointwise_excess(terms, lagrangian, sample):
+    """Return the excess over each pointwise limit at a sample, as a share of its size [-].
+
+    Negative where the limit holds.
     """
     found = []
-    for j, (measure, i) in enumerate(terms.running):
+    for j, (measure, i) in enumerate(terms.pointwise):
         quantity = magnitude(sample.e[i]) if measure == "max_error" else sample.x[i]
-        found.append(RUNNING[measure] * (quantity - held.running[j]) / held.room[0][j])
+        excess = quantity - lagrangian.pointwise[j]
+        found.append(POINTWISE[measure] * excess / lagrangian.sizes[0][j])
     return found
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "terms"))
-def value_and_gradient(loop, clock, terms, u, held):
-    """(search cost, its gradient (pumps, intervals)) of the inputs u of an open loop."""
-    return jax.value_and_grad(_search_cost)(u, loop, clock, terms, held)
+def _integral_excess(terms, lagrangian, measures):
+    """Return the excess over each integral limit, as a share of its size [-]."""
+    return [
+        (jnp.ravel(measures[m])[i] - lagrangian.integral[j]) / lagrangian.sizes[1][j]
+        for j, (m, i) in enumerate(terms.integral)
+    ]
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "terms"))
-def look(loop, clock, terms, u, held):
-    """((running,) tuple of (samples,) excesses, (whole,) excesses, both as shares of their rooms,
-    {measure: value}) of the inputs u.
+def value_and_gradient(loop, clock, terms, u, lagrangian):
+    """Return (search cost, gradient (pumps, intervals)) of the inputs u of an open loop."""
+    return jax.value_and_grad(_search_cost)(u, loop, clock, terms, lagrangian)
+
+
+@functools.partial(jax.jit, static_argnames=("clock", "terms"))
+def evaluate(loop, clock, terms, u, lagrangian):
+    """Return the excesses and the measures of the inputs u.
+
+    ((pointwise,) tuple of (samples,), (integral,), {measure: value}); excesses as shares of sizes.
     """
     loop = _with_inputs(loop, u)
     names = _names(terms)
@@ -95,7 +105,13 @@ def look(loop, clock, terms, u, held):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
+<<<<<<< HEAD
         return (state, ms.update(run, acc, sample, now.context)), tuple(excess(terms, held, sample))
+=======
+        return (state, ms.update(run, acc, sample, now.context)), tuple(
+            _pointwise_excess(terms, lagrangian, sample)
+        )
+>>>>>>> main
 
     (_, acc), over = lp.scan(
         body,
@@ -104,19 +120,21 @@ def look(loop, clock, terms, u, held):
         clock.samples,
     )
     measures = ms.read(run, acc, names)
-    return over, _whole(terms, held, measures), measures
+    return over, _integral_excess(terms, lagrangian, measures), measures
 
 
-def _search_cost(u, loop, clock, terms, held):
+def _search_cost(u, loop, clock, terms, lagrangian):
+    """Return scaled cost + penalty of the excesses; absolute values in the cost are smoothed."""
     loop = _with_inputs(loop, u)
     names = _names(terms)
     run, zero = run_of(loop, clock), jnp.zeros((), u.dtype)
-    soft = {m for m, _ in terms.objective} & {"input_travel", "iae"}
+    smoothed = {m for m, _ in terms.objective} & {"input_travel", "iae"}
 
     def body(carry, xs):
-        state, acc, (before, travel, absolute), penalty = carry
-        now, forces = xs
+        state, acc, (before, variation, absolute), penalty = carry
+        now, multipliers = xs
         state, sample = step(loop, clock, state, now)
+<<<<<<< HEAD
         acc = ms.update(run, acc, sample, now.context)
         if "input_travel" in soft:
             change = sum(_soft(a - b, held.knees[0]) for a, b in zip(sample.u, before))
@@ -127,39 +145,49 @@ def _search_cost(u, loop, clock, terms, held):
             push = force + held.weight * over
             penalty = penalty + jnp.where(push > 0.0, push * push, 0.0)
         return (state, acc, (before, travel, absolute), penalty), None
+=======
+        acc = ms.update(run, acc, sample, now.context)
+        if "input_travel" in smoothed:
+            change = sum(
+                _smooth_absolute(a - b, lagrangian.smoothing[0]) for a, b in zip(sample.u, before)
+            )
+            variation, before = variation + jnp.where(state.k == 1, 0.0, change), sample.u
+        if "iae" in smoothed:
+            absolute = absolute + sum(
+                _smooth_absolute(e, lagrangian.smoothing[1]) for e in sample.e
+            )
+        for multiplier, over in zip(multipliers, _pointwise_excess(terms, lagrangian, sample)):
+            force = multiplier + lagrangian.weight * over
+            penalty = penalty + jnp.where(force > 0.0, force * force, 0.0)
+        return (state, acc, (before, variation, absolute), penalty), None
+>>>>>>> main
 
-    extra = ((zero,) * loop.plant.pumps if "input_travel" in soft else (), zero, zero)
+    extra = ((zero,) * loop.plant.pumps if "input_travel" in smoothed else (), zero, zero)
     carry = (initial(loop, clock), ms.start(run, names), extra, zero)
-    xs = (inputs(loop, clock, names, None), held.forces)
-    _, acc, (_, travel, absolute), penalty = lp.checkpointed_scan(body, carry, xs, clock.samples)
+    xs = (inputs(loop, clock, names, None), lagrangian.multipliers)
+    _, acc, (_, variation, absolute), penalty = lp.checkpointed_scan(body, carry, xs, clock.samples)
     measures = ms.read(run, acc, names)
-    smooth = {"input_travel": travel, "iae": absolute * clock.dt}
+    smooth = {"input_travel": variation, "iae": absolute * clock.dt}
     cost = sum(w * (smooth[m] if m in smooth else jnp.sum(measures[m])) for m, w in terms.objective)
-    total = (cost * cost if terms.squared else cost) / held.scale + 0.5 * penalty / (
-        held.weight * clock.samples
-    )
-    for j, over in enumerate(_whole(terms, held, measures)):
-        push = held.pulls[j] + held.weight * over
-        total = total + 0.5 * jnp.where(push > 0.0, push * push, 0.0) / held.weight
+    total = (cost * cost if terms.squared else cost) / lagrangian.scale
+    total = total + 0.5 * penalty / (lagrangian.weight * clock.samples)
+    for j, over in enumerate(_integral_excess(terms, lagrangian, measures)):
+        force = lagrangian.integral_multipliers[j] + lagrangian.weight * over
+        total = total + 0.5 * jnp.where(force > 0.0, force * force, 0.0) / lagrangian.weight
     return total
 
 
-def _whole(terms, held, measures):
-    return [
-        (jnp.ravel(measures[m])[i] - held.whole[j]) / held.room[1][j]
-        for j, (m, i) in enumerate(terms.whole)
-    ]
-
-
 def _names(terms):
-    return tuple(dict.fromkeys([*(m for m, _ in terms.objective), *(m for m, _ in terms.whole)]))
+    """Return the measures that a run accumulates."""
+    return tuple(dict.fromkeys([*(m for m, _ in terms.objective), *(m for m, _ in terms.integral)]))
 
 
 def _with_inputs(loop, u):
+    """Return an open loop with other inputs."""
     signal = dataclasses.replace(loop.controller.signal, values=u)
     return dataclasses.replace(loop, controller=dataclasses.replace(loop.controller, signal=signal))
 
 
-def _soft(x, knee):
-    """|x|, a parabola near 0: sqrt(x^2 + knee^2) - knee."""
-    return jnp.sqrt(x * x + knee * knee) - knee
+def _smooth_absolute(x, width):
+    """Return |x|, a parabola near 0: sqrt(x^2 + width^2) - width."""
+    return jnp.sqrt(x * x + width * width) - width

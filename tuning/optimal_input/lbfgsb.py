@@ -1,26 +1,36 @@
-"""L-BFGS in a box, for thousands of unknowns: directions on the free ones, steps bent at the walls."""
+"""L-BFGS in a box, for thousands of unknowns and simulations of a few milliseconds. Imported by
+`search`.
+
+SciPy's L-BFGS-B finds the same optima (costs of six cases within 0.03 %, with 0.7 to 1.0 times
+the gradients) but factorises small dense matrices with threaded BLAS: 4.5 ms of CPU time per
+iteration with two threads, 0.1 ms with one, against 0.2 ms here. A search took 1.4 to 2.7 times the
+CPU time (two cores, SciPy 1.17).
+"""
 
 from collections import deque
 
 import numpy as np
 
 MEMORY = 12
-"""Pairs of steps and slopes remembered."""
+"""Pairs of steps and gradient changes kept."""
 
 FLAT = 5
 """Iterations in a row without progress that end a search."""
 
 
 def minimise(function, z, iterations, tolerance=1e-8):
-    """(z, value, gradient, iterations) of a local minimum of `function` over the unit cube
-    (Bertsekas 1982: two-metric projection).
+    """Return (z, value, gradient, iterations) of a local minimum over the unit cube.
 
-    function: z (n,) -> (value, gradient (n,)); z: (n,) start, inside. The direction is that of
-    limited-memory BFGS (Nocedal 1980) in the coordinates that are not held at a wall by their
-    slope; the step is halved until the value falls by a ten-thousandth of what the slope promises.
-    Ends after `iterations`, or where FLAT iterations in a row gain less than `tolerance` of the
-    value or of 1e-2. (SciPy's L-BFGS-B does the same with small dense factorisations, which spend
-    more on threads than such a simulation takes.)
+    Two-metric projection (Bertsekas 1982): the direction is that of limited-memory BFGS (Nocedal
+    1980) in the coordinates that no bound holds; the step is projected onto the bounds, and halved
+    until the value falls by a ten-thousandth of the linear prediction.
+
+    function: z (n,) -> (value, gradient (n,)); z: (n,) start, inside. Ends after `iterations`, or
+    where FLAT iterations in a row gain less than `tolerance` of the value or of 1e-2.
+
+    >>> z, *_ = minimise(lambda z: (float(z @ z - 4 * z[0]), 2 * z - [4, 0]), np.full(2, 0.5), 50)
+    >>> z.round(6).tolist()
+    [1.0, 0.0]
     """
     value, gradient = function(z)
     pairs, flat, count = deque(maxlen=MEMORY), 0, 0
@@ -30,16 +40,17 @@ def minimise(function, z, iterations, tolerance=1e-8):
         slope = np.where(free, gradient, 0.0)
         if not np.any(slope):
             break
-        way = -_inverse_hessian(slope, pairs, free)
-        if way @ slope > -1e-12 * np.linalg.norm(way) * np.linalg.norm(slope):
+        direction = -_inverse_hessian(slope, pairs, free)
+        size = np.linalg.norm(direction) * np.linalg.norm(slope)
+        if direction @ slope > -1e-12 * size:
             pairs.clear()
-            way = -slope
-        step = 1.0 if pairs else min(1.0, 0.1 / np.max(np.abs(way)))
+            direction = -slope
+        step = 1.0 if pairs else min(1.0, 0.1 / np.max(np.abs(direction)))
         for _ in range(30):
-            new = np.clip(z + step * way, 0.0, 1.0)
-            promised = gradient @ (new - z)
+            new = np.clip(z + step * direction, 0.0, 1.0)
+            predicted = gradient @ (new - z)
             trial, trial_gradient = function(new)
-            if trial <= value + 1e-4 * promised:
+            if trial <= value + 1e-4 * predicted:
                 break
             step *= 0.5
         else:
@@ -58,7 +69,7 @@ def minimise(function, z, iterations, tolerance=1e-8):
 
 
 def _inverse_hessian(q, pairs, free):
-    """The two loops of limited-memory BFGS, in the free coordinates alone."""
+    """Return the two-loop recursion of limited-memory BFGS, in the free coordinates alone."""
     used, q = [], q.copy()
     for s, y in reversed(pairs):
         s, y = np.where(free, s, 0.0), np.where(free, y, 0.0)

@@ -1,5 +1,5 @@
-"""The search for the best inputs: grids from coarse to fine, L-BFGS in a box, limits by one
-multiplier per sample.
+"""The search for the optimal inputs: coarse to fine intervals, L-BFGS in a box, and an augmented
+Lagrangian with one multiplier per sample. Imported by `perfect_information`.
 """
 
 import dataclasses
@@ -7,46 +7,27 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError, NonFiniteError
-from jaxtank.core.tree import number
 from jaxtank.loop import run as lp
-from jaxtank.rig import check_objective
-from tuning.optimal_input.cost import RUNNING, Held, Terms, look, open_loop, value_and_gradient
+from tuning.optimal_input.cost import POINTWISE
 from tuning.optimal_input.lbfgsb import minimise
-from tuning.problem.limits import resolve_limits
-
-TOLERANCE = 3e-5
-"""Share of a limit by which it may be passed and still counts as held [-]: 1e-3 cm of 30 cm."""
-
-SEARCH_SAMPLES = 4000
-"""Samples that a coarse clock must leave for the search."""
-
-INTERVALS = 1200
-"""Most intervals of an input where none are asked for."""
+from tuning.optimal_input.problem import TOLERANCE, InputProblem
 
 GRIDS = (16, 4, 1)
-"""Intervals that move together, coarse to fine: slow changes of the input are found on few
-unknowns.
-"""
-
-WEIGHT = 1e5
-"""First weight of a squared excess, of a cost that counts as 1 and an excess as a share of its
-limit [-].
-"""
+"""Intervals that share an input, coarse to fine: slow changes are found with few unknowns."""
 
 SETPOINTS = 8
-"""Setpoints whose steady inputs are asked for: a start needs no more."""
+"""Most setpoints whose steady-state inputs are computed for a start."""
 
 ROUNDS = 8
-"""Most rounds of repair on the finest grid."""
+"""Most rounds of constraint tightening with the finest intervals."""
 
 
 class InputSearch:
-    """The search of `bound`: problem, memory and counters."""
+    """The search of `bound`: the best inputs so far, multipliers and counters."""
 
-    def __init__(self, case, objective, limits, interval, iterations, progress):
+    def __init__(self, problem: InputProblem, iterations=200, progress=None):
         if jax.numpy.result_type(float) != np.float64:
             raise InputError("bound needs float64: jax.config.update('jax_enable_x64', True)")
         if (
@@ -57,136 +38,56 @@ class InputSearch:
             raise InputError(
                 f"iterations = {iterations!r}: must be a whole number from 1 to 100000"
             )
-        self.case, self.most, self.progress = case, iterations, progress
-        self.objective = {
-            m: w
-            for m, w in check_objective(case.objective if objective is None else objective).items()
-            if w > 0
-        }
-        loop, clock = case.loop, case.clock
-        lp.check(loop, clock, jax.random.key(0))
-        self.low, self.high = (
-            np.array(np.broadcast_to(v, loop.plant.pumps), dtype=float)
-            for v in (loop.actuator.low, loop.actuator.high)
-        )
-        if not np.all(np.isfinite([self.low, self.high])):
-            raise InputError(
-                "bound: every pump needs finite limits, actuator.low and actuator.high"
-            )
-        self.limits = resolve_limits(case, limits)
-        _check_served(self.objective, self.limits)
-        self.interval = _interval(clock, interval)
-        self.count = max(1, int(np.ceil((clock.samples - 1) * clock.dt / self.interval - 1e-6)))
-        needs = {
-            a
-            for m in (*self.objective, *(limit.measure for limit in self.limits))
-            for a in ms.MEASURES[m].needs
-        }
-        # changes from sample to sample are fewer at a coarser step
-        self.coarse = (
-            dataclasses.replace(clock, integrator="midpoint")
-            if "changes2" in needs
-            else _search_clock(clock, self.interval, loop.actuator.delay)
-        )
-        # below an offset dead zone the pump stands still whatever the voltage: a search would not
-        # find its way out
-        if np.any(np.asarray(loop.actuator.offset) > 0) and not needs & {
-            "u2",
-            "travel",
-            "deviation2",
-            "changes2",
-            "past2",
-        }:
-            self.low = np.minimum(np.maximum(self.low, loop.actuator.offset), self.high)
-        # no liquid over a rim is a level at most at the rim: the slope of a level that stops there
-        # would say nothing
-        spill = [
-            limit.index
-            for limit in self.limits
-            if limit.measure == "overflow_volume" and limit.value <= 1e-3
-        ]
-        if spill and len(spill) < loop.plant.tanks:
-            raise InputError(
-                "bound: a limit on overflow_volume must be given for all tanks, or max_level = rim"
-            )
-        self.plant = dataclasses.replace(loop.plant, overflow=False) if spill else loop.plant
-        rim = np.asarray(loop.plant.rim)
-        held = [(limit.measure, limit.index, limit.value) for limit in self.limits]
-        levels = [
-            (
-                ("max_level", i, rim[i] * (1 - TOLERANCE))
-                if m == "overflow_volume" and i in spill
-                else (m, i, v)
-            )
-            for m, i, v in held
-        ]
-        running = [limit for limit in levels if limit[0] in RUNNING]
-        whole = [limit for limit in levels if limit[0] not in RUNNING]
-        self.terms = Terms(
-            objective=tuple(self.objective.items()),
-            squared=tuple(self.objective) == ("rms_error_total",),
-            running=tuple((m, i) for m, i, _ in running),
-            whole=tuple((m, i) for m, i, _ in whole),
-        )
-        length = float(np.max(np.abs([*np.ravel(loop.x0), *rim[np.isfinite(rim)], 1e-3])))
-        self.held = Held(
-            scale=np.float64(1.0),
-            weight=np.float64(WEIGHT),
-            running=number([v for *_, v in running]),
-            forces=tuple(np.zeros(self.coarse.samples) for _ in running),
-            whole=number([v for *_, v in whole]),
-            pulls=number(np.zeros(len(whole))),
-            room=(
-                number([abs(v) or length for *_, v in running]),
-                number([abs(v) or 1.0 for *_, v in whole]),
-            ),
-            knees=(number(1e-3 * np.max(self.high - self.low)), number(1e-5 * length)),
-        )
-        self.asked = self.held
+        self.problem, self.most, self.progress = problem, iterations, progress
+        self.lagrangian = problem.start
         self.best, self.closed, self.grids, self.slope = None, None, [], np.nan
         self.iterations, self.gradients, self.simulations = 0, 0, 0
 
     def run(self):
-        """Grids from coarse to fine; on each, rounds of L-BFGS and new multipliers; on the last,
-        until the limits hold.
-        """
-        grids = [g for g in GRIDS if g == 1 or self.count >= 20 * g]
+        """Search with coarse to fine intervals, on the finest until the limits hold."""
+        problem = self.problem
+        grids = [g for g in GRIDS if g == 1 or problem.count >= 20 * g]
         u = self._start(grids[0])
         for group in grids:
-            # a wide knee on a fine grid would let one jump be had for nothing, cut into many small
-            # ones
-            self.held = self.held._replace(
-                knees=(self.asked.knees[0] * group * group / GRIDS[0], self.asked.knees[1])
-            )
+            # the smoothing of |u_k - u_k-1| is reduced with the interval: with a wide one a jump
+            # cut into many small ones would cost nothing
+            width, error = problem.start.smoothing
+            width = width * group * group / GRIDS[0]
+            self.lagrangian = self.lagrangian._replace(smoothing=(width, error))
             self._rescale(u)
             u, found = self._settle(u, group, 5 if group == 1 else 2)
             if group == 1:
                 found = self._repair(u, found)
             self.grids.append(
                 {
-                    "interval_s": self.interval * group,
+                    "interval_s": problem.interval * group,
                     "cost": found["cost"],
                     "excess": found["excess"],
                 }
             )
 
     def _start(self, group):
-        """The better of two searches on the coarsest grid: from the law's own inputs, and from
-        those of steady state.
+        """Return the better of two searches with the coarsest intervals.
+
+        One starts from the inputs of the case's own controller, one from steady-state inputs.
         """
-        starts = [s for s in (self._own(), self._steady()) if s is not None]
+        starts = [s for s in (self._closed_loop(), self._steady()) if s is not None]
         self._rescale(starts[0])
-        done = [self._descend(u, group) for u in starts]
-        if not any(np.isfinite(f) for _, f in done):
+        found = [self._descend(u, group) for u in starts]
+        if not any(np.isfinite(cost) for _, cost in found):
             raise NonFiniteError(
-                "neither the law's own inputs nor those of steady state give a run that stays"
+                "neither the case's own inputs nor those of steady state give a run that stays"
                 " finite"
             )
-        return min(done, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
+        return min(found, key=lambda pair: pair[1] if np.isfinite(pair[1]) else np.inf)[0]
 
-    def _own(self):
-        """The law's own inputs, each the mean over its interval; None if they do not stay finite."""
-        loop, clock = self.case.loop, self.case.clock
+    def _closed_loop(self):
+        """Return the means over each interval of the case's own inputs, None if the run diverges.
+
+        Sets `closed` to the check of these inputs, sample by sample.
+        """
+        problem = self.problem
+        loop, clock = problem.case.loop, problem.case.clock
         quiet = dataclasses.replace(loop, sensor=loop.sensor.without_noise())
         try:
             applied = np.asarray(lp.simulate(quiet, clock).applied).T
@@ -197,81 +98,68 @@ class InputSearch:
         if not np.isfinite(self.closed["cost"]):
             self.closed = None
         at = np.minimum(
-            np.arange(clock.samples) * clock.dt / self.interval + 1e-6, self.count - 1
+            np.arange(clock.samples) * clock.dt / problem.interval + 1e-6, problem.count - 1
         ).astype(int)
-        return self._inside(
-            np.stack(
-                [
-                    np.bincount(at, row, self.count) / np.bincount(at, minlength=self.count)
-                    for row in applied
-                ]
-            )
+        samples = np.bincount(at, minlength=problem.count)
+        return problem.project(
+            np.stack([np.bincount(at, row, problem.count) / samples for row in applied])
         )
 
     def _steady(self):
-        """The inputs that would hold the nearest of a few setpoints, where they exist; the middle
-        of the range elsewhere.
+        """Return steady-state inputs of the nearest of a few setpoints.
+
+        The middle of the range for a setpoint without a steady state.
         """
-        plant, actuator = self.case.loop.plant, self.case.loop.actuator
-        r = np.array(
-            self.case.loop.reference.sample(dataclasses.replace(self.coarse, dt=self.interval))[0]
-        )[:, : self.count]
-        offset = np.asarray(actuator.offset)
+        problem, loop = self.problem, self.problem.case.loop
+        clock = dataclasses.replace(problem.coarse, dt=problem.interval)
+        r = np.array(loop.reference.sample(clock)[0])[:, : problem.count]
+        offset = np.asarray(loop.actuator.offset)
         known = np.unique(r, axis=1)
-        known, held = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
+        known, steady = known[:, :: -(-known.shape[1] // SETPOINTS)].T, []
         for setpoint in known:
             try:
-                held.append(equilibrium(plant, setpoint)[1] + offset)
+                steady.append(equilibrium(loop.plant, setpoint)[1] + offset)
             except InputError:  # none at this setpoint
-                held.append(0.5 * (self.low + self.high))
+                steady.append(0.5 * (problem.low + problem.high))
         nearest = np.argmin(((r[:, None, :] - known.T[:, :, None]) ** 2).sum(axis=0), axis=0)
-        return self._inside(np.array(held)[nearest].T)
-
-    def _inside(self, u):
-        return np.clip(u, self.low[:, None], self.high[:, None])
-
-    def _loop(self):
-        zeros = np.zeros((self.case.loop.plant.pumps, self.count))
-        return dataclasses.replace(
-            open_loop(self.case.loop, zeros, self.interval), plant=self.plant
-        )
+        return problem.project(np.array(steady)[nearest].T)
 
     def _rescale(self, u):
-        """Count the cost of u as 1, and keep the multipliers what they are in units of the cost."""
-        bare = self.held._replace(
+        """Scale the cost of u to 1, and keep the multipliers relative to the cost."""
+        held = self.lagrangian
+        bare = held._replace(
             weight=np.float64(1e-30),
-            forces=tuple(0.0 * f for f in self.held.forces),
+            multipliers=tuple(0.0 * f for f in held.multipliers),
             scale=np.float64(1.0),
+            integral_multipliers=0.0 * held.integral_multipliers,
         )
-        cost = float(
-            value_and_gradient(
-                self._loop(), self.coarse, self.terms, u, bare._replace(pulls=0.0 * bare.pulls)
-            )[0]
-        )
+        cost = float(self.problem.value_and_gradient(u, bare)[0])
         self.gradients += 1
         if not np.isfinite(cost) or cost <= 1e-12:
             return
-        ratio = float(self.held.scale) / cost
-        self.held = self.held._replace(
+        ratio = float(held.scale) / cost
+        self.lagrangian = held._replace(
             scale=np.float64(cost),
-            forces=tuple(f * ratio for f in self.held.forces),
-            pulls=self.held.pulls * ratio,
+            multipliers=tuple(f * ratio for f in held.multipliers),
+            integral_multipliers=held.integral_multipliers * ratio,
         )
 
     def _descend(self, u, group):
-        """(inputs, search cost) after L-BFGS from u, with `group` neighbouring intervals as one."""
-        low, span = self.low[:, None], (self.high - self.low)[:, None]
-        edges = np.arange(0, self.count, group)
-        sizes, loop = np.diff(np.append(edges, self.count)), self._loop()
+        """Return (inputs, search cost) of L-BFGS from u, with `group` intervals as one.
 
-        def spread(z):
+        The unknowns are shares of the range of each input.
+        """
+        problem = self.problem
+        low, span = problem.low[:, None], (problem.high - problem.low)[:, None]
+        edges = np.arange(0, problem.count, group)
+        sizes = np.diff(np.append(edges, problem.count))
+
+        def inputs(z):
             return low + span * np.repeat(z.reshape(len(low), -1), sizes, axis=1)
 
         def cost(z):
             self.gradients += 1
-            value, gradient = value_and_gradient(
-                loop, self.coarse, self.terms, spread(z), self.held
-            )
+            value, gradient = problem.value_and_gradient(inputs(z), self.lagrangian)
             gradient = (np.add.reduceat(np.asarray(gradient), edges, axis=1) * span).ravel()
             if not (np.isfinite(value) and np.all(np.isfinite(gradient))):
                 return 1e12, np.zeros_like(gradient)
@@ -281,150 +169,94 @@ class InputSearch:
         z, value, gradient, count = minimise(cost, np.clip(z, 0.0, 1.0).ravel(), self.most)
         self.iterations += count
         self.slope = float(np.max(np.abs(z - np.clip(z - gradient, 0.0, 1.0))))
-        return spread(z), value
+        return inputs(z), value
 
     def _settle(self, u, group, rounds):
-        """(inputs, what check says of them) after rounds of descent and new multipliers; heavier
-        where an excess does not shrink.
+        """Return (inputs, their check) after rounds of descent and new multipliers.
+
+        The weight is raised where an excess does not shrink.
         """
-        last, before = np.inf, np.inf
+        last, before, found = np.inf, np.inf, {}
         for _ in range(rounds):
             u, _ = self._descend(u, group)
-            found = self.check(u, self.interval)
-            self._tell(found, group)
-            if found["excess"] <= 30 * TOLERANCE and abs(found["cost"] - before) <= 2e-3 * abs(
-                found["cost"]
-            ):
+            found = self.check(u, self.problem.interval)
+            self._report(found, group)
+            small = abs(found["cost"] - before) <= 2e-3 * abs(found["cost"])
+            if found["excess"] <= 30 * TOLERANCE and small:
                 break
             before = found["cost"]
-            if not self.terms.running and not self.terms.whole:
+            if not self.problem.limits:
                 continue
-            self._push(u)
+            self._update_multipliers(u)
             if found["excess"] > max(0.5 * last, TOLERANCE):
-                self.held = self.held._replace(weight=self.held.weight * 3.0)
+                self.lagrangian = self.lagrangian._replace(weight=self.lagrangian.weight * 3.0)
             last = found["excess"]
         return u, found
 
-    def _push(self, u):
-        """New multipliers: force + weight * excess, not below 0."""
-        over, whole, _ = self._look(u, self.interval, self.coarse, self.held)
-        w = self.held.weight
-        self.held = self.held._replace(
-            forces=tuple(
-                np.maximum(0.0, np.asarray(f) + w * np.asarray(g))
-                for f, g in zip(self.held.forces, over)
+    def _update_multipliers(self, u):
+        """Set multipliers to multiplier + weight * excess, not below 0."""
+        held = self.lagrangian
+        self.simulations += 1
+        over, integral, _ = self.problem.excesses(
+            u, self.problem.interval, self.problem.coarse, held
+        )
+        self.lagrangian = held._replace(
+            multipliers=tuple(
+                np.maximum(0.0, np.asarray(f) + held.weight * np.asarray(g))
+                for f, g in zip(held.multipliers, over)
             ),
-            pulls=(
-                np.maximum(0.0, np.asarray(self.held.pulls) + w * np.asarray(whole))
-                if len(whole)
-                else self.held.pulls
+            integral_multipliers=(
+                np.maximum(
+                    0.0, np.asarray(held.integral_multipliers) + held.weight * np.asarray(integral)
+                )
+                if len(integral)
+                else held.integral_multipliers
             ),
         )
 
     def _repair(self, u, found):
-        """Heavier weights, then limits tightened by the little that still passes them, until they
-        hold at the case's own step.
+        """Return the check of inputs that hold the limits at the case's own step, if any are found.
+
+        By a higher weight, then by limits tightened by the remaining excess.
         """
         for k in range(ROUNDS):
             if found["excess"] <= TOLERANCE:
                 break
-            self._push(u)
+            self._update_multipliers(u)
+            held = self.lagrangian
             if found["excess"] > 10 * TOLERANCE and k < ROUNDS - 3:
-                self.held = self.held._replace(weight=self.held.weight * 3.0)
+                self.lagrangian = held._replace(weight=held.weight * 3.0)
             else:
-                sign = np.array([RUNNING[m] for m, _ in self.terms.running])
-                running, whole = (np.maximum(np.array(v), 0.0) for v in found["beyond"])
-                self.held = self.held._replace(
-                    running=self.held.running - sign * running * self.held.room[0],
-                    whole=self.held.whole - whole * self.held.room[1],
+                sign = np.array([POINTWISE[m] for m, _ in self.problem.terms.pointwise])
+                peaks, integral = (np.maximum(np.array(v), 0.0) for v in found["beyond"])
+                self.lagrangian = held._replace(
+                    pointwise=held.pointwise - sign * peaks * held.sizes[0],
+                    integral=held.integral - integral * held.sizes[1],
                 )
             u, _ = self._descend(u, 1)
-            found = self.check(u, self.interval)
-            self._tell(found, 1)
+            found = self.check(u, self.problem.interval)
+            self._report(found, 1)
         return found
 
     def check(self, u, interval):
-        """What a run with u (pumps, intervals) comes to at the case's own step; kept if it is the
-        best so far.
-        """
-        clock = self.case.clock
-        over, whole, measures = self._look(u, interval, clock, self.asked)
-        over, whole = [np.asarray(o) for o in over], [float(w) for w in whole]
-        peaks = [float(o.max()) for o in over]
-        excess = max([0.0, *peaks, *whole])
-        found = {
-            "u": u.T,
-            "interval": interval,
-            "cost": float(sum(w * np.sum(measures[m]) for m, w in self.objective.items())),
-            "excess": excess,
-            "beyond": (peaks, whole),
-            "holds": bool(excess <= TOLERANCE),
-            "constraints": self._constraints(over, whole),
-        }
+        """Return `problem.check` of the inputs; keep it in `best` if it is the best so far."""
+        self.simulations += 1
+        found = self.problem.check(u, interval)
         if (
             np.isfinite(found["cost"])
             and (self.best is None or _better(found, self.best))
-            and u.shape[1] == self.count
+            and u.shape[1] == self.problem.count
         ):
             self.best = found
         return found
 
-    def _look(self, u, interval, clock, held):
-        """What `inputs.look` says of u, given sample by sample: one compiled program for whatever
-        interval.
-        """
-        at = np.minimum(
-            np.arange(clock.samples) * (clock.dt / interval) + 1e-6, u.shape[1] - 1
-        ).astype(int)
-        self.simulations += 1
-        loop = dataclasses.replace(open_loop(self.case.loop, u[:, at], clock.dt), plant=self.plant)
-        return look(loop, clock, self.terms, u[:, at], held)
-
-    def _constraints(self, over, whole):
-        """One dict per limit: name, measure, limit, value, margin, tank or output counted from 1,
-        time of the tightest sample.
-        """
-        rows = []
-        for j, (m, i) in enumerate(self.terms.running):
-            at, limit, room = (
-                int(np.argmax(over[j])),
-                float(self.asked.running[j]),
-                float(self.asked.room[0][j]),
-            )
-            rows.append(
-                (
-                    m,
-                    i,
-                    limit,
-                    limit + RUNNING[m] * over[j][at] * room,
-                    -over[j][at] * room,
-                    at * self.case.clock.dt,
-                )
-            )
-        for j, (m, i) in enumerate(self.terms.whole):
-            limit, room = float(self.asked.whole[j]), float(self.asked.room[1][j])
-            rows.append((m, i, limit, limit + whole[j] * room, -whole[j] * room, None))
-        return [
-            {
-                "name": (
-                    m if ms.MEASURES[m].per == "run" else f"{m} of {ms.MEASURES[m].per} {i + 1}"
-                ),
-                "measure": m,
-                "limit": limit,
-                "value": float(value),
-                "margin": float(margin),
-                "tank": i + 1 if ms.MEASURES[m].per == "tank" else None,
-                "time_s": when,
-            }
-            for m, i, limit, value, margin, when in rows
-        ]
-
-    def _tell(self, found, group):
+    def _report(self, found, group):
+        """Call `progress` with the state of the search."""
         if self.progress is not None:
             self.progress(
                 {
                     "stage": "bound",
-                    "interval_s": self.interval * group,
+                    "interval_s": self.problem.interval * group,
                     "cost": found["cost"],
                     "excess": found["excess"],
                     "gradients": self.gradients,
@@ -433,72 +265,7 @@ class InputSearch:
 
 
 def _better(a, b):
-    """True if a is to be preferred: held limits first, then the smaller excess, then the lower
-    cost.
-    """
+    """Return whether a is preferred: limits that hold, then the smaller excess, then the cost."""
     if a["holds"] != b["holds"]:
         return a["holds"]
     return a["cost"] < b["cost"] if a["holds"] else a["excess"] < b["excess"]
-
-
-def _check_served(objective, limits):
-    good = [m for m, spec in ms.MEASURES.items() if spec.by_input]
-    for m in objective:
-        if m not in good:
-            raise InputError(
-                f"bound of {m}: has no slope in every input; can be made small: {', '.join(good)}"
-            )
-    for limit in limits:
-        if limit.measure not in (*good, *RUNNING):
-            raise InputError(
-                f"bound under a limit on {limit.measure}: has no slope; can be limited:"
-                f" {', '.join([*RUNNING, *good])}"
-            )
-
-
-def _interval(clock, interval):
-    """The interval [s]: as asked, or the shortest of 1, 2, 5 times a power of ten that gives at
-    most INTERVALS.
-    """
-    if interval is None:
-        least = max(clock.duration / INTERVALS, clock.dt)
-        nice = [a * 10.0**b for b in range(-6, 7) for a in (1, 2, 5)]
-        fits = [
-            v
-            for v in nice
-            if (1 - 1e-9) * least <= v <= 2.5 * least and _whole_number(v / clock.dt)
-        ]
-        return float(fits[0] if fits else clock.dt * np.ceil(least / clock.dt - 1e-6))
-    good = (
-        isinstance(interval, (int, float))
-        and not isinstance(interval, bool)
-        and clock.dt * (1 - 1e-9) <= interval <= clock.duration
-    )
-    if not good or not _whole_number(interval / clock.dt):
-        raise InputError(
-            f"interval = {interval!r} s: must be a whole number of samples of {clock.dt:g} s, at"
-            f" most {clock.duration:g} s"
-        )
-    if clock.duration / interval > 20_000:
-        raise InputError(
-            f"interval = {interval:g} s: {clock.duration / interval:.0f} intervals; must be at most"
-            " 20000"
-        )
-    return float(interval)
-
-
-def _search_clock(clock, interval, delay):
-    """The clock of the search: up to twenty of the case's samples in one, as intervals and delay
-    allow, and a cheaper integrator.
-    """
-    for f in (20, 10, 5, 4, 2):
-        dt = clock.dt * f
-        if (clock.samples - 1) / f >= SEARCH_SAMPLES and all(
-            _whole_number(v / dt) for v in (interval, delay, clock.duration)
-        ):
-            return dataclasses.replace(clock, dt=dt, integrator="midpoint")
-    return dataclasses.replace(clock, integrator="midpoint")
-
-
-def _whole_number(x):
-    return abs(x - round(x)) <= 1e-6 * max(1.0, abs(x))

@@ -42,7 +42,7 @@ WORDS = {
         "effect: derivative at the case's own values times the half-width of the distribution"
         f" (half its range; {NORMAL_WIDTH:g} standard deviations of a normal one); tied entries"
         " have one effect together and no derivative each; there is no percentage of a measure that"
-        " is 0; where a measure is not differentiable (total variation of an input at steady state, a"
+        " is 0; where a measure is not differentiable (total variation of a constant input, a"
         " maximum reached twice) the derivative is one-sided"
     ),
     "morris": (

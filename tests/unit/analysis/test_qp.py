@@ -71,8 +71,15 @@ def test_equals_the_enumeration_of_active_sets(n, rows, seed):
 def test_equals_scipy(n, rows):
     H, f, G, l, u = problem(n, rows, 5, tight=1.0)
     options = {"gtol": 1e-12, "xtol": 1e-14, "barrier_tol": 1e-13, "maxiter": 400}
-    found = minimize(lambda x: 0.5 * x @ H @ x + f @ x, np.zeros(n), jac=lambda x: H @ x + f, hess=lambda x: H, method="trust-constr",
-                     constraints=LinearConstraint(G, l, u), options=options)  # fmt: skip
+    found = minimize(
+        lambda x: 0.5 * x @ H @ x + f @ x,
+        np.zeros(n),
+        jac=lambda x: H @ x + f,
+        hess=lambda x: H,
+        method="trust-constr",
+        constraints=LinearConstraint(G, l, u),
+        options=options,
+    )
     x = np.asarray(solve(H, f, G, l, u))
     slack = np.minimum(u - G @ x, G @ x - l)
     assert slack.min() > -1e-9 and np.sum(slack < 1e-6) >= 2  # feasible, and rows bind
@@ -326,7 +333,7 @@ def test_slopes_on_a_corner_are_those_that_differences_see():
 
 
 def test_a_large_programme_meets_its_optimality_conditions():
-    """Stationary with multipliers of the right sign on the rows that bind: enough for a convex one."""
+    """Stationary, multipliers of the right sign on the rows that bind: enough if convex."""
     H, f, G, l, u = problem(60, 100, 7, tight=2.0)
     x = np.asarray(solve(H, f, G, l, u))
     up, low = u - G @ x, G @ x - l

@@ -2,15 +2,15 @@
 cannot be scheduled.
 """
 
-import contextlib
 import dataclasses
-import io
 import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import assert_same_case as assert_same
+from helpers import command as say
 from scipy.optimize import minimize, minimize_scalar
 
 import jaxtank
@@ -25,7 +25,6 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_and_flag, evaluate_compiled, evaluate_for_reverse
 from jaxtank.rig.schedule import schedule
 from jaxtank.xla.reachability import use_of
-from tuning.cli import main
 
 # 8 cm is a plateau of the reference: on a knot for minutes. The ramps have no sample within
 # rounding of the others, where the slope would
@@ -482,18 +481,6 @@ def test_dependence_is_followed_into_calls_and_loops():
 # rig files and the command
 
 
-def assert_same(one, other):
-    assert jax.tree.structure(one.loop) == jax.tree.structure(other.loop)
-    assert all(
-        np.array_equal(v, parameters(other.loop)[n]) for n, v in parameters(one.loop).items()
-    )
-    assert (one.name, one.clock, {n: Free(*s) for n, s in one.free.items()}) == (
-        other.name,
-        other.clock,
-        dict(other.free),
-    )
-
-
 @pytest.mark.parametrize(
     ("name", "gains", "variable"),
     [
@@ -561,13 +548,6 @@ def test_a_bad_schedule_in_a_file_is_told_in_one_line(text, words, tmp_path):
     assert all(word in message for word in [*words, repr(str(path))]) and "\n" not in message, (
         message
     )
-
-
-def say(*args):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(args))
-    return code, out.getvalue(), err.getvalue()
 
 
 @pytest.mark.slow

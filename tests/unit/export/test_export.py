@@ -132,7 +132,7 @@ def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
 @pytest.mark.slow
 @needs_gcc
 def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, monkeypatch):
-    """As above 40 variables, where the factor is found in loops; of 4, which compile in less time."""
+    """As above 40 variables, where loops find the factor; of 4, which compile in less time."""
     monkeypatch.setattr(jaxtank.analysis.qp, "UNROLLED", 3)
     case = presets.find("khalid/laguerre-constrained")
     case = rig.set_values(case, {"clock.duration": 300 * case.clock.dt, "controller.rows": 3})

@@ -1,17 +1,15 @@
 """Logs as files: what is read of them, and one line with the place for each that cannot be used."""
 
-import contextlib
-import io
 import re
 
 import numpy as np
 import pytest
+from helpers import command
 
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
-from tuning.cli import main
-from tuning.identification import experiment
+from tuning.identification import data_checks
 from tuning.identification.csv_log import read_log, split_header
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
@@ -204,7 +202,7 @@ def test_columns_named_by_option_or_rig(read, case):
         "h3": ("c", "cm"),
     }
     assert same(read(content, columns=columns), read(text()))
-    with pytest.raises(InputError, match="unknown log column 'h9'"):
+    with pytest.raises(InputError, match="unknown column 'h9'"):
         read(content, columns={"h9": "a"})
     with pytest.raises(DataError, match="no column 'lft' for pump1; nearest: left"):
         read(content, columns={**columns, "pump1": "lft"})
@@ -226,9 +224,7 @@ def test_a_level_is_left_out_by_none(read, case):
         "h4": "none",
     }
     for slot in ("t", "pump2"):
-        with pytest.raises(
-            InputError, match=f"log column {slot} = none: only a level may be left out"
-        ):
+        with pytest.raises(InputError, match=f"column {slot} = none: only a level may be left out"):
             read(text(), columns={slot: "none"})
     with pytest.raises(DataError, match="no column for a level"):
         read(text(), columns=dict.fromkeys(("h1", "h2", "h3", "h4"), "none"))
@@ -250,7 +246,7 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
     """With its comment signs taken away the example is a table for a file of such columns."""
     code, out, _ = command("init", "mirakhorli/sfc")
     assert code == 0
-    whole, example = out.split("# Which column", 1)
+    whole, example = out.split("# Columns of the experiment data", 1)
     table = "\n".join(line.removeprefix("#") for line in example.splitlines()[1:])
     (tmp_path / "rig.toml").write_text(whole + table + "\n")
     columns = rig.load(tmp_path / "rig.toml").log
@@ -406,14 +402,6 @@ BAD = {
 }
 
 
-def command(*words):
-    """(exit code, stdout, stderr) of the command line."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(list(words))
-    return code, out.getvalue(), err.getvalue()
-
-
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path):
     content, words = BAD[name]
@@ -426,7 +414,7 @@ def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path)
     assert (
         told.count("\n") == 1
         and told.endswith("\n")
-        and told.startswith("jaxtank: log")
+        and told.startswith(("jaxtank: log", "jaxtank: file"))
         and "log.csv" in told
     )
     with pytest.raises(DataError, match=words):
@@ -500,12 +488,12 @@ def test_a_pump_without_a_true_limit_may_be_faint():
     """khalid's input is a dimensionless one with limits of +-1000 in name only."""
     loop = presets.load("khalid").cases["gpc"].loop
     found = tuning.log(t=np.arange(5.0), u=np.full(5, 2.0), y=np.full((5, 2), 0.2))
-    experiment.check_fits(found, loop)
+    data_checks.check_fits(found, loop)
 
 
 def test_a_pump_that_stands_still_is_no_mistake(case):
     u = np.stack([np.full(5, 3.0), np.zeros(5)], axis=1)
-    experiment.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
+    data_checks.check_fits(tuning.log(t=np.arange(5.0), u=u, y=np.ones((5, 4))), case.loop)
 
 
 @pytest.mark.parametrize(
@@ -529,18 +517,18 @@ def test_arrays_that_are_no_log(change, words):
 def test_a_log_of_another_rig(case):
     whole = {"t": np.arange(5.0), "u": np.ones((5, 2)), "y": np.ones((5, 4))}
     with pytest.raises(DataError, match="has 1 pump columns, the rig 2 pumps"):
-        experiment.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
+        data_checks.check_fits(tuning.log(**(whole | {"u": np.ones(5)})), case.loop)
     with pytest.raises(DataError, match="measures tank 8, the rig has 4"):
-        experiment.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
+        data_checks.check_fits(tuning.log(**whole, tanks=(0, 1, 2, 7)), case.loop)
 
 
 def test_gaps_are_counted_in_usual_steps():
     t = np.array([0.0, 1, 2, 3, 5, 6, 7])
     found = tuning.log(t=t, u=np.ones(7), y=np.ones(7))
     with pytest.raises(DataError, match=r"sample 5: a gap of 2 s after 3 s.*--gap 2$"):
-        experiment.check_gaps(found)
-    experiment.check_gaps(found, 2.0)
-    experiment.check_gaps(
+        data_checks.check_gaps(found)
+    data_checks.check_gaps(found, 2.0)
+    data_checks.check_gaps(
         tuning.log(t=np.array([0.0, 1, 2.4, 3, 4.4, 5]), u=np.ones(6), y=np.ones(6))
     )
 

@@ -118,8 +118,8 @@ def test_a_file_whose_name_is_too_long_is_a_log_that_is_not_there(refused):
 
 
 def test_data_that_are_refused_after_reading_get_one_line(refused):
-    """Two of the checks that come after the file was read: a gap, and fewer readings than unknowns."""
+    """Two checks of what was read: a gap, and fewer readings than unknowns."""
     t, u, y = made(30)
     assert "a gap of 31 s" in refused(text(np.where(t > 20, t + 30, t), u, y))
     sparse = np.where(np.arange(30)[:, None] == np.array([0, 1, 2, 3]), y, np.nan)
-    assert "readings cannot tell" in refused(text(t, u, sparse), "l.csv", "--hold-back", "0")
+    assert "readings cannot determine" in refused(text(t, u, sparse), "l.csv", "--hold-back", "0")

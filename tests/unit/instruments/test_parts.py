@@ -406,8 +406,22 @@ def test_levels_over_the_rim_and_when():
 
 
 def test_the_names_of_the_contract_exist():
-    contract = {"rms_error", "rms_error_total", "ise", "iae", "rms_input", "input_travel", "saturated_fraction", "max_level", "min_level",
-                "overflow_volume", "overshoot_percent", "rise_time", "settling_time", "estimation_rms"}  # fmt: skip
+    contract = {
+        "rms_error",
+        "rms_error_total",
+        "ise",
+        "iae",
+        "rms_input",
+        "input_travel",
+        "saturated_fraction",
+        "max_level",
+        "min_level",
+        "overflow_volume",
+        "overshoot_percent",
+        "rise_time",
+        "settling_time",
+        "estimation_rms",
+    }
     assert contract <= set(ms.MEASURES)
 
 

@@ -236,7 +236,8 @@ import sys
 sys.modules["gymnasium"] = sys.modules["control"] = None  # as if they were not installed
 import jaxtank
 from jaxtank import *
-assert not {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"} & set(sys.modules)
+opened = {"jaxtank.interop.python_control", "jaxtank.interop.gymnasium", "jaxtank.export"}
+assert not opened & set(sys.modules)
 assert {"neighbours", "environment", "export"} <= set(dir(jaxtank))
 assert callable(jaxtank.neighbours.columns) and callable(jaxtank.export.export)
 try:

@@ -1,4 +1,4 @@
-"""What no law could beat: against bounds found by others, another solver, and the laws themselves."""
+"""Perfect-information optimum: against bounds found by others, another solver and controllers."""
 
 import dataclasses
 import json
@@ -11,10 +11,10 @@ from scipy.optimize import lsq_linear, minimize
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from tuning.optimal_input.cost import open_loop, value_and_gradient
+from tuning.optimal_input.cost import open_loop
 from tuning.optimal_input.lbfgsb import minimise
 from tuning.optimal_input.perfect_information import bound
-from tuning.optimal_input.search import TOLERANCE, InputSearch
+from tuning.optimal_input.problem import TOLERANCE, InputProblem
 
 
 def short(paper, name, values=None, duration=60.0):
@@ -44,20 +44,20 @@ def test_gradient_is_that_of_central_differences(climb):
     differences of step 1e-5 V.
     """
     objective = {"rms_error_total": 1.0, "input_travel": 0.01, "iae": 0.01}
-    search = InputSearch(
-        climb, objective, {"max_level": 7.5, "min_level": 2.7, "rms_input": 3.0}, 5.0, 10, None
+    problem = InputProblem(
+        climb, objective, {"max_level": 7.5, "min_level": 2.7, "rms_input": 3.0}, 5.0
     )
     rng = np.random.default_rng(0)
-    u = rng.uniform(2.0, 6.0, (2, search.count))
-    held = search.held._replace(
+    u = rng.uniform(2.0, 6.0, (2, problem.count))
+    lagrangian = problem.start._replace(
         weight=np.float64(50.0),
-        forces=tuple(rng.uniform(0, 1, len(f)) for f in search.held.forces),
-        pulls=np.array([0.3, 0.2]),
+        multipliers=tuple(rng.uniform(0, 1, len(f)) for f in problem.start.multipliers),
+        integral_multipliers=np.array([0.3, 0.2]),
     )
-    gradient = value_and_gradient(search._loop(), search.coarse, search.terms, u, held)[1]
+    gradient = problem.value_and_gradient(u, lagrangian)[1]
 
     def cost(u):
-        return float(value_and_gradient(search._loop(), search.coarse, search.terms, u, held)[0])
+        return float(problem.value_and_gradient(u, lagrangian)[0])
 
     for _ in range(4):
         way = rng.standard_normal(u.shape)
@@ -134,6 +134,15 @@ def test_what_is_said_of_it(climbed):
     assert climbed.trajectory(save_every=10).x.shape == (61, 4)
 
 
+def test_a_bound_is_saved_with_its_inputs_and_a_picture(climbed, tmp_path):
+    written = {path.name for path in climbed.save(tmp_path)}
+    assert written == {"result.json", "inputs.csv", "responses.png", "report.html"}
+    table = np.loadtxt(tmp_path / "inputs.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(table[:, 1:], climbed.u, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(table[:, 0], np.arange(60.0))
+    assert json.loads((tmp_path / "result.json").read_text())["cost"] == climbed.cost
+
+
 @pytest.mark.slow_for("gouta2022-enmpc-values1")
 @pytest.mark.parametrize(
     "paper, name, values",
@@ -199,7 +208,7 @@ def test_the_search_in_a_box_against_another_solver():
     [
         (
             {"objective": {"settling_time": 1.0}},
-            "bound of settling_time: .*can be made small: rms_error",
+            "bound of settling_time: .*can be minimised: rms_error",
         ),
         ({"objective": {"saturated_fraction": 1.0}}, "bound of saturated_fraction"),
         ({"limits": {"overshoot_percent": 5.0}}, "limit on overshoot_percent: .*max_level"),

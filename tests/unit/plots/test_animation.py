@@ -10,7 +10,7 @@ from PIL import Image
 
 import jaxtank
 from jaxtank.core.errors import InputError
-from jaxtank.plots import animation, responses
+from jaxtank.plots import animation, style
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def frames(path):
 
 def blue(picture):
     """Pixels in the colour of water."""
-    return np.count_nonzero(np.abs(picture - to_rgb(responses.WATER)).max(axis=2) < 0.03)
+    return np.count_nonzero(np.abs(picture - to_rgb(style.WATER)).max(axis=2) < 0.03)
 
 
 def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):

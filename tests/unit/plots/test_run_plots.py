@@ -137,7 +137,7 @@ def test_estimate_and_disturbance_are_the_runs_own(ax):
     diagnostics.disturbance(ax, run, 0, inflow=2 * t, unit="m/s")
     found = {line.get_label(): line.get_ydata() for line in ax.lines}
     np.testing.assert_allclose(found["estimated"], t - 1)
-    np.testing.assert_allclose(found["disturbing inflow"], 2 * t)
+    np.testing.assert_allclose(found["inflow disturbance"], 2 * t)
     assert ax.get_ylabel() == "d_hat [m/s]"
 
 
@@ -166,7 +166,7 @@ def test_margins_beyond_what_can_be_shown_are_counted(ax):
     diagnostics.margins(
         ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(diagnostics.MANY + 3)]
     )
-    assert len(ax.patches) == diagnostics.MANY and "3 with more room not shown" in ax.get_title()
+    assert len(ax.patches) == diagnostics.MANY and "3 with larger margins not shown" in ax.get_title()
     assert ax.get_yticklabels()[0].get_text().startswith(f"tank {diagnostics.MANY + 2}")
 
 
@@ -182,7 +182,7 @@ def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
     assert {line.get_label(): line.get_xydata().tolist() for line in marks} == {
         "converged": [[12.0, 0.1]],
         "not converged": [[10.0, 0.2]],
-        "limit cannot be kept": [[8.0, 0.3]],
+        "limit cannot be held": [[8.0, 0.3]],
     }
     assert ax.get_xlabel() == "limit of max_level [cm]" and ax.get_ylabel() == "objective [cm]"
 

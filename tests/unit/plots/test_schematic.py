@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from jaxtank import presets
 from jaxtank.plants.network import network
-from jaxtank.plots import responses
+from jaxtank.plots import style
 from jaxtank.plots.layout import place, storeys
 from jaxtank.plots.schematic import schematic
 
@@ -43,7 +43,7 @@ def water(ax):
     return [
         p
         for p in ax.patches
-        if isinstance(p, Rectangle) and p.get_facecolor() == (*to_rgb(responses.WATER), 1.0)
+        if isinstance(p, Rectangle) and p.get_facecolor() == (*to_rgb(style.WATER), 1.0)
     ]
 
 

@@ -41,7 +41,11 @@ def test_a_single_draw_is_told_without_a_spread(case):
 
 
 @pytest.mark.parametrize(
-    "failed, words", [([True, False], "1 run finite: a standard deviation"), ([True, True], "0 runs finite: a standard deviation")]
+    "failed, words",
+    [
+        ([True, False], "1 run finite: a standard deviation"),
+        ([True, True], "0 runs finite: a standard deviation"),
+    ],
 )
 def test_runs_that_left_the_numbers_leave_no_spread(case, failed, words):
     two = dataclasses.replace(tuning.ensemble(case, samples=2, **OPTIONS), failed=np.array(failed))

@@ -81,7 +81,7 @@ def test_every_complete_file_passes(name):
 @given(st.text(alphabet="ab.\"'\\#=\n[]{} \t", max_size=60))
 @settings(max_examples=500, deadline=None)
 def test_what_is_toml_with_short_keys_passes(text):
-    """Whatever is TOML: no part of a short text is a long key, and a long one after it is found."""
+    """Any TOML: no part of a short text is a long key, and a long one behind it is found."""
     check_keys(text)
     try:
         tomllib.loads(text + "\n")

@@ -5,9 +5,9 @@ names the file and the thing.
 import dataclasses
 import re
 
-import jax
 import numpy as np
 import pytest
+from helpers import assert_same_case as assert_same
 
 from jaxtank import presets, rig
 from jaxtank.case import Free
@@ -20,20 +20,6 @@ from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
 HEAD = 'case = "gouta2015/backstepping"\n'
-
-
-def assert_same(a, b):
-    assert (a.name, a.clock) == (b.name, b.clock)
-    # components, static fields, absent leaves
-    assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop)
-    assert parameters(a.loop).keys() == parameters(b.loop).keys()
-    for name, value in parameters(a.loop).items():
-        other = parameters(b.loop)[name]
-        assert np.shape(value) == np.shape(other) and np.array_equal(value, other), name
-    assert a.limits.keys() == b.limits.keys()
-    assert all(np.array_equal(limit, b.limits[measure]) for measure, limit in a.limits.items())
-    assert {n: Free(*s) for n, s in a.free.items()} == {n: Free(*s) for n, s in b.free.items()}
-    assert dict(a.objective) == dict(b.objective)
 
 
 def round_trip(case, folder):

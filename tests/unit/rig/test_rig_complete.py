@@ -37,7 +37,7 @@ KINDS = list(
 )
 
 
-def assert_same(a, b):
+def assert_same_loop(a, b):
     assert jax.tree.structure(a.loop) == jax.tree.structure(b.loop) and a.clock == b.clock
     for one, other in zip(jax.tree.leaves(a.loop), jax.tree.leaves(b.loop)):
         np.testing.assert_array_equal(one, other)
@@ -55,7 +55,7 @@ def test_the_complete_file_is_the_case(name):
     # what is not a suggestion is what `dump` says
     assert tomllib.loads(text) == tomllib.loads(terse)
     again = rig.loads(text)
-    assert_same(again, case)
+    assert_same_loop(again, case)
     assert rig.dump(again) == terse and rig.complete(again) == text
     assert dict(again.uncertain) == dict(case.uncertain) and len(again.scenarios) == len(
         case.scenarios
@@ -88,7 +88,7 @@ def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwis
     again = rig.loads(text)
     assert case.reachable and not again.reachable
     assert f"reachable = false  # {rig.unreachable(case)}" in text.splitlines()
-    assert_same(again, case)
+    assert_same_loop(again, case)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_tank_by_tank_it_is_the_same_rig(name):
         "case" not in tomllib.loads(text)
         and len(tomllib.loads(text)["tank"]) == case.loop.plant.tanks
     )
-    assert_same(again, case)
+    assert_same_loop(again, case)
     assert again.reachable == case.reachable and dict(again.limits) == dict(case.limits)
 
 
@@ -183,7 +183,7 @@ def test_the_short_file_has_what_differs_and_what_is_tuned():
         "free",
         "objective",
     }
-    assert_same(rig.loads(text), case)
+    assert_same_loop(rig.loads(text), case)
     rig.loads(used(text))
     assert len(text.splitlines()) < 50
 
@@ -225,7 +225,7 @@ def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
     case = rig.loads(text)
     for tankwise in (False, True):
         again = rig.loads(rig.dump(case, tankwise))
-        assert_same(again, case)
+        assert_same_loop(again, case)
         assert rig.dump(again) == rig.dump(case)
 
 
@@ -240,7 +240,7 @@ def test_what_a_preset_has_can_be_taken_away():
         and case.scenarios == ()
         and type(case.loop.reference).__name__ == "Ramps"
     )
-    assert_same(rig.loads(rig.dump(case)), case)
+    assert_same_loop(rig.loads(rig.dump(case)), case)
     assert rig.loads('case = "calofir/backstepping-perturbed"\nfault = []\n').loop.faults is None
 
 
@@ -252,7 +252,7 @@ def test_another_law_and_observer_over_a_preset():
     )
     case, preset = rig.loads(text), presets.find("gouta2022/chadpc")
     values = {"controller.Tp": 0.4, "observer.l": 2.0}
-    assert_same(case, rig.set_values(preset, values))  # the same loop, another way
+    assert_same_loop(case, rig.set_values(preset, values))  # the same loop, another way
     kalman = rig.loads(
         'case = "mirakhorli/sfc"\n[observer]\nkind = "kalman"\nprocess = 1e-3\nmeasurement ='
         " 0.01\nmeasured = [1, 2]\n"
@@ -260,7 +260,7 @@ def test_another_law_and_observer_over_a_preset():
     assert kalman.loop.observer.measured == (0, 1) and np.shape(kalman.loop.observer.process) == (
         4,
     )
-    assert_same(rig.loads(rig.dump(kalman)), kalman)
+    assert_same_loop(rig.loads(rig.dump(kalman)), kalman)
 
 
 def test_a_case_without_an_optional_part_of_its_preset_is_read_back():
@@ -274,7 +274,7 @@ def test_a_case_without_an_optional_part_of_its_preset_is_read_back():
             case.loop, actuator=dataclasses.replace(case.loop.actuator, dead_zone=None)
         ),
     )
-    assert_same(rig.loads(rig.dump(case)), case)
+    assert_same_loop(rig.loads(rig.dump(case)), case)
 
 
 TANK = (

@@ -235,7 +235,7 @@ def test_a_key_added_to_a_suggested_section_is_in_the_file_of_init(monkeypatch):
 def test_the_fields_of_a_class_are_the_keys_of_its_section():
     """A controller's leaves are not repeated: unit, range and description are its own."""
     section = components.section_of("law", "backstepping")
-    fields = components.LAWS["backstepping"].__dataclass_fields__
+    fields = components.ROLES["law"].classes["backstepping"].__dataclass_fields__
     for key in section.keys[1:]:
         meta = fields[key.name].metadata
         assert (key.unit, key.low, key.high) == (meta["unit"], meta["low"], meta["high"])

@@ -28,7 +28,7 @@ def eight():
 
 
 def searched(problem, method, iterations=60):
-    """(Search after a local search from the case's own values, passes at a tenth of the samples)."""
+    """(Search after a local search from the case's values, passes at a tenth of the samples)."""
     rough, z = [], problem.start()
     search = Search(problem, problem.point(z), lambda search: rough.append(len(search.history)))
     METHODS[method](search, z, iterations)

@@ -22,7 +22,7 @@ from tuning.search.methods import slsqp
 
 
 class Valley:
-    """|z1 - 0.6| + slope * (z2 - 0.3)^2 under z2 >= floor: a kink along z1 = 0.6, where the slope never vanishes."""
+    """|z1 - 0.6| + slope * (z2 - 0.3)^2 under z2 >= floor: a kink along z1 = 0.6."""
 
     limits = (Limit("min_level", 0, 1.0),)
     rooms = np.ones(1)
@@ -344,7 +344,7 @@ def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
 
 
 def test_what_becomes_undefined_in_the_search_breaks_its_limit(capsys, tmp_path):
-    """With gains this small no run reaches 90 % of the step: the rise time is undefined everywhere."""
+    """With gains this small no run reaches 90 % of the step: no rise time is defined."""
     path = edited(tmp_path, Kc="0.15", Ti="95.0", overshoot_percent=None, settling_time=None)
     free = ["--free", "controller.Kc[0]=0.1:0.2", "--free", "controller.Ti[0]=90:100"]
     code, found, _ = told(capsys, "tune", path, *free, "--starts", "1", "--validation", "0")

@@ -1,4 +1,4 @@
-"""Many draws at once: against runs made one by one, closed forms, and themselves in every layout."""
+"""Many draws at once: against runs made one by one, closed forms, and other layouts."""
 
 import dataclasses
 import json
@@ -128,7 +128,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", devices)
 if process >= 0:
     jax.distributed.initialize(sys.argv[4], 2, process)
-case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02})
+values = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
+case = rig.set_values(presets.find("gouta2015/backstepping"), values)
 two = {"plant.drain": tuning.Uniform(relative=0.1), "controller.k1": tuning.Normal(relative=0.2)}
 found = tuning.ensemble(case, two, samples=50, key=3, batch=16, fan=False, devices=devices)
 np.savez(folder, **found.measures)
@@ -423,7 +424,7 @@ def test_runs_that_fail_are_counted_and_break_every_limit(case):
 
 
 def test_plateaus_without_a_steady_state_are_counted(gouta):
-    """gouta2015 notes S11: c1 0.9 % above its value alone makes (16, 10) cm need more than 30 cm."""
+    """gouta2015 notes S11: with c1 0.9 % above its value, (16, 10) cm needs more than 30 cm."""
     case = gouta("ngpc", {"clock.dt": 0.5})
     found = tuning.ensemble(
         case,
@@ -848,7 +849,8 @@ def test_distributions_are_put_into_words():
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
     assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"
     assert (
-        in_words(Uniform(low=0.0, high=0.05, tied=True)) == "0 to 0.05 (uniform, all entries together)"
+        in_words(Uniform(low=0.0, high=0.05, tied=True))
+        == "0 to 0.05 (uniform, all entries together)"
     )
     assert in_words(Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
     assert in_words(pair) == "2 parameters, correlated, with a covariance"

@@ -1,8 +1,7 @@
-"""Which parameter moves which measure: closed forms, SALib, differences, and what the command says."""
+"""Which parameter moves which measure: closed forms, SALib, differences, and the command."""
 
-import contextlib
 import csv
-import io
+import functools
 import json
 import re
 import subprocess
@@ -13,17 +12,18 @@ import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers import command
 
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning.cli import main
 from tuning.problem.scenarios import Lane, groups_of, values_of
 from tuning.report import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sensitivity_study import sensitivity, what_varies
 
 VARIED = {"plant.drain": Uniform(relative=0.05), "plant.pump_gain": LogUniform(factor=1.2)}
@@ -31,9 +31,11 @@ D = 4
 CUBE = {"num_vars": D, "names": list("abcd"), "bounds": [[0.0, 1.0]] * D}
 ISHIGAMI = {"num_vars": 3, "names": list("abc"), "bounds": [[0.0, 1.0]] * 3}
 
+say = functools.partial(command, "sensitivity")
+
 
 def ishigami(p):
-    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1 with x uniform in (-pi, pi); Ishigami and Homma 1990."""
+    """sin x1 + 7 sin^2 x2 + 0.1 x3^4 sin x1, x uniform in (-pi, pi); Ishigami and Homma 1990."""
     x = np.pi * (2.0 * np.asarray(p) - 1.0)
     return (
         np.sin(x[..., 0]) + 7.0 * np.sin(x[..., 1]) ** 2 + 0.1 * x[..., 2] ** 4 * np.sin(x[..., 0])
@@ -58,7 +60,7 @@ def case():
 @pytest.fixture(scope="module")
 def at_cube(case):
     """f(p (n, 4)) -> (n,) rms_error_total by runs one at a time: what the study does in batches."""
-    draws = distributions.Draws(case.loop, VARIED)
+    draws = Draws(case.loop, VARIED)
     assert draws.dimensions == D
 
     def f(p):
@@ -201,7 +203,9 @@ def test_a_closed_loop_agrees_with_salib(case, at_cube):
         case, VARIED, method="morris", samples=8, seed=9, measures="rms_error_total"
     ).columns
     for name in ("mu", "mu_star", "sigma"):
-        np.testing.assert_allclose(column.effects[name], np.array(other[name], dtype=float), atol=1e-9)
+        np.testing.assert_allclose(
+            column.effects[name], np.array(other[name], dtype=float), atol=1e-9
+        )
     own = float(jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"])
     assert column.nominal == pytest.approx(own, rel=1e-12)
 
@@ -257,7 +261,9 @@ def test_local_against_central_differences(case, monkeypatch):
         seen += int((np.abs(got) > 1e-3).sum())
     assert seen > 15
     column = study.columns[0]
-    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(column.effects["effect"][0])
+    assert column.effects["derivative"][0] * 0.05 * drain[0] == pytest.approx(
+        column.effects["effect"][0]
+    )
     assert column.effects["elasticity"][0] == pytest.approx(
         column.effects["effect"][0] / 0.05 / column.nominal
     )
@@ -321,7 +327,9 @@ def test_noise_may_vary_from_none(case):
     for column in sensitivity(
         case, varied, method="morris", samples=4, measures="input_travel"
     ).columns:
-        assert column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
+        assert (
+            column.effects["mu"][0] > 0 and column.effects["mu"][0] == column.effects["mu_star"][0]
+        )
 
 
 def test_runs_that_fail_are_counted_and_told(case):
@@ -335,16 +343,16 @@ def test_runs_that_fail_are_counted_and_told(case):
         samples=32,
         measures="max_level",
     )
-    draws = distributions.Draws(case.loop, study.distributions)
+    draws = Draws(case.loop, study.distributions)
     points = indices.sobol_points(3, 32, 0)
     (group,) = groups_of([Lane("", case, None, 1.0)])
     _, broken = values_of(group, ("max_level",), draws.values(points.reshape(-1, 3)))
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count
     said = study.to_json()
-    assert said[
-        "failed"
-    ] == count and f"{count} of {study.runs} runs diverged" in " ".join(said["notes"])
+    assert said["failed"] == count and f"{count} of {study.runs} runs diverged" in " ".join(
+        said["notes"]
+    )
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
     assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
@@ -402,7 +410,7 @@ def test_bad_input(case, options, words):
 def test_correlated_parameters_have_local_effects_only(case):
     names = ("plant.drain[0]", "plant.drain[1]")
     joint = {"fit": distributions.Correlated(names=names, covariance=((4e-4, 3e-4), (3e-4, 9e-4)))}
-    assert local.half_widths(distributions.Draws(case.loop, joint)) == [
+    assert local.half_widths(Draws(case.loop, joint)) == [
         {names[0]: 0.04},
         {names[1]: pytest.approx(0.06)},
     ]
@@ -419,13 +427,6 @@ def test_defaults_are_the_cases_own(case):
         sensitivity(case.replace(uncertain={}))
 
 
-def say(*args):
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.main(["sensitivity", *args])
-    return code, out.getvalue(), err.getvalue()
-
-
 SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 
 
@@ -435,9 +436,23 @@ SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 )
 def test_command(tmp_path, method, samples, picture):
     code, out, err = say(
-        *SHORT, "--method", method, "--samples", samples, "--vary", "plant.drain=uniform:5%", "--vary", "plant.pump_gain=normal:2%:tied",
-        "--measure", "max_level", "--measure", "ise", "--json", "--out", str(tmp_path / "found"),
-    )  # fmt: skip
+        *SHORT,
+        "--method",
+        method,
+        "--samples",
+        samples,
+        "--vary",
+        "plant.drain=uniform:5%",
+        "--vary",
+        "plant.pump_gain=normal:2%:tied",
+        "--measure",
+        "max_level",
+        "--measure",
+        "ise",
+        "--json",
+        "--out",
+        str(tmp_path / "found"),
+    )
     assert code == 0
     said = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
     assert said["case"] == "cascaded/pi" and said["method"] == method and said["failed"] == 0
@@ -512,10 +527,13 @@ import jaxtank, tuning
 from jaxtank import presets, rig
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", 3)
-case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1, "clock.duration": 60.0})
+values = {"clock.dt": 0.1, "clock.duration": 60.0}
+case = rig.set_values(presets.find("gouta2015/backstepping"), values)
 for devices in (1, 3):
-    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, devices=devices, progress=lambda *done: print(*done))
-    print([(c.label, c.nominal, v.tolist()) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")])
+    options = dict(devices=devices, progress=lambda *done: print(*done))
+    found = tuning.sensitivity(case, method="morris", samples=6, batch=8, **options)
+    effects = [(c, v) for c in found.columns for v in c.effects.values() if hasattr(v, "tolist")]
+    print([(c.label, c.nominal, v.tolist()) for c, v in effects])
 """
 
 
@@ -544,10 +562,10 @@ def test_a_cloud_shows_who_broke_a_limit_and_when():
     )
     drawn = {c.get_label(): np.asarray(c.get_offsets()).tolist() for c in ax.collections}
     assert drawn == {
-        "broke a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
+        "violated a limit before, none after (2 of 4)": [[2.0, 1.0], [2.5, 1.5]],
         "holds every limit, before and after (1 of 4)": [[1.0, 0.5]],
         # it broke one before, too: the counts are of runs, each in one place
-        "breaks a limit after (1 of 4)": [[3.0, 3.5]],
+        "violates a limit after (1 of 4)": [[3.0, 3.5]],
     }
     labels = [line.get_label() for line in ax.lines]
     assert "limit 3.2 cm" in labels and "no change" in labels and ax.get_xlim() == ax.get_ylim()

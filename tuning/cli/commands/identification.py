@@ -1,5 +1,5 @@
-"""The command `jaxtank identify`: a log in, a rig out; or, with --plan, which experiment to make.
-Imports nothing heavy before it runs.
+"""The command `jaxtank identify`: experiment data in, a rig to tune out; `--plan` compares
+experiments before one is made. Imports nothing heavy before it runs.
 """
 
 import sys
@@ -7,13 +7,16 @@ import sys
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import printable
 from tuning.cli import values
+from tuning.cli.arguments import option, repeatable
 from tuning.cli.interrupts import Interrupts, put_back
-from tuning.cli.options import report_unreachable
+from tuning.cli.options import report_unreachable, report_written
 
 LONGEST = 1e7
-"""Longest experiment that is planned [s]: four months."""
+"""Longest planned experiment [s]: four months."""
 
 STATUS = {"converged": 0, "not_converged": 3, "not_identifiable": 5, "interrupted": 130}
+PLANNED = ("duration", "voltage", "measure")
+"""Options of a planned experiment."""
 
 
 def add(commands, parents):
@@ -21,197 +24,198 @@ def add(commands, parents):
     one = commands.add_parser(
         "identify",
         parents=parents,
-        help="plant parameters from a log, with intervals; --out DIR writes a rig to tune",
+        help="plant parameters from experiment data, with intervals; --out DIR writes a rig to"
+        " tune",
     )
-    one.add_argument(
-        "--data",
-        action="append",
-        default=[],
-        metavar="CSV",
-        help="a log; repeatable: several experiments with a start each",
-    )
-    one.add_argument(
-        "--free",
-        action="append",
-        default=[],
-        metavar="NAME=LOW:HIGH",
-        help=(
-            "what to estimate, of plant, sensor, actuator, disturbance (default: pump gains,"
-            " splits, orifices, pipes); repeatable"
-        ),
-    )
-    one.add_argument(
+    one.set_defaults(run=run)
+    _add_data(one)
+    _add_fit(one)
+    _add_plan(one)
+
+
+def _add_data(one):
+    """Options on the experiment data."""
+    text = "experiment data; repeatable: several experiments with first levels each"
+    one.add_argument("--data", action="append", default=[], metavar="CSV", help=text)
+    repeatable(
+        one,
         "--column",
-        action="append",
-        default=[],
-        metavar="SLOT=HEADER[;UNIT]",
-        help=(
-            "which column is t, pump1, .., h1, .., where its header does not say so; h3=none: leave"
-            " that level out; repeatable"
-        ),
+        "SLOT=HEADER[;UNIT]",
+        "which column is t, pump1, .., h1, .., where its header is in other words; h3=none: leave"
+        " that level out",
     )
-    one.add_argument(
-        "--decimal", default=".", metavar="SIGN", help="decimal sign of the log: . (default) or ,"
+    option(one, "--decimal", "SIGN", "decimal sign of the data: . (default) or ,", ".")
+    option(one, "--gap", "X", "longest step between samples, in median steps (default 1.5)", "1.5")
+    text = "end of the data that validates a first fit: share, or samples (default 0.25)"
+    option(one, "--hold-back", "SHARE", text, "0.25")
+    text = "standard deviation of the readings, one or one per channel (default: from the data)"
+    option(one, "--noise", "SD", text)
+
+
+def _add_fit(one):
+    """Options on what is estimated and how."""
+    repeatable(
+        one,
+        "--free",
+        "NAME=LOW:HIGH",
+        "what to estimate, of plant, sensor, actuator, disturbance (default: pump gains, splits,"
+        " orifices, pipes)",
     )
-    one.add_argument(
-        "--gap",
-        default="1.5",
-        metavar="X",
-        help="longest step between samples, in median steps (default 1.5)",
-    )
-    one.add_argument(
-        "--resume",
-        metavar="DIR",
-        help="go on where a killed run with --out DIR ended, to the same answer",
-    )
-    one.add_argument(
-        "--start",
-        default="free",
-        metavar="HOW",
-        help="first levels: free (default), measured, or case",
-    )
-    one.add_argument("--starts", default="8", metavar="N", help="searches (default 8)")
-    one.add_argument(
-        "--iterations", default="100", metavar="N", help="evaluations of each search (default 100)"
-    )
-    one.add_argument(
-        "--hold-back",
-        default="0.25",
-        metavar="SHARE",
-        help="end of the log to predict before all is fitted: share, or samples",
-    )
-    one.add_argument(
-        "--noise",
-        metavar="SD",
-        help="standard deviation of the readings, one or one per channel (default: from the log)",
-    )
-    one.add_argument(
-        "--loss", default="linear", metavar="NAME", help="linear (default), soft_l1 or huber"
-    )
-    one.add_argument(
-        "--law",
-        metavar="KIND",
-        help="write the rig under a controller to tune: pi, with gains from the identified model",
-    )
+    option(one, "--start", "HOW", "first levels: free (default), measured, or case", "free")
+    option(one, "--starts", "N", "searches (default 8)", "8")
+    option(one, "--iterations", "N", "evaluations of each search (default 100)", "100")
+    option(one, "--loss", "NAME", "linear (default), soft_l1 or huber", "linear")
+    text = "write the rig under a controller to tune: pi, with gains from the identified model"
+    option(one, "--law", "KIND", text)
     one.add_argument(
         "--profile",
         action="store_true",
-        help="also: profile likelihood of the parameter known worst",
+        help="also: profile likelihood of the least certain parameter",
     )
+    text = "continue a killed run with --out DIR, to the same result"
+    option(one, "--resume", "DIR", text)
+
+
+def _add_plan(one):
+    """Options on a planned experiment."""
     one.add_argument(
         "--plan",
         action="store_true",
-        help="no log: compare experiments by the standard deviations they would leave",
+        help="no data: compare experiments by the standard deviations they would leave",
     )
-    one.add_argument("--duration", metavar="S", help="of a planned experiment [s] (default 300)")
-    one.add_argument(
-        "--voltage",
-        metavar="V1,V2",
-        help="pump inputs that a planned experiment works about (default: the case's own)",
-    )
-    one.add_argument(
-        "--measure",
-        metavar="H1,H2",
-        help="tanks that are measured in a planned experiment (default all)",
-    )
+    option(one, "--duration", "S", "of a planned experiment [s] (default 300)")
+    text = "inputs about which a planned experiment works (default: the case's own)"
+    option(one, "--voltage", "V1,V2", text)
+    option(one, "--measure", "H1,H2", "tanks measured in a planned experiment (default all)")
 
 
 def run(args):
     """Run the command; returns the exit code."""
+    with put_back():
+        case = values.open_case(args)
+        pairs = [values.pair("--free", text, values.span) for text in args.free]
+        free = values.once("--free", pairs)
+        code = _plan(args, case, free) if args.plan else _identify(args, case, free)
+        sys.stdout.flush()  # the result is out before Ctrl-C ends the program at once again
+        return code
+
+
+def _identify(args, case, free):
+    """Identify, then write and print the result; returns the exit code."""
     args.out = args.resume or args.out
-    seed, case = values.seed(args), values.open_case(args)
-    free = values.once("--free", [values.pair("--free", text, values.span) for text in args.free])
-    if args.plan:
-        return plan(args, case, free)
-    for option, given in (
-        ("--duration", args.duration),
-        ("--voltage", args.voltage),
-        ("--measure", args.measure),
-    ):
-        if given is not None:
-            raise InputError(
-                f"{option} {given!r}: is of an experiment that is planned, with --plan"
-            )
-    if not args.data:
-        raise InputError(
-            "identify needs --data CSV, a log of the rig (or --plan, to compare experiments before"
-            " making one)"
-        )
-    from tuning.identification.csv_log import read_log
+    _check_data_given(args)
     from tuning.identification.fit import identify
-    from tuning.report import identification, tables
+    from tuning.report import tables
     from tuning.storage.evaluation_log import discard
 
-    given = values.once(
-        "--column", [values.pair("--column", text, _column) for text in args.column]
-    )
-    columns = dict(case.log) | (given or {})
-    logs = [read_log(path, case.loop, columns, args.decimal) for path in args.data]
-    hold = values.number("--hold-back", args.hold_back)
-    if not 0 <= hold < min(one.samples for one in logs):
-        raise InputError(
-            f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a number of"
-            " samples of the log"
-        )
-    noise = None
-    if args.noise is not None:
-        noise = values.parse_value(args.noise, "--noise")
-        entries = noise if isinstance(noise, list) else [noise]
-        if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
-            raise InputError(
-                f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per"
-                " channel"
-            )
-    gap = values.number("--gap", args.gap)
-    if not gap >= 1:
-        raise InputError(f"--gap {args.gap!r}: must be at least 1")
+    logs = _read(args, case)
+    options = _options(args, logs)
 
     def ready():  # not before: data that are refused get one line
         if not args.quiet:
-            print(
-                f"{', '.join(one.name for one in logs)}: {sum(one.samples for one in logs)}"
-                " samples",
-                file=sys.stderr,
-                flush=True,
-            )
+            names, samples = ", ".join(one.name for one in logs), sum(one.samples for one in logs)
+            print(f"{names}: {samples} samples", file=sys.stderr, flush=True)
 
     interrupts = Interrupts()
-    found = identify(
-        case,
-        logs,
-        free,
-        start=args.start,
-        starts=values.whole("--starts", args.starts, 1, 1000),
-        seed=seed,
-        hold_back=hold if hold < 1 else _samples(args.hold_back),
-        noise=noise,
-        loss=args.loss,
-        profile=args.profile,
-        iterations=values.whole("--iterations", args.iterations, 1, 100_000),
-        gap=gap,
-        folder=args.out,
-        resume=args.resume is not None,
-        progress=interrupts.check,  # between two searches
-        ready=ready,
-        law=args.law,
-    )
+    found = identify(case, logs, free, progress=interrupts.check, ready=ready, **options)
+    written = []
     try:
         written = found.save(args.out, args.line) if args.out else []
-    finally:  # a disk that is full costs the files, not the answer; and the log is kept
+    finally:  # a full disk costs the files, not the result; the checkpoint is kept
         print(tables.dumps(found.to_json()) if args.json else repr(found))
     if args.out and found.status != "interrupted":
-        discard(args.out)  # the result is whole: there is nothing left to go on with
-    if written and not args.quiet:
-        print(
-            f"written to {printable(args.out)}: " + ", ".join(p.name for p in written),
-            file=sys.stderr,
+        discard(args.out)  # the result is complete: the checkpoint is not needed
+    report_written(written, args)
+    _report_next(args, found, free, written)
+    return STATUS["interrupted" if interrupts.stop else found.status]
+
+
+def _check_data_given(args):
+    """Raise InputError for options of a planned experiment, and without experiment data."""
+    for name in PLANNED:
+        if getattr(args, name) is not None:
+            raise InputError(
+                f"--{name} {getattr(args, name)!r}: belongs to a planned experiment, with --plan"
+            )
+    if not args.data:
+        raise InputError(
+            "identify needs --data CSV, experiment data of the rig (or --plan, to compare"
+            " experiments before making one)"
         )
+
+
+def _read(args, case):
+    """Return the Logs of --data."""
+    from tuning.identification.csv_log import read_log
+
+    pairs = [values.pair("--column", text, _column) for text in args.column]
+    columns = dict(case.log) | (values.once("--column", pairs) or {})
+    return [read_log(path, case.loop, columns, args.decimal) for path in args.data]
+
+
+def _column(text):
+    """Return HEADER, or (HEADER, UNIT) of HEADER;UNIT."""
+    header, semicolon, unit = text.rpartition(";")
+    return (header.strip(), unit.strip()) if semicolon else text
+
+
+def _options(args, logs):
+    """Return the keyword arguments of `identify`."""
+    gap = values.number("--gap", args.gap)
+    hold, noise = _hold_back(args, logs), _noise(args)
+    if not gap >= 1:
+        raise InputError(f"--gap {args.gap!r}: must be at least 1")
+    return {
+        "start": args.start,
+        "starts": values.whole("--starts", args.starts, 1, 1000),
+        "seed": values.seed(args),
+        "hold_back": hold,
+        "noise": noise,
+        "loss": args.loss,
+        "profile": args.profile,
+        "iterations": values.whole("--iterations", args.iterations, 1, 100_000),
+        "gap": gap,
+        "checkpoint": args.out,
+        "resume": args.resume is not None,
+        "law": args.law,
+    }
+
+
+def _hold_back(args, logs):
+    """Return the share, or number of samples, of the validation set."""
+    hold = values.number("--hold-back", args.hold_back)
+    if not 0 <= hold < min(one.samples for one in logs) or (hold >= 1 and hold != int(hold)):
+        raise InputError(
+            f"--hold-back {args.hold_back!r}: must be a share from 0 to below 1, or a whole number"
+            " of samples, fewer than the data have"
+        )
+    return hold if hold < 1 else int(hold)
+
+
+def _noise(args):
+    """Return --noise: a standard deviation, a list of them, or None."""
+    if args.noise is None:
+        return None
+    noise = values.parse_value(args.noise, "--noise")
+    entries = noise if isinstance(noise, list) else [noise]
+    if not entries or any(isinstance(v, (str, bool)) or not v > 0 for v in entries):
+        raise InputError(
+            f"--noise {args.noise!r}: must be a number above 0, or [SD1,SD2,...], one per channel"
+        )
+    return noise
+
+
+def _report_next(args, found, free, written):
+    """Print on stderr why no rig is written, or what to do with the one that is."""
+    from tuning.report.identification import not_identifiable
+
+    if written:
         report_unreachable(found.identified, written, args)
-    if found.directions and not all(p["identifiable"] for p in found.parameters.values()):
-        words = "; ".join(f"cannot tell {identification.untold(d)}" for d in found.directions)
+    if found.directions and not found.identifiable:
+        names = "; ".join(not_identifiable(d) for d in found.directions)
         print(
-            f"jaxtank: {printable(', '.join(args.data))}: {words}: no rig is written;"
-            f" {_advice(found, free)}",
+            f"jaxtank: {printable(', '.join(args.data))}: not identifiable from these data:"
+            f" {names}: no rig is written; {_advice(found, free)}",
             file=sys.stderr,
         )
     elif (
@@ -219,12 +223,11 @@ def run(args):
         and found.status == "converged"
         and not args.quiet
     ):
-        print(_next(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
-    return STATUS["interrupted" if interrupts.stop else found.status]
+        print(_next_command(found, f"{printable(args.out.rstrip('/'))}/rig.toml"), file=sys.stderr)
 
 
-def _next(found, file):
-    """What to do with the rig that was written to `file`."""
+def _next_command(found, file):
+    """Return what to do with the rig that was written to `file`."""
     case, why = found.proposed
     if why:
         return f"jaxtank: {file}: note: --law {found.law}: {why}"
@@ -237,54 +240,55 @@ def _next(found, file):
 
 
 def _advice(found, free):
-    """What to do about parameters that the data cannot tell."""
-    alone = [
-        n
-        for d in found.directions
-        if len(d["parameters"]) == 1
-        for n in d["parameters"]
-        if n in found.parameters
-    ]
+    """Return what to do about parameters that are not identifiable from the data."""
+    directions = [list(d["parameters"]) for d in found.directions]
+    alone = [names[0] for names in directions if len(names) == 1 and names[0] in found.parameters]
     if free is None:
-        which = f"all but {', '.join(alone)}" if alone else "fewer than the usual"
+        which = f"all but {', '.join(alone)}" if alone else "fewer than by default"
         return (
-            f"say with --free NAME=LOW:HIGH what to estimate ({which}), or take a log that moves"
+            f"choose with --free NAME=LOW:HIGH what to estimate ({which}), or use data that excite"
             f" {'it' if len(alone) == 1 else 'them'}"
         )
-    return (
-        f"leave {', '.join(alone)} out of --free"
-        if alone
-        else "free fewer, or take a log that moves them"
-    )
+    if alone:
+        return f"leave {', '.join(alone)} out of --free"
+    return "free fewer, or use data that excite them"
 
 
-def run_interruptibly(args):
-    """`run`, with the handler of SIGINT put back afterwards."""
-    with put_back():
-        code = run(args)
-        sys.stdout.flush()  # the answer is out before Ctrl-C ends the program at once again
-        return code
+def _plan(args, case, free):
+    """Compare experiments and print the result; returns the exit code."""
+    _check_plan(args)
+    from tuning.identification.design import compare_experiments, most_informative
+    from tuning.report import experiment_plan, tables
 
-
-def _samples(text):
-    """A number of samples: a share below 1 has been taken already."""
-    if not float(text).is_integer():
+    values.seed(args)
+    duration = 300.0 if args.duration is None else values.number("--duration", args.duration)
+    if not 0 < duration <= LONGEST:
         raise InputError(
-            f"--hold-back {text!r}: must be a share from 0 to below 1, or a whole number of samples"
+            f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s"
         )
-    return int(float(text))
+    plan = {
+        "duration": duration,
+        "dt": duration / 300,
+        "levels": _measured(args, case),
+        "voltage": _voltage(args, case),
+        "noise": _planned_noise(args, case),
+    }
+    found = compare_experiments(case, free, start="known", **plan)
+    best = most_informative(found)
+    if not args.json:
+        print(experiment_plan.plan_text(case, found, best, plan))
+        return 0
+    given = {n: plan[n] for n in ("noise", "duration", "dt")}
+    result = {"case": case.name, **given, "experiments": found, "most_informative": best}
+    print(tables.dumps(tables.clean(result)))
+    return 0
 
 
-def _column(text):
-    header, semicolon, unit = text.rpartition(";")
-    return (header.strip(), unit.strip()) if semicolon else text
-
-
-def plan(args, case, free):
-    """Compare experiments; returns the exit code."""
+def _check_plan(args):
+    """Raise InputError for options that are not of a planned experiment."""
     if args.data:
         raise InputError(
-            "--plan compares experiments before there is a log: leave it out to fit --data"
+            "--plan compares experiments before there are data: leave it out to fit --data"
             f" {args.data[0]!r}"
         )
     if args.law:
@@ -293,95 +297,42 @@ def plan(args, case, free):
         raise InputError(
             f"--plan writes no files: leave --out {args.out!r} out (--json prints what it found)"
         )
-    import numpy as np
 
-    from tuning.identification.design import compare_experiments, most_telling
-    from tuning.report import tables
 
-    duration = 300.0 if args.duration is None else values.number("--duration", args.duration)
-    if not 0 < duration <= LONGEST:
+def _measured(args, case):
+    """Return the tanks of --measure, counted from 0, or None for all."""
+    if not args.measure:
+        return None
+    names = [f"h{i + 1}" for i in range(case.loop.plant.tanks)]
+    words = [word.strip() for word in args.measure.split(",")]
+    for word in words:
+        if word not in names:
+            raise InputError(f"--measure {word!r}: must be among {', '.join(names)}")
+    return sorted({names.index(word) for word in words})
+
+
+def _voltage(args, case):
+    """Return the inputs of --voltage, or None for the case's own."""
+    if args.voltage is None:
+        return None
+    voltage = [values.number("--voltage", text) for text in args.voltage.split(",")]
+    high = [float(v) for v in case.loop.actuator.high]
+    if len(voltage) != len(high) or not all(0 < v <= top for v, top in zip(voltage, high)):
         raise InputError(
-            f"--duration {args.duration!r}: must be above 0 s and at most {LONGEST:g} s"
+            f"--voltage {args.voltage!r}: must be {len(high)} numbers above 0 and at most"
+            f" {', '.join(f'{v:g}' for v in high)} {case.loop.units[1]}"
         )
-    dt = duration / 300
-    tanks = None
-    if args.measure:
-        names = [f"h{i + 1}" for i in range(case.loop.plant.tanks)]
-        for word in args.measure.split(","):
-            if word.strip() not in names:
-                raise InputError(f"--measure {word!r}: must be among {', '.join(names)}")
-        tanks = sorted({names.index(w.strip()) for w in args.measure.split(",")})
-    voltage = None
-    if args.voltage is not None:
-        voltage = [values.number("--voltage", text) for text in args.voltage.split(",")]
-        high = np.asarray(case.loop.actuator.high)
-        if len(voltage) != high.size or not all(0 < v <= top for v, top in zip(voltage, high)):
-            tops = ", ".join(f"{v:g}" for v in high)
-            raise InputError(
-                f"--voltage {args.voltage!r}: must be {high.size} numbers above 0 and at most"
-                f" {tops} {case.loop.units[1]}"
-            )
-    length = case.loop.units[0]
-    own = float(np.max(np.asarray(case.loop.sensor.noise)))
-    noise = (
-        values.number("--noise", args.noise)
-        if args.noise
-        else own or 0.005 * float(np.max(np.asarray(case.loop.plant.rim)))
-    )
+    return voltage
+
+
+def _planned_noise(args, case):
+    """Return the standard deviation of the readings: given, the case's, or 0.5 % of the rim."""
+    if args.noise:
+        noise = values.number("--noise", args.noise)
+    else:
+        noise = max(map(float, case.loop.sensor.noise)) or 0.005 * max(
+            map(float, case.loop.plant.rim)
+        )
     if not noise > 0:
         raise InputError(f"--noise {args.noise!r}: must be above 0")
-    found = compare_experiments(
-        case,
-        free,
-        noise=noise,
-        duration=duration,
-        dt=dt,
-        levels=tanks,
-        start="known",
-        voltage=voltage,
-    )
-    best = most_telling(found)
-    if args.json:
-        print(
-            tables.dumps(
-                tables.clean(
-                    {
-                        "case": case.name,
-                        "noise": noise,
-                        "duration": duration,
-                        "dt": dt,
-                        "experiments": found,
-                        "most_telling": best,
-                    }
-                )
-            )
-        )
-        return 0
-    from jaxtank.core.tree import get_value
-
-    letters, rows = dict(zip("ABCDEFGH", found)), []
-    for name in next(iter(found.values()))["sd"]:
-        value = float(np.asarray(get_value(case.loop, name)))
-        sds = [found[words]["sd"][name] for words in letters.values()]
-        shares = [
-            "open" if sd is None else f"{100 * sd / abs(value):.2g} %" if value else f"{sd:.2g}"
-            for sd in sds
-        ]
-        rows.append([name, f"{value:.5g}", *shares])
-    conditions = [found[words]["condition"] for words in letters.values()]
-    rows.append(
-        [
-            "condition of J'J",
-            "",
-            *("-" if c is None or c > 1e15 else f"{c:.3g}" for c in conditions),
-        ]
-    )
-    measured = "every level" if tanks is None else ", ".join(f"h{i + 1}" for i in tanks)
-    print(
-        f"{case.name}: standard deviations that {duration:g} s, {measured} read every {dt:g} s with"
-        f" noise of {noise:g} {length} would leave\n"
-    )
-    print(tables.table(rows, ["parameter", "value", *letters]) + "\n")
-    print("\n".join(f"{letter}  {words}" for letter, words in letters.items()))
-    print(f"\nIt tells most: {best}." if best else "\nNone of them tells all of these parameters.")
-    return 0
+    return noise

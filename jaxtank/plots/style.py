@@ -1,0 +1,86 @@
+"""Colours, line styles and settings of all pictures. Imported by every module of this folder."""
+
+import contextlib
+from typing import Any
+
+import matplotlib.pyplot as plt
+
+# Okabe and Ito's colours, which colour-blind readers can distinguish
+BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = "#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73"
+RUNS = (
+    (BEFORE, "--"),
+    (AFTER, "-"),
+    (OTHER, "-."),
+    ("#E69F00", "-"),
+    ("#56B4E9", "--"),
+    ("0.45", "-."),
+)
+"""(colour, line style) of runs in one picture; the seventh and later ones repeat the colours in
+other line styles.
+"""
+
+PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
+"""One colour for each pump and its pipework."""
+
+WATER, GLASS = "#9CCEEB", "0.35"
+"""Colours of the liquid and of the walls of a tank in drawings of a rig."""
+
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.dpi": 110,
+    "savefig.dpi": 130,
+    "svg.fonttype": "none",
+}
+
+
+@contextlib.contextmanager
+def styled(more=None):
+    """Set matplotlib's settings to STYLE, and to `more` {setting: value}, within a `with` block.
+
+    Afterwards these settings are as before, and only these: `plt.rc_context` restores all of them.
+    If the first figure of a notebook is drawn inside that one, it undoes the interactive mode which
+    the notebook's backend has just switched on, and no later figure is shown.
+
+    Examples
+    --------
+    >>> with styled({"font.size": 20}):
+    ...     plt.rcParams["font.size"]
+    20.0
+    """
+    settings = STYLE | (more or {})
+    before: dict[Any, Any] = {name: plt.rcParams[name] for name in settings}
+    plt.rcParams.update(settings)
+    try:
+        yield
+    finally:
+        plt.rcParams.update(before)
+
+
+def plain(text):
+    r"""Return a text in which matplotlib takes no dollar sign as the start of mathematics.
+
+    Examples
+    --------
+    >>> print(plain("a $ b"))
+    a \$ b
+    """
+    return text.replace("$", r"\$")
+
+
+def grid(rows, columns, size, **more):
+    """Return (figure, axes (rows, columns)) of `size` (width, height) [inch]."""
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
+
+
+def hide(axes):
+    """Hide axes that have no picture."""
+    for ax in axes:
+        ax.set_visible(False)

@@ -1,0 +1,174 @@
+"""Pictures of many runs: quantiles of levels, runs before and after tuning, limits violated."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, REFERENCE, grid, hide, plain, styled
+
+
+def fan(loop, bands, title):
+    """Return a figure of the quantiles of levels over many draws, with setpoints and rims.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    bands : {"t" (rows,) [s], "r" (rows, outputs) setpoints, "x" (5, rows, tanks) quantiles 5, 25,
+        50, 75, 95 % of the levels}
+    title : text above the panels
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> bands = {"t": np.arange(3.0), "r": np.ones((3, 1)), "x": np.ones((5, 3, 2))}
+    >>> figure = fan(presets.find("cascaded/pi").loop, bands, "many runs")
+    >>> [ax.get_title() for ax in figure.axes]
+    ['tank 1', 'tank 2']
+    """
+    tanks, columns = loop.plant.tanks, min(2, loop.plant.tanks)
+    rows = -(-tanks // 2)
+    with styled():
+        figure, axes = grid(rows, columns, (9.6, 2.7 * rows), sharex=True)
+        for i, ax in enumerate(axes.ravel()[:tanks]):
+            _band(ax, loop, bands, i)
+        # the lowest panel of each column, above one that stays empty too
+        for ax in axes.ravel()[max(0, tanks - columns) : tanks]:
+            ax.set_xlabel("time [s]")
+            ax.tick_params(labelbottom=True)
+        hide(axes.ravel()[tanks:])
+        figure.suptitle(plain(title))
+    return figure
+
+
+def _band(ax, loop, bands, i):
+    """The quantiles of one tank."""
+    t, rim, unit = bands["t"], float(loop.plant.rim[i]), loop.units[0]
+    low, first, middle, third, high = bands["x"][:, :, i]
+    band = {"color": AFTER, "linewidth": 0}
+    ax.fill_between(t, low, high, alpha=0.2, label="5 to 95 %", **band)
+    ax.fill_between(t, first, third, alpha=0.35, label="25 to 75 %", **band)
+    ax.plot(t, middle, color=AFTER, linewidth=1.2, label="median")
+    if i in loop.plant.outputs:
+        setpoint = bands["r"][:, loop.plant.outputs.index(i)]
+        ax.plot(t, setpoint, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+    if high.max() > 0.25 * rim:
+        ax.axhline(rim, color=BEFORE, linewidth=1.0, label="rim")
+    else:  # a rim far above all levels would only compress the picture
+        label = f"rim {rim:g} {unit}, above the picture"
+        ax.plot([], [], color=BEFORE, linewidth=1.0, label=label)
+    ax.set(title=f"tank {i + 1}", ylabel=f"level [{unit}]")
+    ax.legend(loc="best", fontsize="x-small")
+
+
+def cloud(ax, pairs, held, name, unit, limit=None):
+    """Draw one point for each run: a measure before tuning across, after tuning up.
+
+    Both are on the same plant and noise; below the diagonal the measure decreased. Blue points hold
+    every limit on both sides, orange squares violated one before and none after, pink crosses
+    violate one after, whatever they did before.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    pairs : (runs, 2) before and after [unit]
+    held : (runs, 2) True where every limit holds
+    name, unit : of the measure
+    limit : of the measure [unit], drawn on both axes, or None
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> held = np.ones((2, 2), dtype=bool)
+    >>> ax = cloud(Figure().gca(), [[2.0, 1.0], [3.0, 1.5]], held, "rms_error", "cm")
+    >>> ax.get_xlabel()
+    'rms_error before [cm]'
+    """
+    pairs, held = np.asarray(pairs, dtype=float), np.asarray(held)
+    sorts = (
+        (held[:, 1] & ~held[:, 0], "s", BEFORE, 7, "violated a limit before, none after"),
+        (held[:, 0] & held[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
+        (~held[:, 1], "x", FORBIDDEN, 22, "violates a limit after"),
+    )
+    for chosen, marker, colour, size, label in sorts:
+        if chosen.any():
+            ax.scatter(
+                *pairs[chosen].T,
+                s=size,
+                marker=marker,
+                color=colour,
+                alpha=1.0 if marker == "x" else 0.55,
+                linewidths=0.9,
+                label=f"{label} ({chosen.sum()} of {len(pairs)})",
+                rasterized=True,
+            )
+    # a limit far above all runs would only move them into a corner
+    limit = limit if limit is not None and (limit <= 0 or np.max(pairs) > 0.6 * limit) else None
+    low, high = _square(ax, pairs if limit is None else np.append(pairs.ravel(), limit))
+    diagonal = {"color": REFERENCE, "linewidth": 0.9, "linestyle": "--", "label": "no change"}
+    ax.plot([low, high], [low, high], **diagonal)
+    if limit is not None:
+        ax.axvline(limit, color=FORBIDDEN, linewidth=1.0)
+        ax.axhline(limit, color=FORBIDDEN, linewidth=1.0, label=f"limit {limit:g} {unit}")
+    ax.set(xlabel=f"{name} before [{unit}]", ylabel=f"{name} after [{unit}]")
+    ax.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+    ax.set_axisbelow(True)
+    return ax
+
+
+def _square(ax, values):
+    """Ends of both axes, which are logarithmic where the values need it."""
+    low, high = float(np.min(values)), float(np.max(values))
+    if not high > 8 * low > 0:
+        margin = 0.05 * (high - low)
+        return low - margin, high + margin
+    ax.set(xscale="log", yscale="log")
+    # 0.2, 0.5, 1 ...: powers of ten alone would leave a decade without a number
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    return low / 1.1, high * 1.1
+
+
+def violations(rows, samples):
+    """Return a figure of the probability that each limit is violated, with its 95 % interval.
+
+    Parameters
+    ----------
+    rows : list of {"name", "limit", "unit", "probability", "interval95"}, as `Ensemble.violations`
+    samples : number of draws
+
+    Examples
+    --------
+    >>> row = {"name": "max_level", "limit": 30.0, "probability": 0.1, "interval95": (0.05, 0.2)}
+    >>> violations([row], 100).axes[0].get_xlabel()
+    'probability of violating the limit [-], 100 draws'
+    """
+    with styled():
+        figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
+        y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
+        ends = np.array([r["interval95"] for r in rows])
+        ax.barh(y, p, color="#56B4E9", height=0.6)
+        ax.errorbar(
+            p,
+            y,
+            xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]),
+            fmt="none",
+            ecolor="black",
+            capsize=3,
+        )
+        ax.set_yticks(
+            y,
+            [
+                plain(f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")"))
+                for r in rows
+            ],
+        )
+        ax.invert_yaxis()
+        ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
+        ax.set_xlabel(f"probability of violating the limit [-], {samples} draws")
+    return figure

@@ -1,0 +1,177 @@
+"""The search of a fit: SciPy's bounded trust region on exact sensitivities, and the profile
+likelihood. Imported by `fit`, which calls it, and by `confidence` for the type of its result.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, cast
+
+import numpy as np
+from scipy import optimize
+
+from tuning.identification.problem import Estimation
+from tuning.identification.residuals import ROBUST_LIMIT
+
+CHI_SQUARED_95 = 3.841458820694124
+"""95 % point of the chi-squared distribution with one degree of freedom."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fit:
+    """Where a search ended."""
+
+    p: np.ndarray  # (shared,) coordinates
+    levels: np.ndarray  # (logs, free levels) levels at the first sample of each log
+    cost: float  # half the weighted sum of squares (of the loss) [-]
+    residual: np.ndarray  # (rows,) weighted
+    jacobian: np.ndarray  # (rows, unknowns) of the weighted residual
+    evaluations: int
+    status: int  # of scipy: above 0 where it has converged
+    loss: str = "linear"
+
+
+class _Residual:
+    """Residual and Jacobian by the unknowns that are free, evaluated once per point.
+
+    prior: (point (unknowns,), strength), as readings of every unknown with standard deviation
+    1 / strength would add; of a level a tenth of that.
+    """
+
+    def __init__(self, estimation, start, fixed, prior):
+        self.estimation, self.point, self.last = estimation, start.copy(), None
+        self.free = np.array([i for i in range(estimation.size) if i not in fixed])
+        for i, value in fixed.items():
+            self.point[i] = value
+        self.prior, self.weight = None, np.zeros(0)
+        if prior is not None:
+            levels = self.free >= estimation.coordinates.size
+            self.prior = prior[0][self.free]
+            self.weight = prior[1] * np.where(levels, 10.0, 1.0)
+
+    def at(self, v):
+        """Return (residual, jacobian) of the readings at the free unknowns v."""
+        if self.last is None or not np.array_equal(self.last[0], v):
+            self.point[self.free] = v
+            self.last = v.copy(), self.estimation.residual_and_jacobian(self.point)
+        return self.last[1]
+
+    def value(self, v):
+        """Return the residual with the rows of the prior."""
+        residual = self.at(v)[0]
+        if self.prior is None:
+            return residual
+        return np.concatenate([residual, self.weight * (v - self.prior)])
+
+    def slope(self, v):
+        """Return the Jacobian by the free unknowns with the rows of the prior."""
+        inner = self.at(v)[1][:, self.free]
+        return inner if self.prior is None else np.concatenate([inner, np.diag(self.weight)])
+
+
+def solve(
+    estimation: Estimation,
+    start: np.ndarray,
+    loss: str = "linear",
+    iterations: int = 100,
+    fixed: Mapping[int, float] | None = None,
+    tolerance: float = 1e-14,
+    prior: Any = None,
+) -> Fit:
+    """Return the Fit of a search from the unknowns `start` (unknowns,).
+
+    fixed: {index: value} of unknowns that stay, in coordinates; tolerance: gain of an iteration, as
+    a share of the cost, at which it ends; prior: as in `_Residual`.
+    """
+    before, residual = estimation.evaluations, _Residual(estimation, start, fixed or {}, prior)
+    low, high = (side[residual.free] for side in estimation.box)
+    begin = np.clip(residual.point[residual.free], low, high)
+    if not np.all(np.isfinite(residual.at(begin)[0])):
+        p, levels = estimation.split(residual.point)
+        empty = np.zeros((0, estimation.size))
+        return Fit(
+            p=p.copy(),
+            levels=levels,
+            cost=np.inf,
+            residual=empty[:, 0],
+            jacobian=empty,
+            evaluations=estimation.evaluations - before,
+            status=-1,
+        )
+    # with a wide range scipy's step to the edge of its trust region overflows
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        found = optimize.least_squares(
+            residual.value,
+            begin,
+            cast(Any, residual.slope),
+            bounds=(low - 1e-12, high + 1e-12),
+            x_scale=1.0,
+            loss=loss,
+            f_scale=ROBUST_LIMIT,
+            xtol=min(1e-8, 1e2 * tolerance),
+            ftol=tolerance,
+            gtol=min(1e-8, 1e2 * tolerance),
+            max_nfev=iterations,
+        )
+    end = residual.point
+    end[residual.free] = np.clip(found.x, low, high)
+    rows, jacobian = estimation.residual_and_jacobian(end)
+    p, levels = estimation.split(end)
+    return Fit(
+        p=p.copy(),
+        levels=levels,
+        cost=float(found.cost) if prior is None else 0.5 * float(rows @ rows),
+        residual=rows,
+        jacobian=jacobian,
+        evaluations=estimation.evaluations - before,
+        status=found.status,
+        loss=loss,
+    )
+
+
+def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):
+    """Return the profile likelihood of the least certain parameter.
+
+    It is fixed at each of `points` values within `reach` standard deviations, and all others are
+    fitted again. {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio,
+    "interval95": where it passes 3.84, interpolated, None on a side where it does not}.
+    """
+    name, sd = spread.worst()
+    levels = estimation.unknowns(fit)[estimation.coordinates.size :]
+    values = estimation.coordinates.values(fit.p)
+    estimation = estimation.without_branch_gains()
+    i = estimation.coordinates.names.index(name)
+    z = np.concatenate([estimation.coordinates.point(values), levels])
+    grid = np.linspace(-reach, reach, points) * (sd if sd else 1 / reach)
+    # a bound may truncate it
+    grid = np.unique(np.clip(z[i] + grid, estimation.box[0][i], estimation.box[1][i]))
+    inflate = max(spread.widened, 1.0) ** 2 * max(spread.scale, 1e-300)
+    points, middle = len(grid), int(np.argmin(np.abs(grid - z[i])))
+    upward, downward = list(range(middle, points)), list(range(middle, -1, -1))
+    rise, values = np.zeros(points), np.zeros(points)
+    for side in (upward, downward):
+        start = z.copy()
+        for j in side:
+            one = solve(estimation, start, loss, fixed={i: grid[j]})
+            start = estimation.unknowns(one)
+            rise[j] = max(2 * (one.cost - fit.cost) / inflate, 0.0)
+            values[j] = float(estimation.coordinates.values(one.p)[name])
+    low, high = (_crossing(values[side], rise[side]) for side in (downward, upward))
+    if low is not None and high is not None and high < low:
+        low, high = high, low
+    return {
+        "name": name,
+        "unit": next(b.unit for b in estimation.bounds if b.name == name),
+        "values": values.tolist(),
+        "rise": rise.tolist(),
+        "interval95": [low, high],
+    }
+
+
+def _crossing(values, rise):
+    """Return the value at which `rise` passes the 95 % threshold, None where it does not."""
+    for k in range(len(rise) - 1):
+        if rise[k + 1] >= CHI_SQUARED_95:
+            low, high, at = (math.sqrt(v) for v in (rise[k], rise[k + 1], CHI_SQUARED_95))
+            return float(values[k] + (at - low) / (high - low) * (values[k + 1] - values[k]))
+    return None

@@ -1,0 +1,125 @@
+"""The result of `identify`: estimates with intervals, the identified case, files and figures.
+
+Imported by `fit`; reports are opened when they are asked for.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from jaxtank.case import Case
+from tuning.identification.identified_case import proposed
+from tuning.identification.least_squares import Fit
+from tuning.identification.problem import Estimation
+from tuning.problem.result import Result
+from tuning.problem.status import Status
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Identification(Result):
+    """Result of `tuning.identify`; `print(result)` for a table.
+
+    Attributes
+    ----------
+    case : Case
+        The case that was given.
+    estimation : Estimation
+        Unknowns, experiment data and residual.
+    fit : Fit
+        Where the best search ended.
+    status : Status
+        CONVERGED, NOT_CONVERGED, NOT_IDENTIFIABLE or INTERRUPTED.
+    parameters : dict
+        {name: {"before", "value", "unit", "lower", "upper", "sd", "interval95", "identifiable",
+        "at_bound"}}.
+    levels : list
+        Of each log, of each tank {"value", "interval95"}: levels at the first sample.
+    covariance : tuple
+        (names, (n, n)) of the parameters that have an interval, in their units.
+    quality : dict
+        {"rmse", "nrmse_percent", "residual_autocorrelation", "noise"} per channel, and "widened",
+        the factor by which correlated residuals widen the intervals.
+    directions : list
+        What is not identifiable: {"words", "parameters" {name: factor}, "sd"}.
+    remedies : list of str
+        Which experiments would identify it.
+    starts : list
+        Of each search {"cost", "evaluations", "agrees"}.
+    validation : dict or None
+        Prediction of the end of the data from a fit to their beginning.
+    profile : dict or None
+        Profile likelihood of the least certain parameter.
+    wall_s : float
+        Run time [s].
+    seed : int
+        Of the starts.
+    law : str or None
+        Kind of controller that is proposed for the identified rig.
+
+    Examples
+    --------
+    >>> result = tuning.identify(case, data)  # doctest: +SKIP
+    >>> result.status, result.parameters["plant.pump_gain[0]"]["interval95"]  # doctest: +SKIP
+    (<Status.CONVERGED: 'converged'>, [26.9, 27.9])
+    >>> result.save("identified")  # doctest: +SKIP
+    """
+
+    REPORT = "tuning.report.identification"
+
+    case: Any
+    estimation: Estimation
+    fit: Fit
+    status: Status
+    parameters: dict
+    levels: list
+    covariance: tuple
+    quality: dict
+    directions: list
+    remedies: list
+    starts: list
+    validation: dict | None
+    profile: dict | None
+    wall_s: float
+    seed: int
+    law: str | None = None
+
+    @functools.cached_property
+    def proposed(self) -> tuple[Case, str | None]:
+        """(identified case, why no controller of kind `law` could be proposed, or None)."""
+        return proposed(self)
+
+    @property
+    def identified(self) -> Case:
+        """The case with the estimates, also in the models of controller and observer.
+
+        With covariance and noise.
+        """
+        return self.proposed[0]
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether every parameter is identifiable, so that a rig file may be written."""
+        return all(p["identifiable"] for p in self.parameters.values())
+
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """(name, unit) of every channel of readings."""
+        length = self.case.loop.units[0]
+        return [
+            (f"h{tank + 1}", "V" if volts else length)
+            for tank, volts in self.estimation.data.channels
+        ]
+
+    @property
+    def correlation(self) -> tuple[tuple, np.ndarray]:
+        """(names, (n, n)) correlation of the estimates that have an interval."""
+        names, matrix = self.covariance
+        sd = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+        return names, np.asarray(matrix) / np.outer(sd, sd)
+
+    @property
+    def message(self) -> str:
+        """How it ended, in one line."""
+        return self._report().message(self)
