@@ -18,46 +18,6 @@ from jaxtank.core.errors import InputError
 CHUNK = 2**18  # samples
 # what is asked before the loop starts
 METHODS = ("sample", "windows", "since", "prepare", "inputs")
-<<<<<<< HEAD
-
-
-class Piece(NamedTuple):
-    """Some of a clock's samples, in place of the Clock that a signal is asked with: from number
-    `first` on, which may be traced.
-    """
-
-    first: Any
-    samples: int
-    dt: float
-
-
-def indices(clock):
-    """(samples,) numbers of the samples of a Clock or a Piece."""
-    return clock.first + jnp.arange(clock.samples)
-
-
-def sample_times(clock):
-    """(samples,) times t_k = k dt [s], from the integer k: no drift over long runs."""
-    return indices(clock) * clock.dt
-
-
-def pointwise(method):
-    """Mark a method whose sample k depends on t_k and on samples k alone."""
-    method.pointwise = True
-    return method
-
-
-def is_pointwise(part: Any) -> bool:
-    """Whether what `part` of a loop, or the whole of it, is asked for can be asked piece by piece."""
-    asked = [getattr(type(part), name) for name in METHODS if hasattr(type(part), name)]
-    inside = [getattr(part, field.name) for field in dataclasses.fields(part)]
-    return all(hasattr(method, "pointwise") for method in asked) and all(
-        map(is_pointwise, filter(dataclasses.is_dataclass, inside))
-    )
-
-
-=======
->>>>>>> main
 INTEGRATORS = ("rk4", "midpoint")
 LARGEST_RUN = 100_000_000  # samples
 
@@ -185,9 +145,6 @@ CLOCK_UNITS: dict[str, str] = {name: meta["unit"] for name, meta in CLOCK.items(
 
 
 def check_clock(clock: Any) -> None:
-<<<<<<< HEAD
-    """Raise InputError unless the clock describes a run."""
-=======
     """Check that a clock describes a run.
 
     Raises
@@ -200,7 +157,6 @@ def check_clock(clock: Any) -> None:
     Traceback (most recent call last):
     jaxtank.core.errors.InputError: clock.dt = 2 s: must be at most clock.duration = 1 s
     """
->>>>>>> main
     if not isinstance(clock, Clock):
         raise InputError(
             f"clock is a {type(clock).__name__}: must be a jaxtank.Clock, as case.clock (first the"

@@ -92,10 +92,23 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | byt
         raise
 
 
-<<<<<<< HEAD
 def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[Path]:
-    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; return the
-    paths. Raises InputError for a folder that cannot be written to.
+    """Write files to a folder, made if need be, all of them or none; return their paths.
+
+    Parameters
+    ----------
+    folder : path
+    files : {name: text or bytes}
+
+    Raises
+    ------
+    InputError for a folder that cannot be written to.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in write_folder(folder, {"a.txt": "1"})]
+    ['a.txt']
     """
     check_folder(folder)
     folder = Path(folder)
@@ -110,9 +123,6 @@ def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[P
     return [folder / name for name in files]
 
 
-def sweep(folder):
-    """Remove the unfinished files that a killed run left in a folder."""
-=======
 def sweep(folder: str | os.PathLike[str]) -> None:
     """Remove the incomplete files that a killed run left in a folder.
 
@@ -124,7 +134,6 @@ def sweep(folder: str | os.PathLike[str]) -> None:
     ...     os.listdir(folder)
     []
     """
->>>>>>> main
     for path in Path(folder).glob(f".*{ASIDE}"):
         with contextlib.suppress(OSError):
             path.unlink()

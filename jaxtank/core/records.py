@@ -14,10 +14,6 @@ from jaxtank.core.errors import InputError
 
 
 def check_key(key: Any) -> None:
-<<<<<<< HEAD
-    """Raise InputError unless `key` is None or one random key of jax, of the typed kind or of the
-    older one, a row of unsigned integers; traced ones and placeholders too.
-=======
     """Check a random key: None, or one key of jax, typed or a row of unsigned integers.
 
     Raises
@@ -31,7 +27,6 @@ def check_key(key: Any) -> None:
     Traceback (most recent call last):
     jaxtank.core.errors.InputError: key is a int: must be one random key, as jax.random.key(0), or \
 None where there is no noise
->>>>>>> main
     """
     kind, ndim = getattr(key, "dtype", None), len(getattr(key, "shape", ()))
     typed = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
@@ -80,34 +75,9 @@ class Sample(NamedTuple):
     d_hat: Sequence[Any]
     r: tuple[Any, ...]  # setpoint, one per output [cm]
     e: tuple[Any, ...]  # tracking error of the true output, x - r, one per output [cm]
-<<<<<<< HEAD
-    command: Sequence[Any]  # what the law asked for, one per pump [V]
-    applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
-    u: Sequence[Any]  # what the pumps run at over [t_k, t_k + dt), one per pump [V]
-    spilled: Sequence[Any]  # volume lost over each rim during [t_k, t_k + dt) [cm^3]
-    # volume that a negative inflow could not take from each tank in that time [cm^3]
-    shortfall: Sequence[Any] = ()
-=======
     command: Sequence[Any]  # what the controller commanded, one per pump [V]
     applied: Sequence[Any]  # the command within the pumps' limits, one per pump [V]
     u: Sequence[Any]  # inputs at the plant over [t_k, t_k + dt), one per pump [V]
     spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
     shortfall: Sequence[Any] = ()
-
-
-class Trajectory(NamedTuple):
-    """A run as arrays with one row per saved sample; row k is at t_k, before the plant moves."""
-
-    t: Any  # (rows,) [s]
-    x: Any  # (rows, tanks) [cm]
-    y: Any  # (rows, tanks) [cm]
-    x_hat: Any  # (rows, tanks) [cm]
-    d_hat: Any  # (rows, tanks) [cm/s]
-    r: Any  # (rows, outputs) [cm]
-    e: Any  # (rows, outputs) [cm]
-    command: Any  # (rows, pumps) [V]
-    applied: Any  # (rows, pumps) [V]
-    u: Any  # (rows, pumps) [V]
-    spilled: Any  # (rows, tanks) overflow since the start [cm^3]
->>>>>>> main

@@ -51,12 +51,7 @@ def check_unit(where: str, text: str) -> str:
 
 
 def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
-<<<<<<< HEAD
-    """`unit`, written with "cm" for the length, "V" for the pump input and "volt" for a sensor's
-    volt, in the units of a rig.
-=======
     """Return a unit in the units of a rig.
->>>>>>> main
 
     A unit of several factors is put in brackets where it is one of several itself.
 

@@ -17,11 +17,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
-<<<<<<< HEAD
-from jaxtank.core.clock import PIECE, Clock, Piece
-=======
-from jaxtank.core.clock import CHUNK, Chunk
->>>>>>> main
+from jaxtank.core.clock import CHUNK, Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.instruments.base import Actuator, Sensor
@@ -119,33 +115,11 @@ def inputs(
 
     Raises InputError for a measure that means nothing for this loop.
     """
-<<<<<<< HEAD
     times: Any = clock
     if batch is not None:
-        times = Piece(first=batch * PIECE, samples=samples, dt=clock.dt)
+        times = Chunk(first=batch * CHUNK, samples=samples, dt=clock.dt)
     r, dr, ddr = loop.reference.sample(times)
     d = None if loop.disturbance is None else loop.disturbance.sample(times)[0]
-=======
-    if piece is not None:
-        clock = Chunk(first=piece * CHUNK, samples=samples, dt=clock.dt)
-    r, dr, ddr = loop.reference.sample(clock)
-    d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
-    window = None
-    if ms.wants_windows(names):
-        window = loop.reference.windows(clock)
-        if window is None:
-            raise InputError(
-                "overshoot, rise and settling need a reference that changes (signals.Ramps)"
-            )
-    since = None if loop.disturbance is None else loop.disturbance.since(clock)
-    if since is None and ms.wants_pours(names):
-        raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
-    if since is not None and window is not None:
-        # while a tank recovers from a pour, it is not settling on its setpoint
-        window = tuple(
-            tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window
-        )
->>>>>>> main
     return Inputs(
         r=r,
         dr=dr,

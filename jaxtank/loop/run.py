@@ -238,28 +238,16 @@ def evaluate_compiled(
         state, sample = step(loop, clock, state, now)
         return (state, ms.update(run, acc, sample, now.context)), None
 
-    def batch(carry: Any, number: Any, samples: int = PIECE) -> Any:
+    def batch(carry: Any, number: Any, samples: int = CHUNK) -> Any:
         return scan(body, carry, inputs(loop, clock, names, key, number, samples), samples)[0], None
 
     carry: Any = (initial(loop, clock), ms.start(run, names))
     if checkpoint:
-<<<<<<< HEAD
         carry = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    elif clock.samples > PIECE and is_pointwise(loop):
-        whole, left = divmod(clock.samples, PIECE)
+    elif clock.samples > CHUNK and is_pointwise(loop):
+        whole, left = divmod(clock.samples, CHUNK)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
         carry = batch(carry, whole, left)[0] if left else carry
-=======
-        state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    elif clock.samples > CHUNK and is_pointwise(loop):
-        whole, rest = divmod(clock.samples, CHUNK)
-        piece = lambda c, number, samples=CHUNK: (
-            scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0],
-            None,
-        )
-        carry = jax.lax.scan(piece, carry, jnp.arange(whole))[0]
-        state, acc = piece(carry, whole, rest)[0] if rest else carry
->>>>>>> main
     else:
         carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
     state, acc = carry

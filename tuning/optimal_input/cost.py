@@ -105,13 +105,9 @@ def evaluate(loop, clock, terms, u, lagrangian):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-<<<<<<< HEAD
-        return (state, ms.update(run, acc, sample, now.context)), tuple(excess(terms, held, sample))
-=======
         return (state, ms.update(run, acc, sample, now.context)), tuple(
             _pointwise_excess(terms, lagrangian, sample)
         )
->>>>>>> main
 
     (_, acc), over = lp.scan(
         body,
@@ -134,18 +130,6 @@ def _search_cost(u, loop, clock, terms, lagrangian):
         state, acc, (before, variation, absolute), penalty = carry
         now, multipliers = xs
         state, sample = step(loop, clock, state, now)
-<<<<<<< HEAD
-        acc = ms.update(run, acc, sample, now.context)
-        if "input_travel" in soft:
-            change = sum(_soft(a - b, held.knees[0]) for a, b in zip(sample.u, before))
-            travel, before = travel + jnp.where(state.k == 1, 0.0, change), sample.u
-        if "iae" in soft:
-            absolute = absolute + sum(_soft(e, held.knees[1]) for e in sample.e)
-        for force, over in zip(forces, excess(terms, held, sample)):
-            push = force + held.weight * over
-            penalty = penalty + jnp.where(push > 0.0, push * push, 0.0)
-        return (state, acc, (before, travel, absolute), penalty), None
-=======
         acc = ms.update(run, acc, sample, now.context)
         if "input_travel" in smoothed:
             change = sum(
@@ -160,7 +144,6 @@ def _search_cost(u, loop, clock, terms, lagrangian):
             force = multiplier + lagrangian.weight * over
             penalty = penalty + jnp.where(force > 0.0, force * force, 0.0)
         return (state, acc, (before, variation, absolute), penalty), None
->>>>>>> main
 
     extra = ((zero,) * loop.plant.pumps if "input_travel" in smoothed else (), zero, zero)
     carry = (initial(loop, clock), ms.start(run, names), extra, zero)

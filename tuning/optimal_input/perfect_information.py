@@ -12,8 +12,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import NonFiniteError
-from jaxtank.loop.trajectory import Trajectory
 from jaxtank.loop import run as lp
+from jaxtank.loop.trajectory import Trajectory
 from tuning.optimal_input.cost import open_loop
 from tuning.optimal_input.problem import InputProblem
 from tuning.optimal_input.search import InputSearch

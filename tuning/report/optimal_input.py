@@ -5,6 +5,7 @@ Opened by `tuning.bound`'s result.
 
 import io
 
+import jax
 import numpy as np
 
 from jaxtank.core.files import check_folder
