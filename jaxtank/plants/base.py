@@ -83,7 +83,7 @@ class Plant(abc.ABC):
         """
         return self.derivative
 
-    def shortfall(self, x: Sequence) -> tuple:
+    def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
         tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
         return (0.0,) * len(x)
@@ -100,6 +100,6 @@ class Plant(abc.ABC):
         """
         return x, (0.0,) * len(x)
 
-    def output(self, x: Sequence) -> tuple:
+    def output(self, x: Sequence[Any]) -> tuple[Any, ...]:
         """Return the levels that are controlled: those of the tanks in `outputs`, in that order."""
         return tuple(x[i] for i in self.outputs)

@@ -289,7 +289,7 @@ def _with_parts(case, table):
         start = [float(levels[i]) for i in loop.plant.outputs]
         changed["controller"] = components.controller_of(table["law"], loop.plant, start, initial)
         if type(changed["controller"]) is not type(loop.controller):
-            case = case.replace(mirror=None)
+            case = case.replace(symmetry=None)
     if "observer" in table:
         changed["observer"] = components.observer_of(table["observer"], loop.plant, levels, initial)
     if not changed:
