@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.analysis.steady_state import equilibrium, linearise
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
 

@@ -13,11 +13,11 @@ from jaxtank.xla.barrier import materialised
 
 
 class Advanced(NamedTuple):
-    """Levels after a sample, and what was lost on the way; (n) each."""
+    """Levels after a sample, and the volumes that overflowed or were missing; (n,) each."""
 
     x: tuple  # levels [cm]
     excess: tuple  # what rounding has added to each level too much [cm]; () where not compensated
-    spilled: tuple  # volume lost over each rim [cm^3]
+    spilled: tuple  # overflow over each rim [cm^3]
     shortfall: tuple  # volume that a negative inflow could not take [cm^3]
 
 
@@ -62,8 +62,8 @@ def advance(plant, integrator, t, x, u, d, dt, substeps, *, excess=(), rolled=Fa
         else:
             x = integrate(plant, integrator, t + j * h, x, u, d, h)
         shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
-        x, lost = plant.spill(x)
-        return Advanced(x, excess, tuple(a + b for a, b in zip(spilled, lost)), shortfall)
+        x, over = plant.spill(x)
+        return Advanced(x, excess, tuple(a + b for a, b in zip(spilled, over)), shortfall)
 
     if rolled and not (isinstance(substeps, int) and substeps == 1):
         zeros = (jnp.zeros_like(x[0]),) * plant.tanks
@@ -76,7 +76,9 @@ def advance(plant, integrator, t, x, u, d, dt, substeps, *, excess=(), rolled=Fa
 
 
 def integrate(plant, integrator, t, x, u, d, h):
-    """Levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d held."""
+    """Return the levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d
+    held.
+    """
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return _along(x, rates, h)
@@ -87,9 +89,7 @@ def integrate(plant, integrator, t, x, u, d, h):
 
 
 def change(plant, integrator, t, x, u, d, h):
-    """What the levels change by in that step, for sums that keep what rounding takes
-    (`jaxtank.core.kahan`).
-    """
+    """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return tuple(h * k for k in rates)

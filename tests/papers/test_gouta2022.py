@@ -10,7 +10,8 @@ from helpers import in_metres
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.analysis.steady_state import equilibrium, linearise
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers.pid import oustaloup
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError

@@ -19,18 +19,15 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import (
-    equilibrium,
+from jaxtank.analysis.linear_model import (
     linearise,
     relative_gain_array,
-    steady_along,
-    steady_flows,
     steady_gain,
-    steady_levels,
     transmission_zeros,
     zero_direction,
 )
+from jaxtank.analysis.riccati import lqr
+from jaxtank.analysis.steady_state import equilibrium, steady_along, steady_flows, steady_levels
 from jaxtank.controllers import LQI, SlidingMode, StateFeedback
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.controllers.sliding_mode import acceleration, lower_tanks
