@@ -29,9 +29,6 @@ LACKING = {
     "jaxtank.presets.find",
     "jaxtank.presets.load",
     "jaxtank.presets.names",
-    "jaxtank.rig.dump",
-    "jaxtank.rig.load",
-    "jaxtank.rig.set_values",
     "jaxtank.sensitivities",
     "jaxtank.simulate",
 }
