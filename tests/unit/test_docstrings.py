@@ -23,7 +23,6 @@ RESULTS = {
 }
 LACKING = {
     "jaxtank.Case",
-    "jaxtank.Clock",
     "jaxtank.ClosedLoop",
     "jaxtank.check",
     "jaxtank.evaluate",
@@ -32,21 +31,6 @@ LACKING = {
     "jaxtank.presets.names",
     "jaxtank.sensitivities",
     "jaxtank.simulate",
-    "tuning.Adam",
-    "tuning.Correlated",
-    "tuning.Discrete",
-    "tuning.LBFGS",
-    "tuning.LogUniform",
-    "tuning.Normal",
-    "tuning.Problem",
-    "tuning.SQP",
-    "tuning.TRF",
-    "tuning.Uniform",
-    "tuning.ensemble",
-    "tuning.sensitivity",
-    "tuning.tradeoff",
-    "tuning.tune",
-    "tuning.tune_robust",
 }
 
 

@@ -486,8 +486,8 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
         problem, diagnostics.curvature(problem, Search(problem, best, lambda s: None), best)
     )
     said = re.fullmatch(
-        r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective"
-        r" by (\S+) %",
+        r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes"
+        r" the objective by (\S+) %",
         words,
     )
     assert said, words
