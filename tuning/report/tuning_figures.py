@@ -172,13 +172,8 @@ def _contours(ax, result, unit):
     """The objective over the two parameters that it is most sensitive to, the others as tuned."""
     from jaxtank.plots import responses
 
-<<<<<<< HEAD
     problem, tuned, start = result.problem, _unit_values(result), result.problem.start()
-    effect = [-(p["felt_percent"] or 0.0) for p in result.parameters.values()]
-=======
-    problem, after, before = result.problem, _unit_values(result), result.problem.start()
     effect = [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()]
->>>>>>> w5
     pair = sorted(np.argsort(effect, kind="stable")[:2])
     side = np.linspace(0.0, 1.0, 24)
     across, up = np.meshgrid(side, side)
