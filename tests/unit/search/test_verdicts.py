@@ -14,7 +14,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.signals.setpoints import ramps
 from tuning.cli import main
-from tuning.problem.limits import Limit, resolve_limits, limit_scale
+from tuning.problem.limits import Limit, limit_scale, resolve_limits
 from tuning.problem.problem import Point
 from tuning.search.driver import Search
 from tuning.search.kkt import downhill

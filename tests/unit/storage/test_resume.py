@@ -13,8 +13,7 @@ import pytest
 import tuning
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
-from tuning.storage import batch_store
-from tuning.storage import evaluation_log
+from tuning.storage import batch_store, evaluation_log
 from tuning.storage.evaluation_log import NAME, EvaluationCache, EvaluationLog
 
 FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
