@@ -79,10 +79,7 @@ class InputProblem:
         """
         loop = self.case.loop
         rim = np.asarray(loop.plant.rim)
-        limits = [
-            _at_the_rim(v, rim) if v.index in dry else (v.measure, v.index, v.value)
-            for v in self.limits
-        ]
+        limits = [_at_the_rim(v, rim) if v.index in dry else _fields(v) for v in self.limits]
         pointwise = [limit for limit in limits if limit[0] in POINTWISE]
         integral = [limit for limit in limits if limit[0] not in POINTWISE]
         self.terms = Terms(
@@ -215,10 +212,15 @@ def _without_overflow(limits, plant):
     return dry
 
 
+def _fields(limit):
+    """Return (measure, entry, value) of a limit."""
+    return limit.measure, limit.index, limit.value
+
+
 def _at_the_rim(limit, rim):
     """Return (measure, entry, value): a limit on overflow as one on the level."""
     if limit.measure != "overflow_volume":
-        return limit.measure, limit.index, limit.value
+        return _fields(limit)
     return "max_level", limit.index, rim[limit.index] * (1 - TOLERANCE)
 
 
