@@ -70,7 +70,8 @@ def _example() -> Any:
 
     t = np.linspace(0.0, 10.0, 11)
     column = (t / 10.0)[:, None]
-    return Trajectory(**(dict.fromkeys(COLUMNS, column) | {"t": t}))
+    arrays: dict[str, Any] = dict.fromkeys(COLUMNS, column) | {"t": t}
+    return Trajectory(**arrays)
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
