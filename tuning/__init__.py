@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from tuning.search.options import TRF as TRF
     from tuning.search.options import Adam as Adam
     from tuning.search.pareto import tradeoff as tradeoff
+    from tuning.search.result import ConstraintRow as ConstraintRow
+    from tuning.search.result import Message as Message
     from tuning.search.result import ParameterChange as ParameterChange
     from tuning.search.result import TuningResult as TuningResult
     from tuning.search.robust import Certificate as Certificate
@@ -52,6 +54,8 @@ _NAMES = {
     "SQP": "tuning.search.options",
     "TRF": "tuning.search.options",
     "Problem": "tuning.problem.problem",
+    "ConstraintRow": "tuning.search.result",
+    "Message": "tuning.search.result",
     "ParameterChange": "tuning.search.result",
     "Status": "tuning.problem.status",
     "TuningResult": "tuning.search.result",

@@ -1,18 +1,16 @@
-"""Steady states, linear models, Riccati equations and quadratic programmes of a rig, before it is
-run.
+"""Steady states, linear models, Riccati equations and quadratic programmes.
+
+Imports core; may be imported by every folder above.
 """
 
-from jaxtank.analysis.steady_state import (
-    equilibrium,
+from jaxtank.analysis.linear_model import (
     linearise,
     relative_gain_array,
-    steady_along,
-    steady_flows,
     steady_gain,
-    steady_levels,
     transmission_zeros,
     zero_direction,
 )
+from jaxtank.analysis.steady_state import equilibrium, steady_along, steady_flows, steady_levels
 
 __all__ = [
     "equilibrium",

@@ -1,22 +1,22 @@
-"""Small quadratic programmes with two-sided rows, solved by an interior point and differentiable in
-everything.
+"""Small quadratic programmes with two-sided rows, solved by an interior-point method and
+differentiable in all data. Imports jax and `elimination`; may be imported by every folder above.
 
     min_x 1/2 x'H x + f'x    subject to    l <= G x <= u
 
 Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl
-the slacks of the two sides), which ends when it has arrived. Its derivatives are those of the
-optimality conditions: the implicit function theorem at the solution, in forward and in reverse
-mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A run that
-is not differentiated does not pay for them.
+the slack variables of the two sides), which ends when it has converged. Its derivatives are those
+of the optimality conditions: the implicit function theorem at the solution, in forward and in
+reverse mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A
+run that is not differentiated does not pay for them.
 """
 
 import functools
-import itertools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+
+from jaxtank.analysis.elimination import factor, normal_matrix, substitute
 
 MU_MIN = 1e-12
 """Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a
@@ -39,13 +39,11 @@ belonged at 0).
 """
 
 CORRECTIONS = 4  # of a derivative
-UNROLLED = 40  # variables up to which the elimination is written out
-STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variables, 8 as much as 4
 BACK = 0.99  # share of the way to the nearest bound that a step may go
 
 
 class Point(NamedTuple):
-    """An iterate: x (n,); slacks and multipliers of the upper and lower sides (rows,), all
+    """An iterate: x (n,); slack variables and multipliers of the upper and lower sides (rows,), all
     positive.
     """
 
@@ -58,12 +56,26 @@ class Point(NamedTuple):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(5,))
 def solve(H, f, G, l, u, iterations=MOST):
-    """x (n,) that minimises 1/2 x'Hx + f'x within l <= G x <= u.
+    """Return x that minimises 1/2 x'Hx + f'x within l <= G x <= u; differentiable in all five.
 
-    H: (n, n) symmetric, positive definite; f: (n,); G: (rows, n); l, u: (rows,) finite, l < u;
-    iterations: the most that are done. Rows may be collinear, and x is unique all the same. A
-    problem without a feasible point gives a meaningless x: nothing is raised inside a trace.
-    Differentiable in all five.
+    Parameters
+    ----------
+    H : (n, n) symmetric, positive definite
+    f : (n,)
+    G : (rows, n); rows may be collinear, and x is unique all the same
+    l, u : (rows,) finite, l < u
+    iterations : most iterations
+
+    Returns
+    -------
+    (n,); meaningless where no point is feasible: nothing is raised inside a trace
+
+    Examples
+    --------
+    >>> with jax.enable_x64(True):
+    ...     x = solve(jnp.eye(2), jnp.array([-2.0, -0.5]), jnp.eye(2), jnp.zeros(2), jnp.ones(2))
+    >>> [round(float(v), 3) for v in x]
+    [1.0, 0.5]
     """
     unit, inside = _scaled(H, f, G, l, u)
     return unit * interior_point(*inside, iterations).x
@@ -144,11 +156,11 @@ def _implicit(point, data, moved):
 
     a, b = (-r for r in jax.jvp(residual, tuple(data), tuple(moved))[1])
     normal = _normal(H, G, point)
-    factor = _factor(jax.lax.stop_gradient(normal))
+    factored = factor(jax.lax.stop_gradient(normal))
 
     def solved(right):
         return jax.lax.custom_linear_solve(
-            lambda z: normal @ z, right, lambda _, z: _substitute(factor, z), symmetric=True
+            lambda z: normal @ z, right, lambda _, z: substitute(factored, z), symmetric=True
         )
 
     def corrected(found, _):
@@ -163,23 +175,27 @@ def _implicit(point, data, moved):
 
 
 def interior_point(H, f, G, l, u, iterations=MOST):
-    """The `Point` at which the iterates have arrived, or the last of `iterations`; arguments as in
-    `solve`. Not for reverse mode.
+    """Return the `Point` at which the iterates converge, or the last of `iterations`.
+
+    Arguments as in `solve`. Not for reverse mode.
+
+    Examples
+    --------
+    >>> with jax.enable_x64(True):
+    ...     limits = jnp.zeros(1), jnp.ones(1)
+    ...     found = interior_point(jnp.eye(1), jnp.array([-2.0]), jnp.eye(1), *limits)
+    >>> round(float(found.x[0]), 3)
+    1.0
     """
-    rows = G.shape[0]
     x = jnp.zeros_like(f)
-    one = jnp.full(rows, 0.1, f.dtype)
-    # of a slack
+    one = jnp.full(G.shape[0], 0.1, f.dtype)
     rounding = 64.0 * jnp.finfo(f.dtype).eps * jnp.maximum(1.0, jnp.maximum(jnp.abs(u), jnp.abs(l)))
     start = Point(x, jnp.maximum(u - G @ x, 0.1), jnp.maximum(G @ x - l, 0.1), one, one)
-
-    def residuals(p):
-        g = G @ p.x
-        return H @ p.x + f + G.T @ (p.lu - p.ll), p.su + g - u, p.sl - g + l
+    data = H, f, G, l, u
 
     def under_way(state):
         k, p = state
-        worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in residuals(p)]))
+        worst = jnp.max(jnp.stack([jnp.max(jnp.abs(r)) for r in _residuals(p, *data)]))
         off = [
             jnp.max(jnp.abs(s * lam - MU_MIN) - rounding * lam)
             for s, lam in ((p.su, p.lu), (p.sl, p.ll))
@@ -188,38 +204,9 @@ def interior_point(H, f, G, l, u, iterations=MOST):
 
     def advance(state):
         k, p = state
-        dual, up, low = residuals(p)
-        mu = (p.su @ p.lu + p.sl @ p.ll) / (2 * rows)
-        factor = _factor(_normal(H, G, p))
-
-        def towards(cu, cl):
-            """The step that clears the residuals and brings s * lam to the values that leave cu and
-            cl.
-            """
-            dx = -_substitute(
-                factor, dual + G.T @ ((p.lu * up - cu) / p.su - (p.ll * low - cl) / p.sl)
-            )
-            dg = G @ dx
-            dsu, dsl = -up - dg, dg - low
-            return Point(dx, dsu, dsl, -(cu + p.lu * dsu) / p.su, -(cl + p.ll * dsl) / p.sl)
-
-        guess = towards(p.su * p.lu, p.sl * p.ll)
-        reach = _reach(p, guess, 1.0)
-        after = (
-            (p.su + reach * guess.su) @ (p.lu + reach * guess.lu)
-            + (p.sl + reach * guess.sl) @ (p.ll + reach * guess.ll)
-        ) / (2 * rows)
-        near = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll)) < NEAR * MU_MIN
-        centre = jnp.where(near, MU_MIN, jnp.maximum((after / mu) ** 3 * mu, MU_MIN))
-        ahead = jnp.where(near, 0.0, 1.0)
-        step = towards(
-            p.su * p.lu + ahead * guess.su * guess.lu - centre,
-            p.sl * p.ll + ahead * guess.sl * guess.ll - centre,
-        )
-        reach = _reach(p, step, BACK)
-        new = jax.tree.map(lambda a, b: a + reach * b, p, step)
-        # where no point is feasible the multipliers grow until they are no numbers: the last that
-        # were are kept
+        new = _iterate(p, *data)
+        # where no point is feasible the multipliers grow until they overflow: the last finite ones
+        # are kept
         good = (
             jnp.sum(jnp.abs(new.x))
             + jnp.sum(new.lu)
@@ -235,26 +222,50 @@ def interior_point(H, f, G, l, u, iterations=MOST):
     return jax.lax.while_loop(under_way, advance, (jnp.int32(0), start))[1]
 
 
+def _residuals(p, H, f, G, l, u):
+    """Residuals at an iterate: of the gradient (n,), and of the upper and lower sides (rows,)."""
+    g = G @ p.x
+    return H @ p.x + f + G.T @ (p.lu - p.ll), p.su + g - u, p.sl - g + l
+
+
+def _iterate(p, H, f, G, l, u):
+    """The next iterate: predictor, then corrector with the centring of Mehrotra."""
+    dual, up, low = _residuals(p, H, f, G, l, u)
+    rows = G.shape[0]
+    mu = (p.su @ p.lu + p.sl @ p.ll) / (2 * rows)
+    factored = factor(_normal(H, G, p))
+
+    def towards(cu, cl):
+        """The step that clears the residuals and brings s * lam to the values that leave cu and
+        cl.
+        """
+        dx = -substitute(
+            factored, dual + G.T @ ((p.lu * up - cu) / p.su - (p.ll * low - cl) / p.sl)
+        )
+        dg = G @ dx
+        dsu, dsl = -up - dg, dg - low
+        return Point(dx, dsu, dsl, -(cu + p.lu * dsu) / p.su, -(cl + p.ll * dsl) / p.sl)
+
+    guess = towards(p.su * p.lu, p.sl * p.ll)
+    reach = _reach(p, guess, 1.0)
+    after = (
+        (p.su + reach * guess.su) @ (p.lu + reach * guess.lu)
+        + (p.sl + reach * guess.sl) @ (p.ll + reach * guess.ll)
+    ) / (2 * rows)
+    near = jnp.maximum(jnp.max(p.su * p.lu), jnp.max(p.sl * p.ll)) < NEAR * MU_MIN
+    centre = jnp.where(near, MU_MIN, jnp.maximum((after / mu) ** 3 * mu, MU_MIN))
+    ahead = jnp.where(near, 0.0, 1.0)
+    step = towards(
+        p.su * p.lu + ahead * guess.su * guess.lu - centre,
+        p.sl * p.ll + ahead * guess.sl * guess.ll - centre,
+    )
+    reach = _reach(p, step, BACK)
+    return jax.tree.map(lambda a, b: a + reach * b, p, step)
+
+
 def _normal(H, G, p):
     """H + G' diag(lu/su + ll/sl) G."""
-    weight = p.lu / p.su + p.ll / p.sl
-    return H + (_weighted(G, weight) if H.shape[0] > UNROLLED else (G.T * weight) @ G)
-
-
-@jax.jit
-def _weighted(G, weight):
-    """Return G' diag(weight) G (n, n) for G (rows, n), row by row.
-
-    Inside a loop that is one compiled function XLA writes the product of a vector and a matrix for
-    the processor's vector unit, and that of two matrices as three plain loops.
-    """
-    product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
-
-    def row(j, product):
-        new = (_entry(G, j, axis=1) * weight) @ G
-        return jax.lax.dynamic_update_index_in_dim(product, new, j, 0)
-
-    return jax.lax.fori_loop(0, G.shape[1], row, product)
+    return normal_matrix(H, G, p.lu / p.su + p.ll / p.sl)
 
 
 def _reach(p, step, back):
@@ -266,85 +277,3 @@ def _reach(p, step, back):
         for v, d in zip(p[1:], step[1:])
     ]
     return jnp.minimum(1.0, jnp.min(jnp.stack(shares)))
-
-
-def _factor(A):
-    """Return a factor of A (n, n) symmetric positive definite, for `_substitute`.
-
-    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by
-        column.
-    Above: `_cholesky`. No LAPACK in either. Its call takes longer than the work on so small a
-    matrix, and in jaxlib 0.10 a batched call divides its work among the threads on which it runs
-    itself: as many such calls at once as there are threads wait for each other for ever.
-    """
-    if A.shape[0] > UNROLLED:
-        return _cholesky(A)
-    columns = []
-    for j in range(A.shape[0]):
-        columns.append((A[:, j] / A[j, j], A[j, j]))
-        A = A - jnp.outer(columns[-1][0], A[j])
-    return columns
-
-
-def _substitute(factor, b):
-    """Return A^-1 b for the `_factor` of A; b: (n,)."""
-    if not isinstance(factor, list):
-        return _cholesky_solve(factor, b)
-    index = np.arange(len(factor))
-    for j, (column, _) in enumerate(factor):
-        b = b - jnp.where(index > j, column, 0.0) * b[j]
-    b = b / jnp.stack([pivot for _, pivot in factor])
-    for j, (column, _) in reversed(list(enumerate(factor))):
-        b = jnp.where(index == j, b - jnp.sum(jnp.where(index > j, column * b, 0.0)), b)
-    return b
-
-
-@jax.jit
-def _cholesky(A):
-    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is
-    not).
-
-    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts
-    of fixed shape, so that little of a product is spent on entries that are zero. `codegen` writes
-    this function and `_cholesky_solve` as loops of its own: it knows them by their names.
-    """
-    n = A.shape[0]
-    ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
-    U = jnp.zeros((0, n), A.dtype)
-    for first, end in itertools.pairwise(ends):
-        index, left = np.arange(n - first), A[first:, first:]
-
-        def row(j, rows, first=first, index=index, left=left):
-            column = _entry(rows, j, axis=1)
-            new = _entry(left, j) - column @ rows
-            new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(_entry(new, j)))
-            return jax.lax.dynamic_update_index_in_dim(rows, new, first + j, 0)
-
-        rows = jnp.concatenate([U[:, first:], jnp.zeros((end - first, n - first), A.dtype)])
-        rows = jax.lax.fori_loop(0, end - first, row, rows)
-        U = jnp.concatenate([U, jnp.pad(rows[first:], ((0, 0), (first, 0)))])
-    return U
-
-
-@jax.jit
-def _cholesky_solve(U, b):
-    """Return x (n,) of U'U x = b; U (n, n) as `_cholesky` returns it; b: (n,)."""
-    n = b.shape[0]
-    index = np.arange(n)
-
-    def forward(j, b):
-        row = _entry(U, j)
-        y = _entry(b, j) / _entry(row, j)
-        return jnp.where(index < j, b, jnp.where(index == j, y, b - row * y))
-
-    def backward(k, x):
-        j = n - 1 - k
-        row = _entry(U, j)
-        y = (_entry(x, j) - jnp.sum(jnp.where(index > j, row * x, 0.0))) / _entry(row, j)
-        return jax.lax.dynamic_update_index_in_dim(x, y, j, 0)
-
-    return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, b))
-
-
-def _entry(array, j, axis=0):
-    return jax.lax.dynamic_index_in_dim(array, j, axis, keepdims=False)

@@ -1,4 +1,7 @@
-"""What can be said of a rig before it is run: steady states, linear models."""
+"""Steady states of a rig.
+
+Imports core; may be imported by every folder above.
+"""
 
 from typing import Any
 
@@ -32,20 +35,37 @@ def _balance(plant, xp=jnp):
 
 
 def steady_flows(plant, y):
-    """Solve the balance of every tank for steady outputs y; linear in the efflux speeds, so no
-    iteration.
+    """Return efflux speeds and inputs of the steady state with outputs y, differentiably.
 
-    plant: TankNetwork without pipes, with as many pumps as outputs; y: (outputs,) levels [cm].
-    Returns (speeds (n) [cm/s], voltages (m) [V]), which may be negative: then no steady state
-    exists. Differentiable in the plant's leaves and in y.
+    The balance of every tank is linear in the efflux speeds, so there is no iteration.
+
+    Parameters
+    ----------
+    plant : TankNetwork without pipes, with as many pumps as outputs
+    y : (outputs,) levels [cm]
+
+    Returns
+    -------
+    (speeds (n,) [cm/s], inputs (m,) [V]); negative where no steady state exists
+
+    Raises
+    ------
+    InputError for another plant.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> speeds, inputs = steady_flows(state_coupled_four_tank(15.0), (8.0, 8.0))
+    >>> [round(float(u), 3) for u in inputs]
+    [2.949, 2.949]
     """
     return _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * jnp.sqrt(jnp.asarray(y)))
 
 
 def _from_known_speeds(plant, known, xp=jnp):
-    """`steady_flows` for the efflux speeds (outputs) [cm/s] of the controlled tanks, in which it is
-    linear; xp: jax.numpy, or numpy where nothing is to be differentiated, which spares thirty
-    little compilations.
+    """`steady_flows` for the efflux speeds (outputs,) [cm/s] of the controlled tanks, in which it
+    is linear; xp: jax.numpy, or numpy where nothing is to be differentiated, which spares thirty
+    small compilations.
     """
     if plant.pipes:
         raise InputError(
@@ -68,13 +88,28 @@ def _from_known_speeds(plant, known, xp=jnp):
 
 
 def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """The steady state of every sample of a reference: what a law of state feedback prepares before
-    the loop.
+    """Return the steady state of every sample of a reference, as state feedback prepares it.
 
-    plant: as in `steady_flows`; r: tuple of arrays (samples,), one per output [cm]. Returns
-    (levels, inputs): tuples of arrays (samples,) [cm], [V]. Each is linear in the roots of r, so
-    the balance is solved once per output and not per sample. No check: where no steady state
-    exists, an input or the flow behind a level is negative.
+    Speeds and inputs are linear in the roots of r, so the balance is solved once per output and not
+    per sample. No check: where no steady state exists, an input or the flow behind a level is
+    negative.
+
+    Parameters
+    ----------
+    plant : as in `steady_flows`
+    r : tuple of arrays (samples,), one per output [cm]
+
+    Returns
+    -------
+    (levels [cm], inputs [V]): tuples of arrays (samples,)
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> r = jnp.array([8.0, 10.0])
+    >>> x, u = steady_along(state_coupled_four_tank(15.0), (r, r))
+    >>> [round(float(v), 3) for v in u[0]]
+    [2.949, 3.297]
     """
     roots = [smooth_sqrt(v, plant.knee) for v in r]
     parts = [
@@ -86,8 +121,27 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
 
 
 def steady_levels(plant, u):
-    """Levels (n) [cm] at which a network without pipes stands still while its pumps run at u (m) >=
-    0 [V]. Differentiable.
+    """Return the steady levels of a network without pipes at given inputs, differentiably.
+
+    Parameters
+    ----------
+    plant : TankNetwork without pipes
+    u : (m,) inputs >= 0 [V]
+
+    Returns
+    -------
+    (n,) levels [cm]
+
+    Raises
+    ------
+    InputError for a network with pipes.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import network
+    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[30.0])
+    >>> round(float(steady_levels(tank, (3.0,))[0]), 3)
+    3.262
     """
     if plant.pipes:
         raise InputError("steady_levels is for networks whose orifices discharge freely")
@@ -97,11 +151,27 @@ def steady_levels(plant, u):
 
 
 def equilibrium(plant, y):
-    """Steady levels and voltages for outputs y: x' = 0 with h_outputs = y (gouta2015 notes S2.3).
+    """Return levels and inputs of the steady state with outputs y (gouta2015 notes S2.3).
 
-    plant: TankNetwork; y: (outputs,) levels [cm]. Returns (levels (n) [cm], voltages (m) [V]) as
-    host arrays. Raises EquilibriumError, naming the tank or the pump, where a steady state would
-    need a negative flow.
+    Parameters
+    ----------
+    plant : TankNetwork
+    y : (outputs,) levels [cm]
+
+    Returns
+    -------
+    (levels (n,) [cm], inputs (m,) [V]) as host arrays: x' = 0 with h_outputs = y
+
+    Raises
+    ------
+    EquilibriumError, naming the tank or the pump, where a steady state needs a negative flow.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> x, u = equilibrium(state_coupled_four_tank(15.0), (8.0, 8.0))
+    >>> u.round(3).tolist()
+    [2.949, 2.949]
     """
     y = np.asarray(y, dtype=float)
     length, drive = plant.units
@@ -115,26 +185,7 @@ def equilibrium(plant, y):
     if plant.pipes:
         x, u = _balanced(plant, y, f"outputs ({at}) {length}")
     else:
-        with np.errstate(all="ignore"):  # what overflows is told below
-            try:
-                speeds, u = _from_known_speeds(
-                    plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np
-                )
-            except np.linalg.LinAlgError:
-                speeds = u = np.array([np.nan])
-            x = np.maximum(speeds, 0.0) ** 2 / (2.0 * float(plant.gravity))
-        if not all(np.all(np.isfinite(v)) for v in (speeds, u, x)):
-            raise EquilibriumError(
-                f"outputs ({at}) {length} have no unique steady state: the pumps cannot move the"
-                " outputs independently"
-            )
-        tolerance = 1e-9 * max(1.0, float(np.max(np.abs(speeds))))
-        for i, v in enumerate(speeds):
-            if v < -tolerance:
-                raise EquilibriumError(
-                    f"outputs ({at}) {length} have no steady state: tank {i + 1} would have to pour"
-                    f" {-v:.3g} {length}/s backwards (below empty)"
-                )
+        x, u = _free_discharge(plant, y, f"outputs ({at}) {length}")
     for j, volts in enumerate(u):
         if volts < -1e-9 * max(1.0, float(np.max(np.abs(u)))):
             raise EquilibriumError(
@@ -142,6 +193,30 @@ def equilibrium(plant, y):
                 f" {volts:.3g} {drive}"
             )
     return x, np.maximum(u, 0.0)
+
+
+def _free_discharge(plant, y, words):
+    """(levels, inputs) of a network without pipes in its steady state; inputs may be negative."""
+    with np.errstate(all="ignore"):  # an overflow is reported below
+        try:
+            speeds, u = _from_known_speeds(
+                plant, np.sqrt(2.0 * float(plant.gravity)) * np.sqrt(y), np
+            )
+        except np.linalg.LinAlgError:
+            speeds = u = np.array([np.nan])
+        x = np.maximum(speeds, 0.0) ** 2 / (2.0 * float(plant.gravity))
+    if not all(np.all(np.isfinite(v)) for v in (speeds, u, x)):
+        raise EquilibriumError(
+            f"{words} have no unique steady state: the pumps cannot move the outputs independently"
+        )
+    tolerance = 1e-9 * max(1.0, float(np.max(np.abs(speeds))))
+    for i, v in enumerate(speeds):
+        if v < -tolerance:
+            raise EquilibriumError(
+                f"{words} have no steady state: the outflow of tank {i + 1} would be"
+                f" {-v:.3g} {plant.units[0]}/s backwards (below empty)"
+            )
+    return x, u
 
 
 @jax.jit
@@ -185,8 +260,7 @@ def _balanced(plant, y, words):
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
     try:
-        # an area of 1e-300, say, overflows on the way: the answer below is all that need be said of
-        # it
+        # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
             found = scipy.optimize.least_squares(
                 residual,
@@ -200,82 +274,11 @@ def _balanced(plant, y, words):
             )
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
-    rough = (
+    speed = (
         float(np.max(np.abs(plant.drain)))
         / float(np.min(plant.area))
         * np.sqrt(2.0 * float(plant.gravity) * scale)
     )
-    if not np.max(np.abs(found.fun)) < 1e-9 * max(rough, 1e-12):
+    if not np.max(np.abs(found.fun)) < 1e-9 * max(speed, 1e-12):
         raise EquilibriumError(f"{words} have no steady state")
     return split(found.x)
-
-
-def linearise(plant, x, u):
-    """(A (n, n), B (n, m), C (p, n)) of the rig at levels x (n) and inputs u (m): delta x' = A
-    delta x + B delta u, y = C delta x.
-
-    Exact derivatives of `plant.derivative`; differentiable in everything. A pipe between equal
-    levels has slope sqrt(2 g / knee).
-    """
-    x, u = jnp.asarray(x, dtype=float), jnp.asarray(u, dtype=float)
-    A, B = jax.jacfwd(
-        lambda x, u: jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None)), argnums=(0, 1)
-    )(x, u)
-    return A, B, jnp.eye(plant.tanks)[np.array(plant.outputs)]
-
-
-def steady_gain(A, B, C):
-    """G(0) = -C A^-1 B (p, m) [cm/V], of a linear model without a pole at 0."""
-    return -C @ jnp.linalg.solve(A, B)
-
-
-def relative_gain_array(A, B, C):
-    """Bristol's relative gains of the steady gain, G(0) o (G(0)^-1)' (m, m) [-], of a model with as
-    many outputs as inputs.
-
-    Entry (i, j): gain from input j to output i with the other loops open, over that with the other
-    outputs held. A negative one forbids the pairing. For the quadruple tank the first is gamma1
-    gamma2 / (gamma1 + gamma2 - 1) (Johansson 2000).
-    """
-    G = steady_gain(A, B, C)
-    return G * jnp.linalg.inv(G).T
-
-
-def transmission_zeros(A, B, C):
-    """Finite transmission zeros [1/s] of a square linear model, by decreasing real part: host
-    array, real where all are real.
-
-    The finite generalised eigenvalues of ([[A, B], [C, 0]], diag(I, 0)), as many outputs as inputs.
-    A zero in the right half plane limits how fast the outputs can be held, whatever the law.
-    """
-    A, B, C = (np.asarray(a, dtype=float) for a in (A, B, C))
-    n, m = B.shape
-    if C.shape[0] != m:
-        raise InputError(
-            f"transmission_zeros needs as many outputs as inputs: this model has {C.shape[0]}"
-            f" and {m}"
-        )
-    pencil = np.block([[A, B], [C, np.zeros((m, m))]])
-    mass = np.diag([1.0] * n + [0.0] * m)
-    alpha, beta = scipy.linalg.eig(pencil, mass, right=False, homogeneous_eigvals=True)
-    finite = np.abs(beta) > 1e-10 * np.abs(alpha)
-    zeros = alpha[finite] / beta[finite]
-    zeros = zeros[np.argsort(-zeros.real)]
-    return (
-        zeros.real
-        if np.all(np.abs(zeros.imag) < 1e-9 * np.abs(zeros).max(initial=1e-300))
-        else zeros
-    )
-
-
-def zero_direction(A, B, C, zero):
-    """Output direction of a transmission zero [1/s]: the unit vector y (p) of y^H G(zero) = 0, its
-    largest entry made positive.
-
-    That combination of the outputs shows the zero; outputs across it need not.
-    """
-    A, B, C = (np.asarray(a) for a in (A, B, C))
-    G = C @ np.linalg.solve(zero * np.eye(len(A)) - A, B)
-    y = np.linalg.svd(G)[0][:, -1]
-    largest = y[np.argmax(np.abs(y))]
-    return y * np.conj(largest) / np.abs(largest)

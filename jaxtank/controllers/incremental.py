@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.analysis import qp
+from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import zero_order_hold
-from jaxtank.analysis.steady_state import linearise
 from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip

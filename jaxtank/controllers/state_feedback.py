@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import linearise, steady_along, steady_flows
+from jaxtank.analysis.steady_state import steady_along, steady_flows
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError

@@ -1,4 +1,7 @@
-"""Sensors and actuators: what stands between the computer and the rig."""
+"""Sensors and actuators: the roles, and the concrete ones of the papers' rigs.
+
+Imports core; may be imported by every folder above.
+"""
 
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.base import Actuator, Sensor

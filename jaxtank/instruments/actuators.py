@@ -1,5 +1,6 @@
-"""What the pumps make of a command: saturation or allocation, dead zone, lag, transport delay, in
-this order.
+"""PumpBank: saturation or allocation, dead zone, lag and transport delay of pumps, in this order.
+
+Imports core and the role Actuator; may be imported by every folder above.
 """
 
 from collections.abc import Sequence
@@ -40,8 +41,8 @@ class PumpBank(Actuator):
     """m pumps: what reaches the plant for a command u. `PumpBank(low=[0.0], high=[12.0])` suffices.
 
     1. Saturation (gouta2015 eq. 9): "clip" holds each voltage in [low, high]; "boxqp" takes the
-       voltages in the box that are best by the law's own cost (see `allocate`), which removes the
-       wrong-way latch-up of clipping a decoupling law.
+       voltages in the box that are best by the controller's own cost (see `allocate`), which
+       removes the wrong-way latch-up of clipping a decoupling controller.
     2. Dead zone, if given: no flow at or below `dead_zone` (gouta2015, Remark 4: 3 V). "offset":
        the flow grows from zero at the dead zone, as that of u - dead_zone (gouta2022 notes S2.3).
        "hysteresis": a pump that turns stops below `stop`, and starts again above `dead_zone`.
@@ -54,6 +55,13 @@ class PumpBank(Actuator):
 
     The slope of a dead zone is that of the branch taken: a gradient does not see the jump at its
     edge, and through "pulse" it is that of the mean flow, 1.
+
+    Examples
+    --------
+    >>> pumps = PumpBank(low=[0.0], high=[12.0], dead_zone=[3.0])
+    >>> start = pumps.init(Clock(dt=1.0, duration=10.0))
+    >>> [float(pumps.step(start, pumps.limit((v,)), 1.0)[0][0]) for v in (2.0, 5.0, 20.0)]
+    [0.0, 5.0, 12.0]
     """
 
     low: np.ndarray = leaf("V", "(m,) lower limit of each pump")
@@ -204,13 +212,32 @@ def _delayed(state, u):
 
 
 def allocate(command, metric, low, high):
-    """The voltages in the box that are best by the law's cost: argmin over w in [low, high]^2 of (w
-    - u)' G (w - u).
+    """Return the inputs in the box that are best by a controller's cost.
 
-    command: u (2) [V]; metric: (g11, g12, g22), G positive definite; low, high: (2,) [V]. For the
-    predictive law of gouta2015 G = b'b makes this the exact constrained minimiser of its cost (eq.
-    21; gouta2015 notes S4.5). Solved by trying the four faces of the box and keeping the cheapest;
-    a command inside the box is kept. Raises ValueError for other than two pumps.
+        argmin over w in [low, high]^2 of (w - u)' G (w - u)
+
+    For the predictive controller of gouta2015 G = b'b makes this the exact constrained minimiser of
+    its cost (eq. 21; gouta2015 notes S4.5). The four faces of the box are tried and the cheapest is
+    kept; a command inside the box is unchanged.
+
+    Parameters
+    ----------
+    command : u (2,) [V]
+    metric : (g11, g12, g22), G positive definite
+    low, high : (2,) limits [V]
+
+    Returns
+    -------
+    (2,) inputs [V]
+
+    Raises
+    ------
+    ValueError for other than two pumps.
+
+    Examples
+    --------
+    >>> [float(v) for v in allocate((14.0, 5.0), (2.0, 1.0, 2.0), (0.0, 0.0), (12.0, 12.0))]
+    [12.0, 6.0]
     """
     if len(command) != 2:
         raise ValueError(f"allocation by box QP is for two pumps, not {len(command)}")

@@ -1,4 +1,7 @@
-"""What the computer sees of the levels."""
+"""LevelSensor: readings of levels with noise and an ADC.
+
+Imports core and the role Sensor; may be imported by every folder above.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -27,6 +30,12 @@ class LevelSensor(Sensor):
         rounded to full_scale / 2^bits
 
     The ADC's slope is that of the line through its staircase (numerics.quantise).
+
+    Examples
+    --------
+    >>> sensor = LevelSensor(noise=[0.0], gain=[3.0], full_scale=3.3, bits=10)
+    >>> round(float(sensor.read((5.0,), None)[0]), 4)
+    4.9983
     """
 
     gain: np.ndarray = leaf(
@@ -49,8 +58,16 @@ class LevelSensor(Sensor):
         return self.read(x, xi), state
 
     def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
-        """Measured levels (n) [cm] of levels x (n) [cm] with the deviates xi (n) of this sample, or
-        None.
+        """Return the readings of levels.
+
+        Parameters
+        ----------
+        x : (n,) levels [cm]
+        xi : (n,) standard normal deviates of the sample [-], or None
+
+        Returns
+        -------
+        (n,) readings [cm]
         """
         y = x if self.offset is None else tuple(h + self.offset[i] for i, h in enumerate(x))
         y = y if xi is None else tuple(y[i] + self.noise[i] * xi[i] for i in range(len(x)))

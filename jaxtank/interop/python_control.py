@@ -5,7 +5,8 @@ Imports analysis and core; imported by users.
 
 import numpy as np
 
-from jaxtank.analysis.steady_state import equilibrium, linearise
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.loop.trajectory import columns
 

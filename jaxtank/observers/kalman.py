@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
-from jaxtank.analysis.steady_state import linearise
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static

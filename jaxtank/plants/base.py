@@ -1,4 +1,7 @@
-"""What every plant is to the loop, to observers and to the laws that carry one as their model."""
+"""The role Plant: what a closed loop, observers and model-based controllers ask of a plant.
+
+Imports core only; may be imported by every folder above.
+"""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -17,6 +20,20 @@ class Plant(abc.ABC):
 
     A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs
     no more than its vector field (notebook 10).
+
+    Examples
+    --------
+    >>> from jaxtank import component, leaf
+    >>> @component
+    ... class Integrator(Plant):
+    ...     outputs = (0,)
+    ...     tanks = pumps = 1
+    ...     rim: float = leaf("cm", "(n,) height")
+    ...
+    ...     def derivative(self, t, x, u, d):
+    ...         return (0.1 * u[0],)
+    >>> Integrator(rim=[10.0]).derivative(0.0, (1.0,), (2.0,), None)
+    (0.2,)
     """
 
     outputs: tuple[int, ...]
@@ -29,7 +46,7 @@ class Plant(abc.ABC):
     """(length, pump input): the units that this plant counts in."""
 
     overflow: bool = False
-    """True where a level stops at its rim and what would rise past it is lost."""
+    """True where a level stops at its rim and the rest overflows."""
 
     bottom: bool = False
     """True where a level stops at zero whatever is drawn from it."""
@@ -46,8 +63,18 @@ class Plant(abc.ABC):
 
     @abc.abstractmethod
     def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
-        """x' at time t [s] for levels x (n) [cm], inputs u (m) [V] and inflows d (n) [cm^3/s] or
-        None; returns (n) [cm/s].
+        """Return the rates of the levels.
+
+        Parameters
+        ----------
+        t : time [s]
+        x : (n,) levels [cm]
+        u : (m,) inputs [V]
+        d : (n,) disturbing inflows [cm^3/s], or None
+
+        Returns
+        -------
+        (n,) x' [cm/s]
         """
 
     def limited(self, step: ArrayLike) -> Callable:
@@ -56,23 +83,23 @@ class Plant(abc.ABC):
         """
         return self.derivative
 
-    def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
+    def shortfall(self, x: Sequence) -> tuple:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
         tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
         return (0.0,) * len(x)
 
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
-        """`derivative` of arrays x (n) and u (m), without time and inflows, as an array (n); a
-        plant of many tanks may have one that is compiled in less time.
+        """Return `derivative` of arrays x (n,) and u (m,), without time and inflows, as an array
+        (n,); a plant of many tanks may have one that is compiled in less time.
         """
         return jnp.stack(self.derivative(0.0, tuple(x), tuple(u), None))
 
     def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
-        """(levels held at their rims, volume lost over each rim [cm^3]); unchanged and zeros where
-        rims are not physics.
+        """Return (levels held at their rims, overflow of each tank [cm^3]); unchanged and zeros
+        where rims are not physics.
         """
         return x, (0.0,) * len(x)
 
     def output(self, x: Sequence[Any]) -> tuple[Any, ...]:
-        """The levels that are controlled: those of the tanks in `outputs`, in that order."""
+        """Return the levels that are controlled: those of the tanks in `outputs`, in that order."""
         return tuple(x[i] for i in self.outputs)

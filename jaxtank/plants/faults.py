@@ -1,4 +1,7 @@
-"""What breaks while a rig runs: parameters of the plant that change for a while."""
+"""Faults: parameters of the plant that change for a while.
+
+Imports core and the role Plant; may be imported by every folder above.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,10 +19,17 @@ from jaxtank.plants.base import Plant
 @component
 class Faults:
     """Entries of the plant's leaves that are `factor` times themselves plus `extra` within a window
-    of time; the law is not told.
+    of time, unknown to the controller.
 
     A pump at 60 %: ("pump_gain[0]", 300, 400) with factor 0.6 (gouta2022). A leak: ("drain[0]",
-    900, 1050) with extra = its area (calofir).
+    900, 1050) with extra = its area (calofir). Built by `faults`.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> weak = faults(state_coupled_four_tank(15.0), [("pump_gain[0]", 1.0, 2.0, 0.6, 0.0)])
+    >>> weak.sample(Clock(dt=1.0, duration=3.0))[0].tolist()
+    [0.0, 1.0, 0.0, 0.0]
     """
 
     factor: np.ndarray = leaf(
@@ -32,7 +42,7 @@ class Faults:
 
     @pointwise
     def sample(self, clock: Clock) -> tuple:
-        """Tuple of arrays (samples,), one per fault: 1 from its start until before its end, else 0."""
+        """Return an array (samples,) per fault: 1 from its start until before its end, else 0."""
         t = sample_times(clock)
         half = 1e-7 * clock.dt
         return tuple(
@@ -41,7 +51,7 @@ class Faults:
         )
 
     def apply(self, plant: Plant, active: Sequence) -> Plant:
-        """The plant of a sample; active: one number per fault, 1 while it lasts."""
+        """Return the plant of a sample; active: one number per fault, 1 while it lasts."""
         changed = {}
         for k, (name, _, _) in enumerate(self.windows):
             field, (index,) = split_index(name)
@@ -58,11 +68,23 @@ class Faults:
 
 
 def faults(plant, entries):
-    """A `Faults` from a list of (entry of `plant`, start [s], end [s], factor [-], extra [unit of
-    the entry]).
+    """Return a `Faults` built from a list.
 
-    Raises InputError for an entry that the plant does not have, and for a window that ends before
-    it starts.
+    Parameters
+    ----------
+    plant : Plant
+    entries : (entry of the plant, start [s], end [s], factor [-], extra [unit of the entry]) each
+
+    Raises
+    ------
+    InputError for an entry that the plant does not have, and for a window that ends before it
+    starts.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> faults(state_coupled_four_tank(15.0), [("drain[0]", 9.0, 10.0, 1.0, 0.2)]).extra
+    array([0.2])
     """
     for name, start, end, _, _ in entries:
         if np.ndim(get_value(plant, name)) != 0 or not split_index(name)[1]:

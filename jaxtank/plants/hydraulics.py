@@ -1,5 +1,6 @@
-"""One physical law each. Scalars or arrays; lengths in the rig's unit (cm unless its paper is in
-m).
+"""Physical relations and constants of tanks: scalars or arrays, lengths in the rig's unit.
+
+Imports core only; may be imported by every folder above.
 """
 
 import math
@@ -25,8 +26,15 @@ PER_CENTIMETRE = {
 
 
 def in_unit(centimetres, length):
-    """A number of `centimetres` [cm], or of one of them per s^2, in the unit `length` of a rig; as
-    it is where that is no length: levels in the volts of a sensor have no other scale.
+    """Return a length [cm], or acceleration [cm/s^2], in the unit `length` of a rig.
+
+    Unchanged where `length` is no unit of length: levels in the volts of a sensor have no other
+    scale.
+
+    Examples
+    --------
+    >>> in_unit(981.0, "m"), in_unit(0.01, "V")
+    (9.81, 0.01)
     """
     return centimetres * PER_CENTIMETRE.get(length, 1.0)
 
@@ -34,7 +42,14 @@ def in_unit(centimetres, length):
 def default_gravity(length):
     """Return the acceleration g [length/s^2] of a rig whose unit of length is `length`: 981 cm/s^2.
 
-    Raises InputError where `length` is no unit of length, as the volts of a sensor.
+    Raises
+    ------
+    InputError where `length` is no unit of length, as the volts of a sensor.
+
+    Examples
+    --------
+    >>> default_gravity("m")
+    9.81
     """
     if length not in PER_CENTIMETRE:
         raise InputError(
@@ -45,19 +60,43 @@ def default_gravity(length):
 
 
 def default_threshold(length):
-    """Level below which flow turns laminar unless a rig says otherwise: 0.01 cm, in the unit
-    `length` of the rig.
+    """Return the default laminar threshold, 0.01 cm, in the unit `length` of a rig.
+
+    Examples
+    --------
+    >>> default_threshold("mm")
+    0.1
     """
     return in_unit(LAMINAR_THRESHOLD, length)
 
 
 def disc(diameter):
-    """Area of a disc [cm^2] of `diameter` [cm]: s = pi d^2 / 4."""
+    """Return the area of a disc [cm^2] of `diameter` [cm]: s = pi d^2 / 4.
+
+    Examples
+    --------
+    >>> round(disc(2.0), 4)
+    3.1416
+    """
     return math.pi * diameter**2 / 4
 
 
-def efflux(level, gravity, knee):
-    """Torricelli's speed of efflux v = sqrt(2 g h) [cm/s] under `level` h [cm]; C1 through zero
-    (see numerics.smooth_sqrt).
+def efflux(level, gravity, threshold):
+    """Return Torricelli's speed of efflux v = sqrt(2 g h), C1 through zero (`smooth_sqrt`).
+
+    Parameters
+    ----------
+    level : (...) h [cm]
+    gravity : g [cm/s^2]
+    threshold : laminar threshold [cm]
+
+    Returns
+    -------
+    (...) [cm/s]
+
+    Examples
+    --------
+    >>> round(float(efflux(10.0, 981.0, 0.01)), 2)
+    140.07
     """
-    return jnp.sqrt(2.0 * gravity) * smooth_sqrt(level, knee)
+    return jnp.sqrt(2.0 * gravity) * smooth_sqrt(level, threshold)

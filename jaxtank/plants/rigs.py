@@ -1,5 +1,5 @@
-"""The rigs of the papers: functions that build a `TankNetwork`, and the topologies by which laws
-know them.
+"""The rigs of the papers: functions that build a `TankNetwork`, and their topologies, by which
+controllers check their model. Imports core and modules of plants.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,21 @@ COUPLED_PIPES = ((0, 1),)
 
 
 def state_coupled_four_tank(area: float) -> TankNetwork:
-    """The state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1): pumps fill the upper
-    tanks 3 and 4, each of which pours into both lower tanks 1 and 2, whose levels are controlled.
+    """Return the state-coupled four-tank of gouta2015 (Fig. 1, eqs. 1-8, Table 1).
 
-    area: cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2
-    (plant A, "table1"), with which the paper's own gains fail; 15 sqrt(2) read as an area gives
-    plant B, "fast", which reproduces the text (gouta2015 notes S1).
+    Pumps fill the upper tanks 3 and 4, each of which discharges into both lower tanks 1 and 2,
+    whose levels are controlled.
+
+    Parameters
+    ----------
+    area : cross-section of every tank [cm^2]. The printed diameter 15 sqrt(2) cm gives 353.43 cm^2
+        (plant A, "table1"), with which the paper's own gains fail; 15 sqrt(2) read as an area gives
+        plant B, "fast", which reproduces the text (gouta2015 notes S1).
+
+    Examples
+    --------
+    >>> state_coupled_four_tank(15.0).tanks
+    4
     """
     inner, outer = disc(0.38), disc(0.31)  # d31 = d42, d32 = d41 [cm], Table 1
     return network(
@@ -49,11 +58,22 @@ def quadruple_tank(
     rim: ArrayLike,
     gravity: float = 981.0,
 ) -> TankNetwork:
-    """Johansson's quadruple tank: tank 3 pours into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4,
-    pump 2 tanks 2 and 3 (mirakhorli eq. 2).
+    """Return Johansson's quadruple tank (mirakhorli eq. 2).
 
-    area, outlet: (4,) cross-sections A and outlet areas a [cm^2]; pump_gain: (2,) k [cm^3/(s V)];
-    split: (2,) share gamma of each pump that goes to the lower tank [-]; rim: [cm].
+    Tank 3 discharges into 1, tank 4 into 2; pump 1 feeds tanks 1 and 4, pump 2 tanks 2 and 3.
+
+    Parameters
+    ----------
+    area, outlet : (4,) cross-sections A and outlet areas a [cm^2]
+    pump_gain : (2,) k [cm^3/(s V)]
+    split : (2,) share gamma of each pump that goes to the lower tank [-]
+    rim : height of the tanks [cm]
+    gravity : acceleration [cm/s^2]
+
+    Examples
+    --------
+    >>> johansson("minimum")[0].split
+    array([0.7, 0.6])
     """
     a1, a2, a3, a4 = outlet
     return network(
@@ -79,11 +99,24 @@ JOHANSSON = {
 
 
 def johansson(phase):
-    """(rig, operating voltages (2) [V]) of Johansson's laboratory process (IEEE Trans. CST 8(3),
-    2000).
+    """Return Johansson's laboratory process (IEEE Trans. CST 8(3), 2000).
 
-    phase: "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+).
-        Raises InputError for another.
+    Parameters
+    ----------
+    phase : "minimum", where the pumps feed mostly the lower tanks (P-), or "non-minimum" (P+)
+
+    Returns
+    -------
+    (rig, operating voltages (2,) [V])
+
+    Raises
+    ------
+    InputError for another phase.
+
+    Examples
+    --------
+    >>> johansson("non-minimum")[1]
+    (3.15, 3.15)
     """
     if phase not in JOHANSSON:
         raise InputError(f"phase = {phase!r}: must be one of {', '.join(JOHANSSON)}")
@@ -106,11 +139,24 @@ def coupled_tanks(
     feeds: Sequence,
     **more: Any,
 ) -> TankNetwork:
-    """Two tanks joined by a pipe below the surface, each with an outlet to the basin (0: none):
-    gouta2022, calofir, khalid.
+    """Return two tanks joined by a pipe below the surface: gouta2022, calofir, khalid.
 
-    area, drain, rim: (2,) or a number; pipe: effective area; feeds: the tank that each pump fills;
-        more: as in `network`.
+    Parameters
+    ----------
+    area, drain, rim : (2,) or a number: cross-section, outlet to the basin (0: none) [cm^2], height
+        [cm]
+    pipe : effective area of the pipe [cm^2]
+    pump_gain : (m,) or a number [cm^3/(s V)]
+    outputs : tanks whose levels are controlled, counted from 0
+    feeds : the tank that each pump fills
+    more : as in `network`
+
+    Examples
+    --------
+    >>> coupled_tanks(
+    ...     area=15.0, drain=0.2, pipe=0.1, pump_gain=5.0, rim=30.0, outputs=(1,), feeds=(0,)
+    ... ).pipes
+    ((0, 1),)
     """
     return network(
         area=area,
@@ -126,12 +172,25 @@ def coupled_tanks(
 
 
 def check_topology(model, like, **wanted):
-    """Raise InputError unless the fields `wanted` of a law's model are those of the rig it inverts;
-    `like`: that rig in words.
+    """Check that the model of a controller is the rig that it inverts.
+
+    Parameters
+    ----------
+    model : Plant
+    like : that rig in words
+    wanted : its fields, such as links and feeds
+
+    Raises
+    ------
+    InputError, naming the field that differs.
+
+    Examples
+    --------
+    >>> check_topology(state_coupled_four_tank(15.0), "a four-tank", feeds=STATE_COUPLED_FEEDS)
     """
     for name, value in wanted.items():
         if getattr(model, name, None) != value:
             raise InputError(
-                f"controller.model must be {like}: this law inverts it, and its {name} are not"
-                f" {value}"
+                f"controller.model must be {like}: this controller inverts it, and its {name} are"
+                f" not {value}"
             )

@@ -1,6 +1,6 @@
 """Integration of a plant over a sample: the only copy, for the loop, observers and experiments.
 
-May import core, xla and `plants.base`.
+Imports core and xla only.
 """
 
 from collections.abc import Sequence
@@ -10,23 +10,22 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import added
-from jaxtank.plants.base import Plant
 from jaxtank.xla.barrier import materialised
 
 
 class Advanced(NamedTuple):
-    """Levels after a sample, and what was lost on the way; (n) each."""
+    """Levels after a sample, and the volumes that overflowed or were missing; (n,) each."""
 
     x: Sequence[Any]  # levels [cm]
     excess: tuple[
         Any, ...
     ]  # what rounding has added to each level too much [cm]; () where not compensated
-    spilled: tuple[Any, ...]  # volume lost over each rim [cm^3]
+    spilled: tuple[Any, ...]  # overflow over each rim [cm^3]
     shortfall: tuple[Any, ...]  # volume that a negative inflow could not take [cm^3]
 
 
 def advance(
-    plant: Plant,
+    plant: Any,
     integrator: str,
     t: Any,
     x: Sequence[Any],
@@ -78,8 +77,8 @@ def advance(
         else:
             x = integrate(plant, integrator, t + j * h, x, u, d, h)
         shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
-        x, lost = plant.spill(x)
-        return Advanced(x, excess, tuple(a + b for a, b in zip(spilled, lost)), shortfall)
+        x, over = plant.spill(x)
+        return Advanced(x, excess, tuple(a + b for a, b in zip(spilled, over)), shortfall)
 
     if rolled and not (isinstance(substeps, int) and substeps == 1):
         zeros = (jnp.zeros_like(x[0]),) * plant.tanks
@@ -92,7 +91,9 @@ def advance(
 
 
 def integrate(plant, integrator, t, x, u, d, h):
-    """Levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d held."""
+    """Return the levels a step `h` [s] later, by one step of "rk4" or "midpoint" with u and d
+    held.
+    """
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return _along(x, rates, h)
@@ -103,9 +104,7 @@ def integrate(plant, integrator, t, x, u, d, h):
 
 
 def change(plant, integrator, t, x, u, d, h):
-    """What the levels change by in that step, for sums that keep what rounding takes
-    (`jaxtank.core.kahan`).
-    """
+    """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
         return tuple(h * k for k in rates)

@@ -69,6 +69,10 @@ def open_case(name: str) -> Case:
     ----------
     name : "paper/case" as `jaxtank list` prints it, or a path
 
+    Returns
+    -------
+    Case, checked.
+
     Raises
     ------
     InputError for a case that does not exist, and as `load`.
@@ -88,6 +92,10 @@ def load(path: str | Path) -> Case:
     Parameters
     ----------
     path : of a TOML file, UTF-8, of at most 4 MiB
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------
@@ -113,6 +121,10 @@ def loads(text: str, words: str = "rig file") -> Case:
     ----------
     text : TOML
     words : what errors call it
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------
@@ -159,6 +171,10 @@ def from_table(table: Mapping[str, Any]) -> Case:
     Parameters
     ----------
     table : {key or section: value, table, or list of tables}
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------

@@ -35,6 +35,10 @@ def check(case: Case) -> Case:
     ----------
     case : Case
 
+    Returns
+    -------
+    The case itself.
+
     Raises
     ------
     InputError for a loop that cannot be run; EquilibriumError for a plateau without a steady state,
@@ -60,6 +64,10 @@ def unreachable(case: Case) -> str | None:
     Parameters
     ----------
     case : Case
+
+    Returns
+    -------
+    A sentence, or None.
 
     Examples
     --------

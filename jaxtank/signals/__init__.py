@@ -1,7 +1,22 @@
-"""References and disturbances as functions of time, sampled before the time loop starts."""
+"""References and disturbances as functions of time, sampled before the time loop starts.
+
+Imports core; may be imported by every folder above.
+"""
 
 from jaxtank.signals.base import Constant, Signal, Sum, Table
-from jaxtank.signals.inflows import Pours, pours
+from jaxtank.signals.inflows import InflowPulses, Pours, inflow_pulses, pours
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
-__all__ = ["Constant", "Pours", "Ramps", "Signal", "Sine", "Sum", "Table", "pours", "ramps"]
+__all__ = [
+    "Constant",
+    "InflowPulses",
+    "Pours",
+    "Ramps",
+    "Signal",
+    "Sine",
+    "Sum",
+    "Table",
+    "inflow_pulses",
+    "pours",
+    "ramps",
+]

@@ -1,4 +1,7 @@
-"""The interface of a signal, and signals that hold for any purpose: constant, table, sum."""
+"""The role Signal, and signals for any purpose: constant, table, sum.
+
+Imports core; may be imported by every folder above.
+"""
 
 import abc
 import math
@@ -70,7 +73,14 @@ class Signal(abc.ABC):
 
 @component
 class Constant(Signal):
-    """A signal that does not change."""
+    """A signal that does not change.
+
+    Examples
+    --------
+    >>> value, rate, _ = Constant(level=[4.0]).sample(Clock(dt=1.0, duration=2.0))
+    >>> value[0].tolist(), rate[0].tolist()
+    ([4.0, 4.0, 4.0], [0.0, 0.0, 0.0])
+    """
 
     level: np.ndarray = leaf(
         "-",
@@ -91,14 +101,20 @@ class Constant(Signal):
 
 @component
 class Table(Signal):
-    """Recorded samples, one every `period` from t = 0 on: an input or an inflow that was logged.
+    """Recorded samples, one every `period` from t = 0 on: a measured input or inflow.
 
     Between samples the last one is held ("hold"; its rate is 0) or a straight line joins them
-    ("linear"); after the last, the last.
+    ("linear"); after the last sample, it is held.
+
+    Examples
+    --------
+    >>> table = Table(values=[[1.0, 3.0]], period=2.0, between="linear")
+    >>> table.sample(Clock(dt=1.0, duration=3.0))[0][0].tolist()
+    [1.0, 2.0, 3.0, 3.0]
     """
 
     values: np.ndarray = leaf(
-        "-", "(channels, samples) the record, in the unit of what it stands for"
+        "-", "(channels, samples) recorded values, in the unit of what they stand for"
     )
     period: float = static("s", "time between samples", low=0.0, strict=True)
     between: str = static(doc="what is between samples", choices=("hold", "linear"), default="hold")
@@ -109,8 +125,8 @@ class Table(Signal):
 
     def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         last = np.shape(self.values)[1] - 1
-        # which sample, and how far past it, is known to the host: a little forgiveness makes 3 *
-        # 0.1 s sample 3
+        # which sample, and how far past it, is known to the host; the tolerance makes 3 * 0.1 s
+        # sample 3
         at = np.arange(clock.samples) * (clock.dt / self.period)
         index = np.minimum(np.floor(at + 5e-7), last).astype(int)
         after, past = np.minimum(index + 1, last), np.clip(at - index, 0.0, 1.0)
@@ -124,7 +140,14 @@ class Table(Signal):
 
 @component
 class Sum(Signal):
-    """Two signals added, channel by channel."""
+    """Two signals added, channel by channel.
+
+    Examples
+    --------
+    >>> total = Sum(first=Constant(level=[4.0]), second=Constant(level=[1.0]))
+    >>> total.sample(Clock(dt=1.0, duration=1.0))[0][0].tolist()
+    [5.0, 5.0]
+    """
 
     first: Signal
     second: Signal
@@ -147,8 +170,8 @@ class Sum(Signal):
 
     @pointwise
     def windows(self, clock: Clock) -> tuple[Any, ...] | None:
-        """Those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has no step
-        from its start on.
+        """Return those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has
+        no step from its start on.
         """
         t = sample_times(clock)
         sine, windows = cast(Any, self.second), self.first.windows(clock)

@@ -1,4 +1,7 @@
-"""Inflow disturbances: volumes added to a tank for a while."""
+"""Inflow disturbances: volumes added to a tank for a while.
+
+Imports core; may be imported by every folder above.
+"""
 
 from collections.abc import Sequence
 
@@ -13,20 +16,25 @@ from jaxtank.signals.base import Signal
 
 
 @component
-class Pours(Signal):
-    """Volumes poured into tanks at a steady rate: 500 cm^3 over 1.1 s in gouta2022 (sec. 5.2;
-    gouta2022 notes S3.2). An inflow per tank [cm^3/s].
+class InflowPulses(Signal):
+    """Inflow pulses: volumes added to tanks at a constant rate, as an inflow per tank [cm^3/s].
 
-    What a sample is given is the mean over that sample, so that the whole volume arrives whatever
-    the sampling period.
+    500 cm^3 over 1.1 s in gouta2022 (sec. 5.2; gouta2022 notes S3.2). The value of a sample is the
+    mean over that sample, so that the whole volume arrives whatever the sampling period.
+
+    Examples
+    --------
+    >>> pulse = InflowPulses(volume=[50.0], events=((1.0, 2.0, 0),), width=1)
+    >>> pulse.sample(Clock(dt=1.0, duration=4.0))[0][0].tolist()
+    [0.0, 25.0, 25.0, 0.0, 0.0]
     """
 
-    volume: np.ndarray = leaf("cm^3", "(pours,) volume of each pour; negative: taken out")
-    events: tuple = static(doc="((time [s], duration [s], tank), ...) one per pour")
+    volume: np.ndarray = leaf("cm^3", "(pours,) volume of each inflow pulse; negative: taken out")
+    events: tuple = static(doc="((time [s], duration [s], tank), ...) one per inflow pulse")
     width: int = static("-", "number of tanks", low=1, high=100)
     window: float = static(
         "s",
-        "how long after a pour a tank is watched for its recovery",
+        "time after an inflow pulse in which the recovery of its tank is measured",
         low=0.0,
         strict=True,
         default=60.0,
@@ -54,7 +62,7 @@ class Pours(Signal):
 
     @pointwise
     def since(self, clock: Clock) -> jax.Array:
-        """(samples,) time since the last pour began [s]; -1 where there was none within `window`."""
+        """Return (samples,) time since the last pulse began [s]; -1 for none within `window`."""
         t = sample_times(clock)
         since = -jnp.ones_like(t)
         for start in self.onset:
@@ -65,20 +73,36 @@ class Pours(Signal):
         return since
 
 
-def pours(tanks: int, entries: Sequence[tuple[float, float, int, float]]) -> Pours:
-    """A `Pours` for `tanks` tanks from a list of (time [s], duration [s], tank counted from 0,
-    volume [cm^3]). InputError for a bad one.
+def inflow_pulses(tanks: int, entries: Sequence[tuple[float, float, int, float]]) -> InflowPulses:
+    """Return an `InflowPulses` built from a list.
+
+    Parameters
+    ----------
+    tanks : number of tanks
+    entries : (time [s], duration [s], tank counted from 0, volume [cm^3]) of each pulse
+
+    Raises
+    ------
+    InputError for a time before 0, a duration of 0 and a tank that does not exist.
+
+    Examples
+    --------
+    >>> inflow_pulses(2, [(500.0, 1.1, 1, 500.0)]).onset
+    (500.0,)
     """
     for time, duration, tank, _ in entries:
         if not (time >= 0 and duration > 0 and 0 <= tank < tanks):
             raise InputError(
-                f"pour at {time} s over {duration} s into tank {tank}: needs a time at or after 0"
-                f" s, a duration above 0 s and a tank from 0 to {tanks - 1}, counted from 0"
+                f"inflow pulse at {time} s over {duration} s into tank {tank}: needs a time at or"
+                f" after 0 s, a duration above 0 s and a tank from 0 to {tanks - 1}, counted from 0"
             )
-    return Pours(
+    return InflowPulses(
         volume=number([volume for *_, volume in entries]),
         events=tuple(
             (float(time), float(duration), int(tank)) for time, duration, tank, _ in entries
         ),
         width=tanks,
     )
+
+
+Pours, pours = InflowPulses, inflow_pulses  # their former names

@@ -1,8 +1,7 @@
-"""References and disturbances as functions of time, sampled before the time loop starts.
+"""Setpoints as functions of time: ramps and a sine.
 
-A signal answers `sample(clock)` with three tuples (value, rate, second derivative), one array
-(samples,) per channel. The
-samples are inputs of the loop: interpolating inside it would cost more than the plant does.
+Their samples are inputs of the loop: interpolating inside it would cost more than the plant does.
+Imports core; may be imported by every folder above.
 """
 
 import math
@@ -29,7 +28,13 @@ class Ramps(Signal):
     S(x) is x (shape "linear"; rate Delta/D on [t_j, t_j + D), second derivative 0, the impulses at
     the corners left out) or 10 x^3 - 15 x^4 + 6 x^5 ("quintic": two continuous derivatives), held
     at 0 before and 1 after. D = 0 gives steps. A change that begins before the last one of its
-    channel has ended starts from where that one has got to.
+    channel has ended starts from the value reached by then. Built by `ramps`.
+
+    Examples
+    --------
+    >>> steps = ramps([3.0], [(1.0, 0, 8.0)], ramp=2.0)
+    >>> steps.sample(Clock(dt=1.0, duration=4.0))[0][0].tolist()
+    [3.0, 3.0, 5.5, 8.0, 8.0]
     """
 
     initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
@@ -55,7 +60,7 @@ class Ramps(Signal):
         # of each channel: (first sample, function of time)
         pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]
         for j, (start, i) in enumerate(self.changes):
-            # the last target, or how far a change that is not over has come
+            # the last target, or the value reached by a change that has not ended
             level = pieces[i][-1][1](start)[0]
             if pieces[i][-1][0] > _index(start, clock):
                 pieces[i].pop()
@@ -72,10 +77,12 @@ class Ramps(Signal):
 
     @pointwise
     def windows(self, clock: Clock) -> tuple:
-        """Per channel (target, step, time since the change ended, settling band), each (samples,):
-        what overshoot and settling refer to.
+        """Return what overshoot and settling refer to; the step is 0 before the first change.
 
-        Before a channel's first change the step is 0. Times in s, levels in cm.
+        Returns
+        -------
+        Per channel (target [cm], step [cm], time since the change ended [s], settling band [cm]),
+        arrays (samples,) each
         """
         t = sample_times(clock)
         last = [self.initial[i] for i in range(self.channels)]
@@ -91,8 +98,9 @@ class Ramps(Signal):
         return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
 
     def plateaus(self, until: float = math.inf) -> np.ndarray:
-        """(plateaus, channels) the values held between changes, as host numbers: those whose
-        changes end before the next and `until` [s].
+        """Return (plateaus, channels) values held between changes [cm], as host numbers.
+
+        Those whose changes end before the next one and `until` [s].
         """
         values, now = [], np.array(self.initial, dtype=float)
         values.append(now.copy())
@@ -116,6 +124,14 @@ class Sine(Signal):
 
     One channel of several moves, the others stay at 0. Its rate is that of the sine; jumps at the
     two ends have no impulse.
+
+    Examples
+    --------
+    >>> sine = Sine(
+    ...     amplitude=1.0, offset=2.0, period=4.0, zero=0.0, start=0.0, end=9.0, channel=0, width=1
+    ... )
+    >>> [round(float(v), 3) for v in sine.sample(Clock(dt=1.0, duration=3.0))[0][0]]
+    [2.0, 3.0, 2.0, 1.0]
     """
 
     amplitude: np.ndarray = leaf("cm", "amplitude of the sine")
@@ -157,9 +173,24 @@ def ramps(
     shape: str = "linear",
     band: float = 0.05,
 ) -> Ramps:
-    """A `Ramps` from a list of (time [s], channel, target [cm]); band: share of each step.
+    """Return a `Ramps` built from a list.
 
-    Raises InputError for a bad time, channel or shape.
+    Parameters
+    ----------
+    initial : (channels,) values before the first change [cm]
+    changes : (time [s], channel counted from 0, target [cm]) of each change
+    ramp : duration of every change [s]; 0 gives steps
+    shape : "linear" or "quintic"
+    band : half width of the settling band, as a share of each step [-]
+
+    Raises
+    ------
+    InputError for a time before 0, a channel that does not exist and an unknown shape.
+
+    Examples
+    --------
+    >>> ramps([3.0, 3.0], [(20.0, 0, 8.0)]).plateaus().tolist()
+    [[3.0, 3.0], [8.0, 3.0]]
     """
     changes = sorted(changes, key=lambda change: change[0])
     for time, channel, _ in changes:

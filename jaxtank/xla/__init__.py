@@ -1,1 +1,4 @@
-"""What the compiler has to be asked for; each module names the version that made it necessary."""
+"""Workarounds for the XLA compiler; each module names the version that made it necessary.
+
+Imports jax only; may be imported by every folder.
+"""

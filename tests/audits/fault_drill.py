@@ -37,7 +37,7 @@ COMMANDS = {
         "plant.drain[1]=0.02:0.08"],
     ],
 }  # fmt: skip
-AFRESH = re.compile(r"no evaluations\.jsonl|no ensemble to go on with|had ended")
+AFRESH = re.compile(r"holds no checkpoint to continue|had ended")
 PATIENCE = 300.0  # s
 
 
@@ -50,7 +50,7 @@ def prepare(cache):
 
     import tuning.identification.fit
     import tuning.report.identification
-    import tuning.report.uncertainty
+    import tuning.report.studies.uncertainty
     import tuning.search.tuner  # noqa: F401
     from tuning.cli import main as cli
 

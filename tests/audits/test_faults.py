@@ -117,18 +117,18 @@ def test_a_log_and_batches_on_a_full_disk(tmp_path):
     """/dev/full takes nothing."""
     (tmp_path / evaluation_log.NAME).symlink_to("/dev/full")
     with pytest.raises(InputError, match=r"evaluations\.jsonl.*No space left.*--resume"):
-        evaluation_log.Log(tmp_path, {"p": 1})
+        evaluation_log.EvaluationLog(tmp_path, {"p": 1})
     with small_disk(100), pytest.raises(InputError, match=r"manifest\.json.*too large.*--resume"):
-        batch_store.Store(tmp_path / "new", {"measures": ["x" * 200]})
+        batch_store.BatchStore(tmp_path / "new", {"measures": ["x" * 200]})
     assert not list((tmp_path / "new").iterdir())
 
 
 def test_a_log_on_a_disk_that_fills_up_is_good_to_go_on_from(tmp_path):
-    log = evaluation_log.Log(tmp_path, {"p": 1})
-    with small_disk(2000), pytest.raises(InputError, match="make room, then --resume"):
+    log = evaluation_log.EvaluationLog(tmp_path, {"p": 1})
+    with small_disk(2000), pytest.raises(InputError, match="free disk space, then --resume"):
         for i in range(100):
             log.recall("x", [float(i)], lambda i=i: (float(i), 1 / 3))
-    again, made = evaluation_log.Log(tmp_path, {"p": 1}, resume=True), []
+    again, made = evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True), []
     assert [
         again.recall("x", [float(i)], lambda i=i: made.append(i) or (float(i), 1 / 3))
         for i in range(20)

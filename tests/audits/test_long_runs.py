@@ -203,9 +203,9 @@ def noisy(reference=None):
     )
 
 
-@pytest.mark.parametrize("rest", [0, 1000])
-def test_a_run_in_pieces_is_the_run(rest):
-    """Longer runs are made in pieces of CHUNK samples: measures against the trajectory of the same
+@pytest.mark.parametrize("rest", [pytest.param(0, marks=pytest.mark.slow), 1000])
+def test_a_run_in_chunks_equals_the_run_in_one(rest):
+    """Longer runs are made in chunks of CHUNK samples: measures against the trajectory of the same
     run, made in one.
     """
     loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK * (1 if rest else 2) + rest - 1) * 0.01)
@@ -226,8 +226,8 @@ def test_a_run_in_pieces_is_the_run(rest):
 
 
 @pytest.mark.slow
-def test_slopes_through_pieces():
-    """Forward, in pieces of CHUNK samples, against reverse, whose pieces are of another kind."""
+def test_slopes_through_chunks():
+    """Forward, in chunks of CHUNK samples, against reverse, whose pieces are of another kind."""
     loop, long = noisy(), Clock(dt=0.01, duration=(CHUNK + 999) * 0.01)
 
     def cost(evaluate, k):

@@ -22,7 +22,7 @@ from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import DataError, InputError
 from tuning.identification import csv_log
-from tuning.storage import batch_store, evaluation_log
+from tuning.storage import batch_store, checkpoint, evaluation_log
 
 PACKAGES = {p.__name__: Path(p.__file__).parent for p in (jaxtank, tuning)}
 
@@ -85,15 +85,15 @@ READ = {
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
-    ("tuning.storage.evaluation_log", "_read", "read_bytes"): "after `refusal`",
+    ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
     ("tuning.storage.evaluation_log", "keep", "open"): "to write",
     (
         "tuning.storage.batch_store",
-        "read_part",
+        "read_batch",
         "ZipFile",
     ): "after `refusal`; unpacked sizes are added up first",
-    ("tuning.storage.batch_store", "read_part", "load"): "after that; allow_pickle=False",
+    ("tuning.storage.batch_store", "read_batch", "load"): "after that; allow_pickle=False",
     ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
     ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.cli.terminal", "guard", "open"): "/dev/null, in place of a stream that was closed",
@@ -193,11 +193,11 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
             (folder / name).symlink_to(odd)
         says = "is not a file|at most"
         with pytest.raises(InputError, match=says):
-            evaluation_log.Log(folder, {"p": 1}, resume=True)
+            evaluation_log.EvaluationLog(folder, {"p": 1}, resume=True)
         with pytest.raises(InputError, match=says):
             batch_store.read_manifest(folder)
         with pytest.raises(InputError, match=says):
-            batch_store.read_part(folder / "part-000000.npz", {"x"})
+            batch_store.read_batch(folder / "part-000000.npz", {"x"})
         with pytest.raises(InputError, match=says):
             files.read_text(folder / "rig.toml", "rig file")
         with pytest.raises(DataError, match=says):
@@ -242,7 +242,7 @@ def test_a_batch_is_not_trusted(held, tmp_path):
         for name, data in held.items():
             archive.writestr(name, data)
     with pytest.raises(InputError, match=r"part-000000\.npz: is not a batch of this program"):
-        batch_store.read_part(path, {"x"})
+        batch_store.read_batch(path, {"x"})
     assert [p.name for p in tmp_path.iterdir()] == [path.name] and not (
         tmp_path.parent / "x.npy"
     ).exists()
@@ -263,14 +263,14 @@ def test_a_batch_that_lies_about_its_size_or_is_cut_or_locked(tmp_path):
     ):
         path.write_bytes(whole[:where] + value + whole[where + len(value) :])
         with pytest.raises(InputError, match="not a batch of this program"):
-            batch_store.read_part(path, {"x"})
+            batch_store.read_batch(path, {"x"})
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="not a batch of this program"):
-        batch_store.read_part(path, {"x"})
+        batch_store.read_batch(path, {"x"})
 
 
 def test_json_without_end_is_refused(tmp_path):
-    head = json.dumps({"jaxtank": 1, "problem": {"p": 1}}) + "\n"
+    head = json.dumps({"problem": {"format": checkpoint.FORMAT, "p": 1}}) + "\n"
     deep = "[" * 200_000 + "\n"
     (tmp_path / batch_store.MANIFEST).write_text(deep)
     with pytest.raises(InputError, match="is not a manifest"):
@@ -286,7 +286,7 @@ def test_json_without_end_is_refused(tmp_path):
     ):
         (tmp_path / evaluation_log.NAME).write_text(text)
         with pytest.raises(InputError, match=words):
-            evaluation_log.Log(tmp_path, {"p": 1}, resume=True)
+            evaluation_log.EvaluationLog(tmp_path, {"p": 1}, resume=True)
         assert (tmp_path / evaluation_log.NAME).read_text() == text
 
 

@@ -39,7 +39,7 @@ from jaxtank.case import Free
 from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.problem import Problem
-from tuning.problem.scenarios import rough_clock
+from tuning.problem.scenarios import coarse_clock
 from tuning.report import tables
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS
@@ -150,7 +150,7 @@ def prices(problem, z, lanes, rounds=7):
     calls = {
         "simulation": lambda z: problem.screen(z[None]),
         "pass": problem.point,
-        "rough pass": problem.rough,
+        "rough pass": problem.coarse_point,
         "population": lambda z: problem.screen(np.tile(z, (lanes, 1))),
     }
     spent = {name: [] for name in calls}
@@ -166,7 +166,10 @@ def prices(problem, z, lanes, rounds=7):
 def ours(problem, method, z, reference, price, iterations):
     """Trace of a local search of tuning.solvers."""
     trace, search = Trace(), None
-    unit, tenth = price["simulation"][1], rough_clock(problem.clock).samples / problem.clock.samples
+    unit, tenth = (
+        price["simulation"][1],
+        coarse_clock(problem.clock).samples / problem.clock.samples,
+    )
 
     def seen(search):
         rough = len(search.history) == seen.known
@@ -179,7 +182,7 @@ def ours(problem, method, z, reference, price, iterations):
         trace.add(np.inf if rough else search.history[-1][1], *spent)
 
     seen.known = 0
-    problem.memo = type(problem.memo)()
+    problem.cache = type(problem.cache)()
     search = Search(problem, reference, seen)
     METHODS[method](search, z, iterations)
     return trace
@@ -189,7 +192,7 @@ def rival(problem, method, z, seed, stop, budget, seconds=np.inf):
     """Trace of a derivative-free optimiser, ended at the cost `stop`, after `budget` evaluations or
     some seconds.
     """
-    problem.memo = type(problem.memo)()
+    problem.cache = type(problem.cache)()
     trace, count = Trace(), len(z)
 
     def costs(zs):
@@ -305,7 +308,7 @@ def compare(parameters, options):
     best = min(t.best for many in traces.values() for t in many)
     found = {
         "parameters": parameters,
-        "scenarios": len(problem.lanes),
+        "scenarios": len(problem.runs),
         "samples": problem.clock.samples,
         "best": best,
         "compile_s": {name: p[0] for name, p in price.items()},

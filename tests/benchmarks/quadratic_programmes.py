@@ -8,7 +8,7 @@ import time
 import jax
 import numpy as np
 
-from jaxtank.analysis import qp
+from jaxtank.analysis import elimination, qp
 
 jax.config.update("jax_enable_x64", True)
 SIZES, LANES, ROUNDS, CALLS = (48, 60, 100), 16, 5, 4
@@ -44,7 +44,8 @@ def core_us(n, lanes, slope):
 
 
 def main():
-    ours = qp._cholesky, qp._cholesky_solve, qp._weighted
+    names = ("_cholesky", "_cholesky_solve", "_weighted")
+    ours = [getattr(elimination, name) for name in names]
     lapack = (
         lambda A: jax.scipy.linalg.cholesky(A),
         lambda U, b: jax.scipy.linalg.cho_solve((U, False), b),
@@ -56,7 +57,8 @@ def main():
             for slope in (False, True):
                 times = []
                 for functions in (ours, lapack):
-                    qp._cholesky, qp._cholesky_solve, qp._weighted = functions
+                    for name, function in zip(names, functions):
+                        setattr(elimination, name, function)
                     times.append(core_us(n, lanes, slope))
                 what = "slope" if slope else "run"
                 print(f"{n:9d}  {lanes:5d}  {what:5}  {times[0]:7.0f}  {times[1]:9.0f}", flush=True)

@@ -1205,7 +1205,7 @@ def test_uncertainty_in_shards_is_that_of_one_run(here):
     for picture in (here / "one").glob("*.png"):
         assert_picture(picture)
     said = say("merge", CASE, *SHORT, *DRAWS, "--out", "two")
-    assert said.code == 2 and "no ensemble" in said.err
+    assert said.code == 2 and "no checkpoint to continue" in said.err
     done("uncertainty", CASE, *SHORT, *DRAWS, "--quiet", "--out", "two", "--shard", "1/1")
     joined = done("merge", CASE, *SHORT, *DRAWS, "--out", "two", "--quiet", "--json").json
     assert joined | {"wall_s": 0} == one | {"wall_s": 0}

@@ -2,6 +2,7 @@
 exit codes and answers as promised.
 """
 
+import io
 import re
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import sys
 import pytest
 
 from tuning.cli import terminal
+from tuning.cli.commands.tuning import Progress
 
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
@@ -98,3 +100,33 @@ def test_a_forgiving_stream_writes_what_is_taken(tmp_path):
         )
         assert (tmp_path / "told").read_bytes() == b"start 1/8\n"
     assert terminal.Forgiving(10**6).write(b"lost") == 4  # no descriptor has that number
+
+
+class Screen(io.StringIO):
+    """A stderr that is a terminal."""
+
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+@pytest.mark.parametrize("stream", [Screen, io.StringIO])
+def test_a_long_compilation_is_announced_on_a_terminal_only(monkeypatch, stream, quiet):
+    monkeypatch.setattr(sys, "stderr", stream())
+    Progress("cm", quiet)
+    announced = "compiling the simulation and its derivatives, about" in sys.stderr.getvalue()
+    assert announced == (stream is Screen and not quiet)
+
+
+def test_a_line_is_overwritten_on_a_terminal_and_elsewhere_printed_at_each_tenth(monkeypatch):
+    printed = []
+    for stream in (Screen, io.StringIO):
+        monkeypatch.setattr(sys, "stderr", stream())
+        line = terminal.Line(False)
+        for done in range(1, 101):
+            line.runs(done, 100)
+        line.end()
+        printed.append(sys.stderr.getvalue())
+    screen, file = printed
+    assert screen.count("\r") == 100 and screen.count("\n") == 1
+    assert file.splitlines() == [f"run {done}/100" for done in range(10, 101, 10)]

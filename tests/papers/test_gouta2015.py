@@ -222,6 +222,7 @@ PLANT_B = [
 ]
 
 
+@pytest.mark.slow_for("ngpc-30s", "backstepping-30s", "backstepping-20s", "backstepping-ff-30s")
 @pytest.mark.parametrize("row", PLANT_B, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_plant_b_rows_of_the_acceptance_table(row):
     (
@@ -299,6 +300,7 @@ VARIANTS = [  # case, overrides, RMS1, RMS2
 ]
 
 
+@pytest.mark.slow_for("ngpc-values0-0.053-0.1271", "backstepping-ff-values2-0.0602-0.1406")
 @pytest.mark.parametrize(
     "name, values, rms1, rms2", VARIANTS, ids=lambda v: v if isinstance(v, str) else None
 )
@@ -606,6 +608,7 @@ def test_the_inversion_inverts():
         np.testing.assert_allclose(b @ np.column_stack(columns), np.eye(2), atol=1e-12)
 
 
+@pytest.mark.slow_for("ngpc", "backstepping-ff")
 @pytest.mark.parametrize("kind", ["ngpc", "backstepping", "backstepping-ff"])
 def test_an_equilibrium_stays(gouta, kind):
     case = gouta(kind)

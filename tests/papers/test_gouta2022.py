@@ -10,7 +10,8 @@ from helpers import in_metres
 
 import jaxtank
 from jaxtank import presets, rig
-from jaxtank.analysis.steady_state import equilibrium, linearise
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers.pid import oustaloup
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
@@ -87,6 +88,7 @@ ROWS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow_for("d=0 E", "d=0 S", "const d E", "const d S", "DZ A")
 @pytest.mark.parametrize("name", ROWS)
 def test_acceptance_table(name):
     case, values, change, u, e, ts, tr, d = ROWS[name]
@@ -306,7 +308,9 @@ def test_printed_sign_leaves_its_offset():
         np.testing.assert_allclose(r.e[paper.quiet(r.t)].mean(axis=0), (-0.095, -0.076), atol=1e-3)
 
 
-@pytest.mark.parametrize(("tau", "limit"), [(0.13, 0.05), (1.3, 0.12)])
+@pytest.mark.parametrize(
+    ("tau", "limit"), [pytest.param(0.13, 0.05, marks=pytest.mark.slow), (1.3, 0.12)]
+)
 def test_delay_margin(tau, limit):
     """The largest stable delay of S at l = 10 (notes S7.2): a kick dies out at it and does not two
     samples later.
@@ -335,6 +339,7 @@ TABLE6 = {  # notes S7.3, delay 0.5 s: RMS u, RMS e, ts, tr as printed there
 }
 
 
+@pytest.mark.slow_for("pi", "pi-ff", "pid")
 @pytest.mark.parametrize("name", TABLE6)
 def test_baselines(name):
     found = paper.figures(run(name, {"actuator.delay": 0.5}))
@@ -493,6 +498,7 @@ def test_published_parameters_are_those_of_the_cases():
     assert float(loop.plant.pump_gain[0]) == pytest.approx(10 * published["plant.pump_gain"].value)
 
 
+@pytest.mark.slow_for("pid-ff")
 @pytest.mark.parametrize("name", ["chadpc", "pid-ff", "fopi"])
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
 

@@ -68,7 +68,7 @@ def summary(kind, *setting, **more):
 
 
 def test_linear_model_with_one_pump():
-    from jaxtank.analysis.steady_state import linearise
+    from jaxtank.analysis.linear_model import linearise
 
     plant = dataclasses.replace(khalid.tanks(1), knee=EXACT)
     A, B, C = (np.asarray(m) for m in linearise(plant, khalid.MIDDLE[1], (0.0,)))
@@ -89,7 +89,7 @@ def test_linear_model_with_one_pump():
 
 
 def test_linear_model_with_two_pumps():
-    from jaxtank.analysis.steady_state import linearise
+    from jaxtank.analysis.linear_model import linearise
 
     plant = dataclasses.replace(khalid.tanks(2), knee=EXACT)
     for levels, poles in (
@@ -355,7 +355,12 @@ def rows(table, quick):
         )
 
 
-@pytest.mark.slow_for("S2-laguerre-constrained-0.1", "S2-laguerre-constrained-0.5")
+@pytest.mark.slow_for(
+    "S2-laguerre-constrained-0.1",
+    "S2-laguerre-constrained-0.5",
+    "S2-laguerre-unconstrained-0.5",
+    "S1-laguerre-constrained-0.1",
+)
 @pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):
     where, kind, mode, du, rmse, over, under, up, down, rms_u, travel, held, top = row

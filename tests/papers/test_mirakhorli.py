@@ -19,18 +19,15 @@ from scipy.integrate import solve_ivp
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import (
-    equilibrium,
+from jaxtank.analysis.linear_model import (
     linearise,
     relative_gain_array,
-    steady_along,
-    steady_flows,
     steady_gain,
-    steady_levels,
     transmission_zeros,
     zero_direction,
 )
+from jaxtank.analysis.riccati import lqr
+from jaxtank.analysis.steady_state import equilibrium, steady_along, steady_flows, steady_levels
 from jaxtank.controllers import LQI, SlidingMode, StateFeedback
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.controllers.sliding_mode import acceleration, lower_tanks
@@ -1327,9 +1324,7 @@ def test_every_published_number_that_can_be_measured_is():
     )
     published = load("mirakhorli").published
     assert set(found) <= set(published)
-    verdicts = {
-        name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")
-    }
+    verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
     assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
     assert [verdicts[f"rise time, {law}"] for law in ("SMC", "SFC", "hybrid")] == [

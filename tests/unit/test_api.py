@@ -1,9 +1,12 @@
 """What a user writes in Python: names for components, solver options, results that are read."""
 
 import abc
+import ast
 import dataclasses
 import json
+import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,7 @@ import pytest
 
 import jaxtank
 import tuning
+from jaxtank import measures as ms
 from jaxtank import presets, rig
 from jaxtank.controllers import Controller
 from jaxtank.core.errors import InputError
@@ -23,6 +27,9 @@ from jaxtank.plants.base import Plant
 from jaxtank.rig import components
 from tuning.cli.main import main
 from tuning.optimal_input.perfect_information import InputBound
+from tuning.search import messages
+from tuning.search.messages import messages_of
+from tuning.search.result import constraint_rows
 
 
 @jaxtank.component
@@ -317,6 +324,83 @@ def test_a_parameter_of_a_result_is_read_by_name(tuned):
         change.after = 1.0
     with pytest.raises(InputError, match=r"'controller.Kd'; nearest: controller.Kc"):
         tuned["controller.Kd"]
+
+
+def test_messages_have_codes_and_their_texts_are_the_message(tuned):
+    assert type(tuned.messages) is tuple and len(tuned.messages) > 1
+    assert all(type(m) is tuning.Message for m in tuned.messages)
+    assert tuned.message == "; ".join(m.text for m in tuned.messages)
+    assert all(m.text == str(m) and "\n" not in m.text for m in tuned.messages)
+    listed = tuned.to_json()["messages"]
+    assert listed == [{"code": m.code, "text": m.text} for m in tuned.messages]
+    codes = [m.code for m in tuned.messages]
+    assert "parameter-at-bound" in codes and "starts-agree" in codes
+    assert "infeasible" not in codes
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        tuned.messages[0].code = "other"
+
+
+def test_the_message_on_a_bound_names_value_unit_and_sensitivity(tuned):
+    (text,) = [m.text for m in tuned.messages if m.code == "parameter-at-bound"]
+    assert text.startswith("controller.Kc ended at its upper bound 10 V/V")
+    percent = tuned["controller.Kc"].sensitivity_percent
+    small = tuned.replace(
+        parameters={
+            "controller.Kc": tuned.parameters["controller.Kc"] | {"sensitivity_percent": 0.01}
+        }
+    )
+    (text,) = [m.text for m in messages_of(small) if m.code == "parameter-at-bound"]
+    assert percent > 0.5 and text == (
+        "controller.Kc ended at its upper bound 10 V/V; the objective is insensitive to it"
+        " (10 % changes it by 0.01 %)"
+    )
+
+
+def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
+    folder = Path(messages.__file__).parent
+    found = set()
+    for path in [*folder.glob("*.py"), folder.parent / "report" / "tuning.py"]:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
+                found |= {
+                    n.value
+                    for n in ast.walk(node.args[0])
+                    if isinstance(n, ast.Constant) and isinstance(n.value, str)
+                }
+    listed = re.findall(r"^([a-z]+(?:-[a-z]+)*)  ", messages.__doc__, flags=re.M)[1:]  # the head
+    assert found == set(listed) and len(listed) == len(set(listed))
+
+
+def test_a_limit_is_a_typed_row_with_the_values_before_and_after(own, tuned):
+    limits = {"max_level": [9.0, 9.5], "input_travel": 1e9}
+    problem = tuning.Problem(own, limits=limits)
+    before, after = (
+        {"max_level": np.array(levels), "input_travel": np.array([travel])}
+        | dict.fromkeys(ms.times(), np.array([12.5, 20.0]))
+        for levels, travel in (([9.25, 8.0], 70.0), ([8.5, 9.499], 80.0))
+    )
+    rows = constraint_rows(problem, [after], [before], {"max_level of tank 1": 0.25})
+    first, _, travel = rows
+    assert all(type(row) is tuning.ConstraintRow for row in rows)
+    assert (first.name, first.measure, first.unit) == ("max_level of tank 1", "max_level", "V")
+    assert [(row.tank, row.pump) for row in rows] == [(1, None), (2, None), (None, 1)]
+    assert [row.before for row in rows] == [9.25, 8.0, 70.0]
+    assert [row.value for row in rows] == [8.5, 9.499, 80.0]
+    assert [row.limit for row in rows] == [9.0, 9.5, 1e9]
+    assert (first.margin, first.time_s, travel.time_s) == (0.5, 12.5, None)
+    # by its multiplier; by its margin, a tenth of a thousandth of the limit; not at all
+    assert [row.active for row in rows] == [True, True, False]
+    assert [row.multiplier for row in rows] == [0.25, 0.0, 0.0]
+    (violated, *_) = constraint_rows(problem, [before], None, {"max_level of tank 1": 0.25})
+    assert violated.margin == -0.25 and not violated.active and violated.before is None
+    assert first["margin"] == first.margin
+    with pytest.raises(KeyError):
+        first["price"]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        first.limit = 1.0
+    found = tuned.replace(constraints=rows).to_json()["constraints"]
+    assert {"name", "limit", "value", "margin", "tank", "time_s"} < set(found[0])
+    assert [row["before"] for row in found] == [9.25, 8.0, 70.0]
 
 
 def test_a_status_is_typed_and_is_its_text(tuned):

@@ -23,7 +23,7 @@ PAGE = next(p for p in Path(__file__).resolve().parents if (p / ".github").is_di
     ".github/CONTRIBUTING.md"
 )
 TABLES = (
-    components.LAWS,
+    components.ROLES["law"].classes,
     components.REGISTERED,
     catalogue.MEASURES,
     accumulators.ACCUMULATORS,

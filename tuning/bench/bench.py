@@ -1,12 +1,14 @@
-"""`jaxtank bench`: what a closed-loop step costs here, beside a C loop of the same arithmetic."""
+"""`jaxtank bench`: time of a closed-loop step here, beside a C loop; for command and benchmarks."""
 
 import ctypes
+import functools
 import re
 import shutil
 import statistics
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
@@ -36,9 +38,7 @@ def _compilations():
 
 
 def c_loop(folder):
-    """The C loop of floor.c, built with gcc -O3 -march=native in `folder`; None where there is no
-    gcc.
-    """
+    """Return the C loop of floor.c, built by gcc -O3 in `folder`; None without gcc."""
     if shutil.which("gcc") is None:
         return None
     library = Path(folder) / "floor.so"
@@ -53,10 +53,8 @@ def c_loop(folder):
 
 
 def c_runner(function, case, rk4=True):
-    """A call of the C loop with the numbers of `case` (backstepping as printed): () -> (rms error
-    [cm], highest levels [cm]).
-    """
-    plant, law, clock = case.loop.plant, case.loop.controller, case.clock
+    """Return a call of the C loop for a case: () -> (rms error [cm], highest levels [cm])."""
+    plant, controller, clock = case.loop.plant, case.loop.controller, case.clock
     numbers = np.concatenate(
         [
             plant.area,
@@ -74,9 +72,9 @@ def c_runner(function, case, rk4=True):
 
     real = [
         float(clock.dt),
-        float(law.k),
-        float(law.k1),
-        float(law.level_floor),
+        float(controller.k),
+        float(controller.k1),
+        float(controller.level_floor),
         float(case.loop.actuator.high[0]),
     ]
     dt, *rest = (ctypes.c_double(v) for v in real)
@@ -98,8 +96,9 @@ def c_runner(function, case, rk4=True):
 
 
 def timed(calls, rounds):
-    """{name: [seconds of each round]}: every call once a round, in turn, after a warm-up; {name:
-    first result}.
+    """Return {name: [seconds of each round]} and {name: first result} of functions.
+
+    Every function is called once a round, in turn, after a warm-up.
     """
     results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
     seconds = {name: [] for name in calls}
@@ -112,25 +111,12 @@ def timed(calls, rounds):
 
 
 def measure(rounds=7):
-    """The figures of `jaxtank bench`, as a table for JSON."""
+    """Return the figures of `jaxtank bench`, as a dict for JSON.
+
+    rounds: interleaved rounds that medians are taken of.
+    """
     cases = {name: presets.find(name) for name in CASES}
-    first = cases[CASES[0]]
-    gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
-    derivative = jax.jit(
-        jax.jacfwd(
-            lambda v: lp.evaluate(with_values(first.loop, v), first.clock, MEASURES)[
-                "rms_error_total"
-            ]
-        )
-    )
-    compile_s = {}
-    calls = {}
-    for name, case in cases.items():
-        calls[name] = lambda case=case: lp.evaluate(case.loop, case.clock, MEASURES)
-    calls["jacfwd for 2 gains"] = lambda: derivative(gains)
-    calls["gradient, Gauss-Newton and maxima for 2 gains"] = lambda: lp.sensitivities(
-        first.loop, first.clock, MEASURES, gains
-    )
+    first, calls, compile_s = cases[CASES[0]], _calls(cases), {}
     for name, call in calls.items():
         began = time.perf_counter()
         jax.block_until_ready(call())
@@ -138,17 +124,16 @@ def measure(rounds=7):
     with tempfile.TemporaryDirectory() as folder:
         function = c_loop(folder)
         if function is not None:
-            calls["C loop, backstepping"] = c_runner(function, first)
+            calls[C_LOOP] = c_runner(function, first)
         seconds, results = timed(calls, rounds)
     medians = {name: statistics.median(s) for name, s in seconds.items()}
-    base = medians[CASES[0]]
     rows = {
         name: {
             "ns_per_step": 1e9 * medians[name] / first.clock.samples,
             "ms": 1e3 * medians[name],
             "spread": (max(s) - min(s)) / medians[name],
             "first_call_s": compile_s.get(name),
-            "times_the_run": medians[name] / base,
+            "times_the_run": medians[name] / medians[CASES[0]],
         }
         for name, s in seconds.items()
     }
@@ -157,21 +142,46 @@ def measure(rounds=7):
         "rounds": rounds,
         "rows": rows,
         "provenance": provenance(first, None),
+        **_beside_c(seconds, results),
     }
-    if "C loop, backstepping" in seconds:
-        rms, top = results["C loop, backstepping"]
-        ours = results[CASES[0]]
-        found["ratio_to_c"] = statistics.median(
-            a / b for a, b in zip(seconds[CASES[0]], seconds["C loop, backstepping"])
-        )
-        found["difference_to_c_cm"] = float(
-            max(
-                abs(rms - float(ours["rms_error_total"])),
-                np.max(np.abs(top - np.asarray(ours["max_level"]))),
-            )
-        )
     found["notes"] = _notes(found, function)
     return found
+
+
+C_LOOP = "C loop, backstepping"
+
+
+def _calls(cases) -> dict[str, Callable[[], Any]]:
+    """{name: call} of what is timed: the cases, and two derivatives of the first one."""
+    first = cases[CASES[0]]
+    gains = {"controller.k": np.float64(0.03), "controller.k1": np.float64(0.088)}
+
+    def error(values):
+        measures = lp.evaluate(with_values(first.loop, values), first.clock, MEASURES)
+        return measures["rms_error_total"]
+
+    derivative = jax.jit(jax.jacfwd(error))
+    calls: dict[str, Callable[[], Any]] = {
+        name: functools.partial(lp.evaluate, case.loop, case.clock, MEASURES)
+        for name, case in cases.items()
+    }
+    calls["jacfwd for 2 gains"] = functools.partial(derivative, gains)
+    calls["gradient, Gauss-Newton and maxima for 2 gains"] = functools.partial(
+        lp.sensitivities, first.loop, first.clock, MEASURES, gains
+    )
+    return calls
+
+
+def _beside_c(seconds, results):
+    """Time and numbers of the first case beside those of the C loop, where there is one."""
+    if C_LOOP not in seconds:
+        return {}
+    rms, top = results[C_LOOP]
+    ours = results[CASES[0]]
+    ratios = [a / b for a, b in zip(seconds[CASES[0]], seconds[C_LOOP])]
+    error = abs(rms - float(ours["rms_error_total"]))
+    level = np.max(np.abs(top - np.asarray(ours["max_level"])))
+    return {"ratio_to_c": statistics.median(ratios), "difference_to_c_cm": float(max(error, level))}
 
 
 def _notes(found, function):
@@ -189,7 +199,7 @@ def _notes(found, function):
 
 
 def text(found):
-    """The page of `jaxtank bench`."""
+    """Return the page of `jaxtank bench`."""
     rows = [
         [
             n,
@@ -221,8 +231,9 @@ def text(found):
 
 
 def is_one_function(program, samples):
-    """True if the time loop (the loop of `samples` turns) of a compiled program's text is one that
-    XLA runs as one function.
+    """Return whether XLA runs the time loop of a compiled program as one function.
+
+    program: its text; samples: number of turns of the loop.
     """
     small = set(
         re.findall(r'to_apply=(%[\w.-]+), frontend_attributes={xla_cpu_small_call="true"', program)
@@ -240,7 +251,7 @@ def is_one_function(program, samples):
     return False
 
 
-WALLED = ("custom-call", "scatter", "sort", "fft", "partition-id", "outfeed", "infeed")
+BLOCKING = ("custom-call", "scatter", "sort", "fft", "partition-id", "outfeed", "infeed")
 """Operations that keep XLA from compiling a loop to one function (methods 2.1): LAPACK, callbacks,
 `.at[].set`, sorting.
 """
@@ -252,14 +263,14 @@ OFF = (
 
 
 def reasons(program, samples, option, dtype, compiled):
-    """Why a run is slower or less exact than it could be, in words; [] if nothing is known.
+    """Return why a run is slower or less exact than it could be, as sentences.
 
     program: text of the compiled run; samples: of its loop; option: whether the XLA options are on;
     dtype: of the levels; compiled: how many programs three further runs compiled.
     """
     found = []
     if not is_one_function(program, samples):
-        named = [word for word in WALLED if f" {word}(" in program]
+        named = [word for word in BLOCKING if f" {word}(" in program]
         found.append(
             OFF
             if not option
@@ -270,7 +281,7 @@ def reasons(program, samples, option, dtype, compiled):
         )
     if dtype == np.float32:
         found.append(
-            "float32: less exact, and one run is no faster for it; many lanes are (half the time)"
+            "float32: less exact, and no faster for one run; a batch of runs takes half the time"
         )
     if compiled:
         found.append(
@@ -281,8 +292,9 @@ def reasons(program, samples, option, dtype, compiled):
 
 
 def measure_cases(cases, rounds=3):
-    """{name: {"ns_per_step", "ms", "samples", "one_function", "first_call_s", "reasons"}} of {name:
-    Case}: a run with two measures, median of `rounds`.
+    """Return the time of a run with two measures of each of {name: Case}, median of `rounds`.
+
+    Its keys: ns_per_step, ms, samples, one_function, first_call_s, reasons.
     """
     found = {}
     for name, case in cases.items():
@@ -317,7 +329,7 @@ def measure_cases(cases, rounds=3):
 
 
 def text_of_cases(found):
-    """The page of `jaxtank bench CASE ...`."""
+    """Return the page of `jaxtank bench CASE ...`."""
     rows = [
         [
             name,

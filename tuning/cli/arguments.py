@@ -54,7 +54,8 @@ class Parser(argparse.ArgumentParser):
 
     def options(self, command=None):
         """Return the spellings of all options of a command, or of those before any command."""
-        actions = self.commands.get(command, self)._actions
+        parser = self if command is None else self.commands[command]
+        actions = parser._actions
         return [spelling for a in actions for spelling in a.option_strings]
 
 

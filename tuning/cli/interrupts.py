@@ -22,8 +22,7 @@ _held = []  # True once the main thread waits for its end
 
 
 def listen():
-    """Answer SIGINT and SIGTERM from now on: for a program of its own, never for a caller's
-    process.
+    """Answer SIGINT and SIGTERM from now on: for a program of its own, never in a caller's process.
 
     A thread answers them. The main thread cannot while it is in native code, which may compile for
     minutes, and an exception raised in an import would leave a module half made.
@@ -95,7 +94,7 @@ def leave(number=_signal.SIGINT, words=None):
 
 
 def say(words):
-    """Write a line to stderr; what it does not take is let go."""
+    """Write a line to stderr; what it cannot take is discarded."""
     try:
         fresh = b"\n" if os.isatty(2) else b""  # after ^C, or a line of progress
         os.write(2, fresh + b"jaxtank: " + words + b"\n")
@@ -117,9 +116,9 @@ class before_leaving:
 
 
 class Interrupts:
-    """Ctrl-C of a search: from the first `check` on, the first one lets it end with the best point
-    so far, the second ends the program at once. Before that there is nothing yet that could be
-    lost.
+    """Ctrl-C of a search: the first one ends it with the best point so far, the second at once.
+
+    It takes effect from the first `check` on; before that there is no point to report.
     """
 
     def __init__(self):

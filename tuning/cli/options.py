@@ -1,5 +1,6 @@
-"""What the options that several commands share mean, and what every command says of the files it
-wrote.
+"""Values of the options that several commands share, and the report of written files.
+
+Imported by the commands.
 """
 
 import re
@@ -11,6 +12,7 @@ from tuning.cli.values import number, once, pair, parse_value, plain_number, set
 
 
 def limits_of(args, case):
+    """Return the limits of a case as --limit changes them."""
     limits, given = dict(case.limits), [text.partition("=")[0].strip() for text in args.limit]
     for name in given:
         if given.count(name) > 1:
@@ -34,36 +36,35 @@ def limits_of(args, case):
 
 
 def scenarios_of(args):
-    from jaxtank import rig
-    from jaxtank.presets import Scenario
-
+    """Return the Scenarios of --scenario, None without, () for "none"."""
     if not args.scenario:
         return None
     if args.scenario == ["none"]:
         return ()
-    found = []
-    for i, text in enumerate(args.scenario):
-        values = (
-            once(
-                "--scenario", [pair("--scenario", part) for part in text.split(";") if part.strip()]
+    return tuple(_scenario(args, i, text) for i, text in enumerate(args.scenario))
+
+
+def _scenario(args, i, text):
+    """The Scenario of the i-th --scenario."""
+    from jaxtank import rig
+    from jaxtank.presets import Scenario
+
+    pairs = [pair("--scenario", part) for part in text.split(";") if part.strip()]
+    values = once("--scenario", pairs) or {}
+    for name, value in values.items():
+        set_too = any(rig.overlap(name, given) for given in settings(args))
+        if set_too and not rig.is_change(value):
+            raise InputError(
+                f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of them,"
+                f" or a factor, as {name}=x1.1"
             )
-            or {}
-        )
-        for name, value in values.items():
-            if any(rig.overlap(name, given) for given in settings(args)) and not rig.is_change(
-                value
-            ):
-                raise InputError(
-                    f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of"
-                    f" them, or a factor, as {name}=x1.1"
-                )
-        seed = values.pop("seed", i)
-        weight = values.pop("weight", 1.0)
-        found.append(Scenario(values.pop("name", text), values, seed, weight))
-    return tuple(found)
+    seed, weight = values.pop("seed", i), values.pop("weight", 1.0)
+    return Scenario(values.pop("name", text), values, seed, weight)
 
 
 def choices_of(args):
+    """Return {name: values} of --choose, None without."""
+
     def values(name, text):
         parts = [part.strip() for part in text.split(",")]
         if "" in parts or any(re.match(r"[+-]?0\d", part) for part in parts):
@@ -78,7 +79,7 @@ def choices_of(args):
 
 
 def tradeoff_of(args):
-    """(measure, values) of --tradeoff."""
+    """Return (measure, values) of --tradeoff, None without."""
     if args.tradeoff is None:
         return None
     measure, text = pair("--tradeoff", args.tradeoff, str)
@@ -101,12 +102,13 @@ def tradeoff_of(args):
 
 
 def distributions_of(args, case):
-    """What varies, by --vary or --spread; None for the case's own."""
+    """Return {name: distribution} of --vary or --spread, None without."""
     from tuning.uncertainty.sampling import spread_of
 
     if args.vary and args.spread is not None:
         raise InputError(
-            "--vary says what varies, --spread how much of the case's own: give one of them"
+            "--vary names what varies, --spread how much all that the case calls uncertain varies:"
+            " give one of them"
         )
     if args.vary:
         varied = [_pair_of(text, case) for text in args.vary]
@@ -136,7 +138,7 @@ def _pair_of(text, case):
 
 
 def devices_of(args):
-    """The number of --devices, which jax is told before it starts."""
+    """Return the number of --devices; jax must be configured before it starts."""
     devices = whole("--devices", args.devices, 1, 1024)
     if devices > 1:
         import jax
@@ -146,6 +148,7 @@ def devices_of(args):
 
 
 def report_written(paths, args):
+    """Print the names of written files on stderr."""
     if paths and not args.quiet:
         print(
             f"written to {printable(args.out)}: " + ", ".join(p.name for p in paths),
@@ -154,9 +157,7 @@ def report_written(paths, args):
 
 
 def report_unreachable(case, paths, args):
-    """A note on stderr where the rig.toml among `paths`, that of `case`, says `reachable = false`
-    and the case itself did not.
-    """
+    """Print a note where the written rig.toml of `case` states `reachable = false` anew."""
     from jaxtank import rig
 
     if (

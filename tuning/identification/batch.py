@@ -119,9 +119,10 @@ def identify_many(
     >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.load("cascaded").cases["open-loop"]
     >>> t = np.arange(20.0)
-    >>> logs = [tuning.log(t=t, u=0 * t + 3, y=slope * t, tanks=[1]) for slope in (0.08, 0.1)]
+    >>> levels = [4.46 + slope * t for slope in (0.0, 0.02)]
+    >>> logs = [tuning.log(t=t, u=0 * t + 3, y=y, tanks=[0]) for y in levels]
     >>> result = tuning.identify_many(
-    ...     case, logs, {"plant.pump_gain": (0.01, 9.0)}, start="case", noise=0.1, substeps=1)
+    ...     case, logs, {"plant.pump_gain": (0.01, 0.2)}, start="case", noise=0.1, substeps=1)
     >>> len(result), result.names, bool(result.values[0, 0] < result.values[1, 0])
     (2, ('plant.pump_gain[0]',), True)
     """

@@ -185,7 +185,7 @@ def compare_experiments(
     >>> t = np.arange(0.0, 60.0, 4.0)
     >>> step = {"step": (t, np.full((15, 1), 3.0), np.zeros(2))}
     >>> found = tuning.compare_experiments(
-    ...     case, {"plant.pump_gain": (1.0, 9.0)}, noise=0.05, duration=56, dt=4, inputs=step
+    ...     case, {"plant.pump_gain": (0.01, 0.2)}, noise=0.05, duration=56, dt=4, inputs=step
     ... )
     >>> found["step"]["open"], found["step"]["sd"]["plant.pump_gain[0]"] < 0.1
     ([], True)

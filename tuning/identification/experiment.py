@@ -131,7 +131,7 @@ def log(
     >>> data = tuning.log(t=[0.0, 1.0], u=[[3.0, 2.8], [3.0, 2.8]], y=[[1.0], [1.2]], tanks=[1])
     >>> data.samples, data.tanks
     (2, (1,))
-    >>> tuning.log(t=[0.0, 0.0], u=[3.0, 3.0], y=[1.0, 1.2])
+    >>> tuning.log(t=[0.0, 0.0], u=[3.0, 3.0], y=[1.0, 1.2])  # doctest: +ELLIPSIS
     Traceback (most recent call last):
     ...
     jaxtank.core.errors.DataError: log, sample 2: time 0 s is that of the sample before: times ...

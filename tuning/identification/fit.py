@@ -7,12 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-import jaxtank
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.plants.base import Plant
@@ -28,8 +26,9 @@ from tuning.identification.proposal import check_law
 from tuning.identification.residuals import quality, validate
 from tuning.identification.result import Identification
 from tuning.problem.status import Status
-from tuning.storage.batch_store import digest
-from tuning.storage.evaluation_log import Log, Memo, folder_of
+from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
+from tuning.storage.fingerprint import digest, fingerprint
 
 LOSSES = ("linear", "soft_l1", "huber")
 AGREE = 1.001
@@ -124,13 +123,13 @@ def identify(
     >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.load("cascaded").cases["open-loop"]
     >>> t = np.arange(30.0)
-    >>> data = tuning.log(t=t, u=0 * t + 3, y=t**2 / 200, tanks=[1])
+    >>> data = tuning.log(t=t, u=0 * t + 3, y=4.46 + 0.02 * t, tanks=[0])
     >>> result = tuning.identify(
-    ...     case, data, {"plant.pump_gain": (0.01, 9.0)}, start="case", starts=1, substeps=1)
+    ...     case, data, {"plant.pump_gain": (0.01, 0.2)}, start="case", starts=1, substeps=1)
     >>> result.status, list(result.parameters)
     (<Status.CONVERGED: 'converged'>, ['plant.pump_gain[0]'])
     """
-    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
+    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     check_float64()
     _check_options(loss, starts=starts, iterations=iterations)
     case = bare(case) if isinstance(case, Plant) else case
@@ -141,13 +140,25 @@ def identify(
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
     partial, options = _first_problem(case, logs, kept, options)
     check_length(logs)
-    memo = Memo()
+    cache = EvaluationCache()
     if folder is not None:
-        given = {**options, "loss": loss, "iterations": iterations, "gap": gap}
-        memo = Log(folder, _problem(case, logs, partial, given), resume)
+        what = fingerprint(
+            case,
+            command="identify",
+            logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
+            free=partial.bounds,
+            held_back=[one.samples for one in partial.logs],
+            noise=partial.noise,
+            substeps=partial.substeps,
+            start=options["start"],
+            loss=loss,
+            iterations=iterations,
+            gap=gap,
+        )
+        cache = EvaluationLog(folder, what, resume)
     if ready is not None:
         ready()
-    fits, interrupted = _searches(memo, partial, starts, seed, loss, iterations, progress)
+    fits, interrupted = _searches(cache, partial, starts, seed, loss, iterations, progress)
     first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
     if not np.isfinite(first.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
@@ -216,12 +227,12 @@ def _first_problem(case, logs, kept, options):
     return Estimation(case, begin, **options), options
 
 
-def _searches(memo, estimation, starts, seed, loss, iterations, progress):
+def _searches(cache, estimation, starts, seed, loss, iterations, progress):
     """Return (Fits of the searches that ended, whether they were interrupted)."""
     fits = []
     try:
         for z in estimation.starts(starts, seed):
-            fits.append(_search(memo, estimation, z, loss, iterations))
+            fits.append(_search(cache, estimation, z, loss, iterations))
             if progress is not None:
                 progress(fits[-1])
     except KeyboardInterrupt:
@@ -231,7 +242,7 @@ def _searches(memo, estimation, starts, seed, loss, iterations, progress):
     return fits, False
 
 
-def _search(memo, estimation, z, loss, iterations):
+def _search(cache, estimation, z, loss, iterations):
     """Return the Fit of a first search from z.
 
     One from the checkpoint has where it ended, not its residual and Jacobian.
@@ -243,7 +254,7 @@ def _search(memo, estimation, z, loss, iterations):
         made.append(one)
         return one.p, one.levels, one.cost, float(one.evaluations), float(one.status)
 
-    p, levels, cost, evaluations, status = memo.recall("search", [z], compute)
+    p, levels, cost, evaluations, status = cache.recall("search", [z], compute)
     if made:
         return made[0]
     none = np.zeros((0, estimation.size))
@@ -326,19 +337,3 @@ def _status(case, best, parameters, interrupted):
     if best.status > 0 and not at_search_bounds(case.loop, parameters):
         return Status.CONVERGED
     return Status.NOT_CONVERGED
-
-
-def _problem(case, logs, partial, options):
-    """Return {what: text} that two runs must share for one to continue from the other."""
-    return {
-        "command": "identify",
-        "case": digest([np.asarray(leaf) for leaf in jax.tree.leaves(case.loop)]),
-        "logs": digest([np.asarray(v) for one in logs for v in (one.t, one.u, one.y)]),
-        "free": repr([tuple(b) for b in partial.bounds]),
-        "held back": repr([one.samples for one in partial.logs]),
-        "noise": repr(partial.noise.tolist()),
-        "substeps": repr(partial.substeps),
-        **{n: repr(options[n]) for n in ("start", "loss", "iterations", "gap")},
-        "jaxtank": jaxtank.__version__,
-        "jax": jax.__version__,
-    }

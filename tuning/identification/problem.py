@@ -80,8 +80,9 @@ class Estimation:
     >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.load("cascaded").cases["open-loop"]
     >>> t = np.arange(20.0)
-    >>> data = tuning.log(t=t, u=0 * t + 3, y=0.1 * t, tanks=[1])
-    >>> problem = tuning.Estimation(case, [data], {"plant.pump_gain": (1.0, 9.0)}, "case", 0.1, 1)
+    >>> data = tuning.log(t=t, u=0 * t + 3, y=4 + 0.01 * t, tanks=[1])
+    >>> free = {"plant.pump_gain": (0.01, 0.2)}
+    >>> problem = tuning.Estimation(case, [data], free, "case", noise=0.1, substeps=1)
     >>> problem.names, problem.size
     (('plant.pump_gain[0]',), 1)
     >>> residual, jacobian = problem.residual_and_jacobian(problem.nominal())

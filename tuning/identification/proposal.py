@@ -12,7 +12,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from jaxtank import rig as rigs
-from jaxtank.analysis.steady_state import linearise
+from jaxtank.analysis.linear_model import linearise
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number

@@ -1,6 +1,7 @@
-"""Where a value may lie, and the scale on which it is searched."""
+"""Where a value may lie, and the scale on which it is searched; imported by `problem`."""
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,12 +9,20 @@ from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, split_index
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_free
 
 
 class Bound(NamedTuple):
-    """One scalar parameter: its dotted name, range and unit. The search sees z in [0, 1],
-    logarithmic or linear in the value.
+    """One scalar parameter: its dotted name, range and unit.
+
+    The search uses z in [0, 1], logarithmic or linear in the value.
+
+    Examples
+    --------
+    >>> bound = Bound("controller.k", 0.01, 1.0, "log", "1/s")
+    >>> round(float(bound.to_unit(0.1)), 12), round(float(bound.from_unit(0.5)), 12)
+    (0.5, 0.1)
     """
 
     name: str
@@ -23,13 +32,13 @@ class Bound(NamedTuple):
     unit: str
 
     def to_unit(self, value: Any) -> Any:
-        """z in [0, 1] of a value; values outside the range give z outside [0, 1]."""
+        """Return z in [0, 1] of a value; values outside the range give z outside [0, 1]."""
         if self.scale == "log":
             return np.log(value / self.low) / math.log(self.high / self.low)
         return (value - self.low) / (self.high - self.low)
 
     def from_unit(self, z: ArrayLike) -> Any:
-        """The value at z; the ends are met exactly. Numbers or arrays."""
+        """Return the value at z; the ends are met exactly. Numbers or arrays."""
         z = np.asarray(z, dtype=float)
         if self.scale == "log":
             value = self.low * np.exp(z * math.log(self.high / self.low))
@@ -38,7 +47,7 @@ class Bound(NamedTuple):
         return np.where(z <= 0, self.low, np.where(z >= 1, self.high, value))
 
     def slope(self, value: Any) -> Any:
-        """d value / d z."""
+        """Return d value / d z."""
         return (
             value * math.log(self.high / self.low)
             if self.scale == "log"
@@ -46,15 +55,21 @@ class Bound(NamedTuple):
         )
 
 
-def bounds(loop, free):
-    """The Bounds of {name: Free}; the name of an array stands for all its entries.
+def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
+    """Return the Bounds of {name: Free}; the name of an array stands for all its entries.
 
     Raises InputError for an unknown name, a range that is empty, not finite or outside what the
     parameter allows.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> [b.name for b in bounds(presets.find("cascaded/pi").loop, {"x0": (1.0, 2.0)})]
+    ['x0[0]', 'x0[1]']
     """
     if not free:
         raise InputError("nothing to tune: name at least one parameter with --free NAME=LOW:HIGH")
-    found = []
+    found: list[Bound] = []
     for name, spec in free.items():
         low, high, scale = check_free(loop, name, *spec)
         unit = describe(loop, name)["unit"]

@@ -1,46 +1,65 @@
-"""Limits: a measure, its bound, and the margin that is left."""
+"""Limits: a measure, its limit, and the margin to it.
 
-from typing import NamedTuple
-
-import numpy as np
-
-from jaxtank import measures as ms
-from jaxtank.core.errors import InputError
-from jaxtank.rig import check_limits
-from tuning.problem import scenarios as sc
-
-NOT_A_NUMBER = 1e6
-"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of
-the step) is taken to break its limit.
+Imported by `problem`, `search` and `uncertainty`.
 """
 
-NOTHING = 1e-3
-"""Share of what a measure is about, below which a limit is as good as 0 [-]."""
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
 
-SPILL = 1e-6
-"""Volume over a rim that counts as none, where rims are physics, as a share of what the tank holds
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxtank import measures as ms
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.rig import check_limits
+from tuning.problem.scenarios import ScenarioRun
+
+UNDEFINED_MARGIN = 1e6
+"""Amount by which a measure that is infinite (never settled) or undefined (never reached 90 % of
+the step) is taken to violate its limit.
+"""
+
+SMALLEST_SCALE = 1e-3
+"""Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
+
+NO_OVERFLOW = 1e-6
+"""Overflow volume that counts as none, where rims are physics, as a share of the tank's volume
 [-].
 """
 
 
-class Limit(NamedTuple):
-    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in the
-    measure's unit, in one scenario.
+@dataclasses.dataclass(frozen=True)
+class Limit:
+    """One hard constraint: entry `index` of `measure` at most (or at least) `value`, in one run.
+
+    The value is in the measure's unit; run is the scenario's index in `Problem.runs`.
+
+    Examples
+    --------
+    >>> limit = Limit("max_level", 2, 30.0)
+    >>> limit.label, limit.sign, limit.margin({"max_level": np.array([9.0, 8.0, 29.5])})
+    ('max_level of tank 3', 1.0, 0.5)
     """
 
     measure: str
     index: int
     value: float
-    lane: int = 0
+    run: int = 0
     scenario: str = ""
 
     @property
-    def sign(self):
+    def sign(self) -> float:
         """+1 for an upper limit, -1 for a lower one."""
         return ms.MEASURES[self.measure].sense
 
     @property
-    def label(self):
+    def label(self) -> str:
         """Name with the entry, counted from 1: "max_level of tank 3", and its scenario."""
         per = ms.MEASURES[self.measure].per
         where = f" in {self.scenario}" if self.scenario else ""
@@ -48,107 +67,133 @@ class Limit(NamedTuple):
             self.measure if per == "run" else f"{self.measure} of {per} {self.index + 1}"
         ) + where
 
-    def margin(self, measures):
-        """How far the limit is from being met exactly: positive where it holds. See `margins`."""
+    def margin(self, measures: Mapping[str, Any]) -> float:
+        """Return the distance to the limit, positive where it holds; see `margins`."""
         return float(self.margins(np.ravel(measures[self.measure])[self.index]))
 
-    def margins(self, values):
-        """Return the margin for each of `values` of the measure.
+    def margins(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Return the margin for each of `values` of the measure, in its unit.
 
-        An infinite value (never settled) breaks the limit by NOT_A_NUMBER, as does an undefined one
-        (a rise that never reached 90 %). An undefined settling time holds: the output never left
-        its band.
+        An infinite value (never settled) violates the limit by UNDEFINED_MARGIN, as does an
+        undefined one (a rise that never reached 90 %). An undefined settling time holds: the
+        output never left its band.
         """
-        undefined = NOT_A_NUMBER if ms.MEASURES[self.measure].nan_holds else -NOT_A_NUMBER
-        found = np.clip(self.sign * (self.value - np.asarray(values)), -NOT_A_NUMBER, NOT_A_NUMBER)
+        undefined = UNDEFINED_MARGIN if ms.MEASURES[self.measure].nan_holds else -UNDEFINED_MARGIN
+        distance = self.sign * (self.value - np.asarray(values))
+        found = np.clip(distance, -UNDEFINED_MARGIN, UNDEFINED_MARGIN)
         return np.where(np.isnan(values), undefined, found)
 
 
-def room_of(limit, loop):
-    """The size by which a limit's margin counts: the limit's own, but no less than a thousandth of
-    what its measure is about (the tanks' height or volume, 1 for a share, 100 for percent), which
-    matters where a limit is 0 or nearly.
+def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
+    """Return the size by which a limit's margin counts, in the measure's unit.
+
+    The limit's own size, but no less than a thousandth of the measured quantity (the tanks' height
+    or volume, 1 for a share, 100 for percent), which matters where a limit is 0 or nearly.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> limit_scale(Limit("saturated_fraction", 0, 0.2), loop)
+    0.2
+    >>> limit_scale(Limit("saturated_fraction", 0, 0.0), loop)
+    0.001
     """
-    length, rim = loop.units[0], np.asarray(loop.plant.rim)
-    # no other plant spills, and some have no area to name
-    area = np.asarray(loop.plant.area) if loop.plant.overflow else 1.0
-    own = {
+    plant: Any = loop.plant  # of any class: no other plant overflows, and some have no area to name
+    length, rim = loop.units[0], np.asarray(plant.rim)
+    area = np.asarray(plant.area) if plant.overflow else 1.0
+    size = {
         length: float(np.max(rim)),
         f"{length}^3": float(np.max(rim * area)),
         "%": 100.0,
         "-": 1.0,
     }.get(ms.unit(limit.measure, loop.units))
-    return max(abs(limit.value), NOTHING * own) if own is not None else abs(limit.value) or 1.0
+    if size is None:
+        return abs(limit.value) or 1.0
+    return max(abs(limit.value), SMALLEST_SCALE * size)
 
 
-def resolve_limits(case, limits=None, lane=0, scenario=""):
-    """The Limits of {measure: number, list or "rim"}; the case's own where None.
+def resolve_limits(
+    case: Case, limits: Mapping[str, Any] | None = None, run: int = 0, scenario: str = ""
+) -> list[Limit]:
+    """Return the Limits of {measure: number, list or "rim"}; the case's own where None.
 
     With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no
     overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
     Raises InputError for an unknown measure, a value that is no number, and a measure all of whose
     entries are undefined.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> [limit.label for limit in resolve_limits(presets.find("cascaded/pi"), {"ise": 3.0})]
+    ['ise of output 1']
     """
-    return resolve_in([sc.Lane(scenario, case, None, 1.0)], limits, lane)
+    return resolve_in([ScenarioRun(scenario, case, None, 1.0)], limits, run)
 
 
-def resolve_in(lanes, limits=None, first=0):
-    """Return the Limits of `resolve_limits` in each of `lanes`, numbered from `first`.
+def resolve_in(
+    runs: Sequence[ScenarioRun], limits: Mapping[str, Any] | None = None, first: int = 0
+) -> list[Limit]:
+    """Return the Limits of `resolve_limits` in each of `runs`, numbered from `first`.
 
-    Raises InputError as it does, for a measure that is undefined in all of them."""
-    found, why = [], {}
-    for i, lane in enumerate(lanes, first):
-        plant = lane.case.loop.plant
-        given = check_limits(lane.case.loop, lane.case.limits if limits is None else limits)
+    Raises InputError as it does, for a measure that is undefined in all of them.
+    """
+    found: list[Limit] = []
+    why: dict[str, tuple[Any, str]] = {}
+    for i, run in enumerate(runs, first):
+        loop = run.case.loop
+        given = check_limits(loop, run.case.limits if limits is None else limits)
         for measure, value in given.items():
-            value = np.asarray(plant.rim) if isinstance(value, str) else value
-            values = np.broadcast_to(np.asarray(value, dtype=float), (ms.entries(measure, plant),))
-            reason, missing = undefined(measure, lane.case)
+            value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
+            reason, missing = undefined(measure, run.case)
             if all(missing):
                 why.setdefault(measure, (value, reason))
                 continue
+            values = np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))
             for j, v in enumerate(values):
-                held = plant.overflow and measure == "max_level" and v >= plant.rim[j]
-                measured, at = (
-                    ("overflow_volume", SPILL * float(plant.area[j] * plant.rim[j]))
-                    if held
-                    else (measure, float(v))
-                )
                 if not missing[j]:
-                    found.append(Limit(measured, j, at, i, lane.name))
+                    measured, at = _without_overflow(measure, j, float(v), loop.plant)
+                    found.append(Limit(measured, j, at, i, run.name))
     for measure, (value, reason) in why.items():
         if not any(limit.measure == measure for limit in found):
-            unit, text = (
-                ms.unit(measure, lanes[0].case.loop.units),
-                ", ".join(f"{v:g}" for v in np.ravel(value)),
-            )
-            where = "in every scenario" if len(lanes) > 1 else "on this run"
+            text = ", ".join(f"{v:g}" for v in np.ravel(value))
+            where = "in every scenario" if len(runs) > 1 else "on this run"
             raise InputError(
-                f"limit {measure} = {text} {unit}: undefined {where}: {reason}, or drop the limit"
-                f" (--limit {measure}=none)"
+                f"limit {measure} = {text} {ms.unit(measure, runs[0].case.loop.units)}: undefined"
+                f" {where}: {reason}, or drop the limit (--limit {measure}=none)"
             )
     return found
 
 
-def undefined(measure, case):
-    """Return (reason and remedy, (entries,) True where `measure` has no value on the run of
-    `case`).
+def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:
+    """Return (measure, value) of a limit; one at a rim that is physics limits the overflow."""
+    if plant.overflow and measure == "max_level" and value >= np.asarray(plant.rim)[index]:
+        return "overflow_volume", NO_OVERFLOW * float(plant.area[index] * plant.rim[index])
+    return measure, value
+
+
+def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
+    """Return (reason and remedy, (entries,) True where `measure` has no value on the case's run).
 
     Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has
-    no step within the run, and recovery where nothing is poured.
+    no step within the run, and recovery where there is no inflow disturbance.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> undefined("ise", presets.find("cascaded/pi"))
+    ('', [False])
     """
     wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)
     since = np.full(1, -1.0) if onset is None else np.asarray(onset)
     if "since" in wanted and onset is not None:
-        why = f"nothing is poured within its {clock.duration:g} s; add a pour ([[pour]])"
+        why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    windows = loop.reference.windows(clock) if "window" in wanted else None
+    windows = cast(Any, loop.reference).windows(clock) if "window" in wanted else None
     if windows is not None:
-        steps = [np.asarray(step) for _, step, *_ in windows]
-        why = (
-            f"no setpoint is stepped within its {clock.duration:g} s; add a step"
-            " (reference.changes)"
-        )
+        steps = [np.asarray(window[1]) for window in windows]
+        why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"
         return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
     return "", [False] * ms.entries(measure, loop.plant)

@@ -1,20 +1,28 @@
-"""What is made small and what must hold, as numbers with exact derivatives."""
+"""What is minimised and what must hold, as numbers with exact derivatives.
+
+Imported by `search`, and as `tuning.Problem`.
+"""
+
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
 from tuning.problem.bounds import bounds
-from tuning.problem.limits import NOT_A_NUMBER, resolve_in, room_of
-from tuning.storage.evaluation_log import Memo
+from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
+from tuning.problem.point import Floats, Point
+from tuning.storage.evaluation_log import EvaluationCache
 
 FORWARD_LIMIT = 24
 """Number of free parameters up to which derivatives run forward with the simulation; above,
@@ -24,69 +32,61 @@ checkpointed reverse, without a Gauss-Newton matrix.
 ROOT = "rms_error_total"
 """The measure that is the root of a sum of squares over all outputs."""
 
-
-EXPLODED = 1e9
-"""Size at which a cost, a margin or a slope is no longer a number to search with."""
-
 RISKS = ("mean", "cvar", "worst")
-"""What the costs of several scenarios come to: their weighted mean, the mean of the worst TAIL of
-them, or the worst.
+"""The cost of several scenarios: their weighted mean, the mean of the worst TAIL of them, or the
+worst.
 """
 
 TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
 
-
-class Point(NamedTuple):
-    """The problem at one point z of the unit cube, derivatives with respect to z."""
-
-    z: np.ndarray  # (P,)
-    cost: float  # weighted sum of measures, mean over scenarios
-    gradient: np.ndarray  # (P,)
-    # (P, P) second derivative of what `Problem.model` names, without the residuals' own curvature
-    gauss_newton: np.ndarray
-    margins: np.ndarray  # (limits,) in each measure's unit
-    margin_slopes: np.ndarray  # (limits, P)
-    measures: tuple  # of each scenario, {name: value}
-    lane_costs: np.ndarray = np.zeros(0)  # (scenarios,)
-    lane_slopes: np.ndarray = np.zeros((0, 0))  # (scenarios, P)
-    rows: tuple = ()  # which of the problem's limits the margins are of, where not all
-
-    @property
-    def finite(self):
-        """True if cost, margins and derivatives are numbers one can search with; a slope of 1e9 is
-        that of a loop that has gone unstable.
-        """
-        return all(
-            np.all(np.abs(v) < EXPLODED)
-            for v in (self.cost, self.gradient, self.margins, self.margin_slopes)
-        )
+Row = Mapping[str, Any]
+"""Measures of one scenario, {name: value}."""
 
 
 class Problem:
     """A case, its free parameters, its cost and its limits, over one run or several scenarios.
 
-    free: {name: Free}; objective: {measure: weight} (a list measure counts with the sum of its
-    entries; scenarios count with their weighted mean); limits as in resolve_limits, held in every
-    scenario; scenarios: tuple of Scenario, () for the case's own run, None for those of the case;
-    seed: of the sensor noise, which is the same for every evaluation (common random numbers); memo:
-    a Memo of what was evaluated before; risk: what the costs of the scenarios come to, one of
-    RISKS. `tune` takes a Problem in the place of a Case.
+    `tune` takes a Problem in the place of a Case. The search sees z in [0, 1]^P (`Bound`).
+
+    Parameters
+    ----------
+    case : the Case.
+    free : {name: (low, high) or Free}; the case's own where None, as for the next three.
+    objective : {measure: weight}; a measure with several entries counts with their sum.
+    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario.
+    scenarios : tuple of Scenario, () for the case's own run alone.
+    seed : of the sensor noise, which is the same for every evaluation (common random numbers).
+    cache : an EvaluationCache of what was evaluated before.
+    risk : how the costs of the scenarios are combined, one of RISKS.
+
+    Raises
+    ------
+    InputError : for a name, range, measure, limit or scenario that cannot be used.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> problem = Problem(presets.find("cascaded/pi"), free={"controller.Kc": (0.5, 2.0)})
+    >>> problem.names, problem.risk
+    (['controller.Kc[0]'], 'mean')
     """
 
     def __init__(
         self,
-        case,
-        free=None,
-        objective=None,
-        limits=None,
-        scenarios=None,
-        seed=0,
-        memo=None,
-        risk="mean",
+        case: Case,
+        free: Mapping[str, Any] | None = None,
+        objective: Mapping[str, float] | None = None,
+        limits: Mapping[str, Any] | None = None,
+        scenarios: Sequence[Scenario] | None = None,
+        seed: int = 0,
+        cache: EvaluationCache | None = None,
+        risk: str = "mean",
     ):
         self.case, self.loop, self.clock, self.seed = case, case.loop, case.clock, seed
-        self.given = dict(free=free, objective=objective, scenarios=scenarios, risk=risk)
+        self.given: dict[str, Any] = dict(
+            free=free, objective=objective, scenarios=scenarios, risk=risk
+        )
         if risk not in RISKS:
             raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
         self.risk = risk
@@ -95,10 +95,10 @@ class Problem:
         self.scenarios = sc.check_scenarios(
             case, case.scenarios if scenarios is None else scenarios, self.names
         )
-        self.lanes = sc.lanes_of(case, self.scenarios, seed)
-        self.groups = sc.groups_of(self.lanes)
+        self.runs = sc.runs_of(case, self.scenarios, seed)
+        self.groups = sc.groups_of(self.runs)
         self.limit(limits)
-        self.memo = Memo() if memo is None else memo
+        self.cache = EvaluationCache() if cache is None else cache
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
 
     def limit(self, limits: Mapping[str, Any] | None) -> None:
@@ -106,12 +106,12 @@ class Problem:
 
         The evaluation cache holds margins of the former limits, and is emptied."""
         self.given["limits"] = limits
-        self.limits = resolve_in(self.lanes, limits)
-        self.rooms = np.array([room_of(limit, self.loop) for limit in self.limits])
+        self.limits: list[Limit] = resolve_in(self.runs, limits)
+        self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
-        self.memo = Memo()
+        self.cache = EvaluationCache()
 
     @property
     def names(self) -> list[str]:
@@ -120,24 +120,24 @@ class Problem:
 
     @property
     def model(self) -> str | None:
-        """What the Gauss-Newton matrix is the second derivative of: "square" (the cost is one root
-        mean square: its square), "cost", or None where no term of the cost is made of squares, or
-        the parameters are too many to carry slopes of.
+        """What the Gauss-Newton matrix is the second derivative of.
+
+        "square" (the cost is one root mean square: its square), "cost", or None where no term of
+        the cost is a sum of squares, or the parameters are too many to carry derivatives of.
         """
         if len(self.bounds) > FORWARD_LIMIT:
             return None
         if self.risk != "mean":
-            # the worst change from point to point: a second derivative of the mean says little
+            # the worst scenario changes from point to point: the mean's curvature is not its own
             return None
-        if set(self.objective) == {ROOT} and len(self.lanes) == 1:
+        if set(self.objective) == {ROOT} and len(self.runs) == 1:
             return "square"
         return "cost" if any(m == ROOT or m in ms.squares() for m in self.objective) else None
 
-    def start(self) -> np.ndarray:
-        """(P,) z of the case's own values. Raises InputError if one lies outside its range."""
-        z = []
-        for b in self.bounds:
-            value = float(get_value(self.loop, b.name))
+    def start(self) -> Floats:
+        """Return (P,) z of the case's own values. Raises InputError if one is outside its range."""
+        z: list[float] = []
+        for b, value in zip(self.bounds, self.own_values().values()):
             if not b.low <= value <= b.high:
                 raise InputError(
                     f"{b.name} = {value:g} {b.unit}: starts outside its range {b.low:g}:{b.high:g}"
@@ -146,28 +146,30 @@ class Problem:
             z.append(float(b.to_unit(value)))
         return np.array(z)
 
-    def values(self, z: np.ndarray) -> dict[str, float]:
-        """{name: value in its unit} at z."""
+    def own_values(self) -> dict[str, float]:
+        """Return {name: value in its unit} of the case itself."""
+        return {name: float(get_value(self.loop, name)) for name in self.names}
+
+    def values(self, z: Any) -> dict[str, float]:
+        """Return {name: value in its unit} at z (P,)."""
         return {b.name: float(b.from_unit(v)) for b, v in zip(self.bounds, z)}
 
-    def loop_at(self, z: np.ndarray) -> ClosedLoop:
-        """The loop with the values at z."""
+    def loop_at(self, z: Any) -> ClosedLoop:
+        """Return the loop with the values at z (P,)."""
         return with_values(self.loop, self.values(z))
 
-    def cost(self, measures: Mapping[str, Any]) -> float:
-        """Weighted sum of the measures of one run."""
+    def cost(self, measures: Row) -> float:
+        """Return the weighted sum of the measures of one run."""
         return sum(w * float(np.sum(measures[m])) for m, w in self.objective.items())
 
-    def total(self, table: Sequence[Mapping[str, Any]]) -> float:
-        """The cost of `table`, the measures of every scenario: what their costs come to by `risk`."""
+    def total(self, table: Sequence[Row]) -> float:
+        """Return the cost of `table`, the measures of every scenario, combined by `risk`."""
         costs = np.array([self.cost(row) for row in table])
-        return float(self.shares(costs, range(len(self.lanes))) @ costs)
+        return float(self.shares(costs, range(len(self.runs))) @ costs)
 
-    def shares(self, costs: np.ndarray, lanes: Sequence[int]) -> np.ndarray:
-        """What the cost of each of `lanes` counts, given all their costs: its weight, or where it
-        is among the worst. Sums to 1.
-        """
-        weights = np.array([self.lanes[i].weight for i in lanes])
+    def shares(self, costs: Floats, runs: Sequence[int]) -> Floats:
+        """Return the share of each of `runs` in the cost, given their costs (runs,); sums to 1."""
+        weights = np.array([self.runs[i].weight for i in runs])
         if self.risk == "mean" or not np.all(np.isfinite(costs)):
             return weights / weights.sum()
         order = np.argsort(-costs, kind="stable")
@@ -176,160 +178,139 @@ class Problem:
         chosen[order[:count]] = weights[order[:count]]
         return chosen / chosen.sum()
 
-    def margins(self, table: Sequence[Mapping[str, Any]]) -> np.ndarray:
-        """(limits,) margin of each limit, of the measures of every scenario."""
-        return np.array([limit.margin(table[limit.lane]) for limit in self.limits])
+    def margins(self, table: Sequence[Row]) -> Floats:
+        """Return (limits,) margin of each limit, of the measures of every scenario."""
+        return np.array([limit.margin(table[limit.run]) for limit in self.limits])
 
-    def screen(self, zs: np.ndarray, coarse: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """(costs (points,), margins (points, limits)) at many points (points, P), without
-        derivatives; coarse: at the coarse clock.
+    def screen(self, zs: Any, coarse: bool = False) -> tuple[Floats, Floats]:
+        """Return (costs (points,), margins (points, limits)) at zs (points, P), no derivatives.
+
+        coarse : with the coarse clock of the screening.
         """
         zs = np.asarray(zs, dtype=float)
-        self.simulations += len(zs) * len(self.lanes)
-        return tuple(
-            v.copy()
-            for v in self.memo.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse))
-        )
+        self.simulations += len(zs) * len(self.runs)
+        found = self.cache.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse))
+        return found[0].copy(), found[1].copy()
 
-    def _per_lane(self) -> list[Any]:
-        return [None] * len(self.lanes)
-
-    def _screen(self, zs, coarse):
+    def _screen(self, zs: Floats, coarse: bool) -> tuple[Floats, Floats]:
         points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
-        tables, broken = [self._per_lane() for _ in zs], np.zeros(len(zs), dtype=bool)
+        tables, broken = [self._per_run() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
-            clock = sc.coarse_clock(group.clock) if coarse else group.clock
+            clock = sc.screening_clock(group.clock) if coarse else group.clock
             measures, flags = sc.values_of(group, self.needed, points, clock)
-            measures, broken = (
-                {m: np.asarray(v) for m, v in measures.items()},
-                broken | np.asarray(flags).any(axis=1),
-            )
-            for j, lane in enumerate(group.lanes):
+            broken |= np.asarray(flags).any(axis=1)
+            arrays = {m: np.asarray(v) for m, v in measures.items()}
+            for j, run in enumerate(group.runs):
                 for i, table in enumerate(tables):
-                    table[lane] = {m: v[i, j] for m, v in measures.items()}
+                    table[run] = {m: v[i, j] for m, v in arrays.items()}
         costs = np.where(broken, np.nan, [self.total(table) for table in tables])
         return costs, np.array([self.margins(table) for table in tables]).reshape(len(zs), -1)
 
-    def point(self, z: np.ndarray) -> Point:
-        """The Point at z: every scenario at its own step, with derivatives."""
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        self.simulations, self.gradients = (
-            self.simulations + len(self.lanes),
-            self.gradients + len(self.lanes),
-        )
-        found = Point(z, *self.memo.recall("point", [z], lambda: self._point(z, self.groups)))
+    def point(self, z: Any) -> Point:
+        """Return the Point at z (P,): every scenario at its own step, with derivatives."""
+        z = self._counted(z, len(self.runs))
+        found = Point(z, *self.cache.recall("point", [z], lambda: self._point(z, self.groups)))
         self.non_finite += not found.finite
         return found
 
-    def rough(self, z: np.ndarray) -> Point:
-        """The Point at z with a tenth of the samples, near enough to search with before the true
-        one is asked.
-        """
-        z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
-        self.simulations, self.gradients = (
-            self.simulations + len(self.lanes),
-            self.gradients + len(self.lanes),
-        )
-        groups = [group._replace(clock=sc.rough_clock(group.clock)) for group in self.groups]
-        return Point(z, *self.memo.recall("rough", [z], lambda: self._point(z, groups)))
+    def coarse_point(self, z: Any) -> Point:
+        """Return the Point at z (P,) with a tenth of the samples: a start for a search."""
+        z = self._counted(z, len(self.runs))
+        groups = [group._replace(clock=sc.coarse_clock(group.clock)) for group in self.groups]
+        return Point(z, *self.cache.recall("coarse", [z], lambda: self._point(z, groups)))
 
-    def part(self, z: np.ndarray, batch: int, rng: np.random.Generator) -> Point:
-        """The Point at z of about `batch` scenarios drawn by rng, the same number of every group,
-        so that nothing is compiled twice.
+    def batch_point(self, z: Any, batch: int, rng: np.random.Generator) -> Point:
+        """Return the Point at z (P,) of about `batch` scenarios drawn by rng.
+
+        The same number of every group, so that nothing is compiled twice.
         """
-        z, groups = np.clip(np.asarray(z, dtype=float), 0.0, 1.0), []
+        groups: list[sc.Group] = []
         for group in self.groups:
-            count = min(len(group.lanes), max(1, round(batch * len(group.lanes) / len(self.lanes))))
+            count = min(len(group.runs), max(1, round(batch * len(group.runs) / len(self.runs))))
             groups.append(
-                sc.take(group, np.sort(rng.choice(len(group.lanes), count, replace=False)))
+                sc.take(group, np.sort(rng.choice(len(group.runs), count, replace=False)))
             )
-        drawn = [i for group in groups for i in group.lanes]
-        self.simulations, self.gradients = (
-            self.simulations + len(drawn),
-            self.gradients + len(drawn),
+        drawn = [i for group in groups for i in group.runs]
+        z = self._counted(z, len(drawn))
+        found = self.cache.recall(
+            "batch", [z, np.array(drawn, dtype=float)], lambda: self._point(z, groups)
         )
-        found = self.memo.recall(
-            "part", [z, np.array(drawn, dtype=float)], lambda: self._point(z, groups)
-        )
-        return Point(
-            z, *found, rows=tuple(i for i, limit in enumerate(self.limits) if limit.lane in drawn)
-        )
+        rows = tuple(i for i, limit in enumerate(self.limits) if limit.run in drawn)
+        return Point(z, *found, rows=rows)
 
-    @np.errstate(over="ignore", invalid="ignore")  # what explodes is told by Point.finite
-    def _point(self, z, groups):
-        """The fields of the Point at z after z itself, of the lanes in `groups` alone; others count
-        nothing.
-        """
-        values = {name: np.float64(v) for name, v in self.values(z).items()}
-        per_z = np.array(
-            [float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())]
-        )
-        count, ruined = len(z), False
-        table, slopes, matrices = (self._per_lane() for _ in range(3))
-        for group in groups:
-            measures, rates, curvature, broken = self._run(group, values)
-            ruined = ruined or bool(np.any(broken))
-            for j, i in enumerate(group.lanes):
-                table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
-                slopes[i] = {
-                    m: np.asarray(v)[j].reshape(-1, count) * per_z for m, v in rates.items()
-                }
-                matrices[i] = self._curvature(
-                    np.asarray(curvature)[j] * np.outer(per_z, per_z), table[i], slopes[i]
-                )
-        mine = [limit for limit in self.limits if table[limit.lane] is not None]
-        margins = np.array([limit.margin(table[limit.lane]) for limit in mine])
-        margin_slopes = np.array(
-            [-limit.sign * slopes[limit.lane][limit.measure][limit.index] for limit in mine]
-        ).reshape(-1, count)
-        margin_slopes[np.abs(margins) >= NOT_A_NUMBER] = 0.0
+    def _counted(self, z: Any, runs: int) -> Floats:
+        """Return z in the unit cube, after `runs` simulations with gradients were counted."""
+        self.simulations, self.gradients = self.simulations + runs, self.gradients + runs
+        return np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
+
+    def _per_run(self) -> list[Any]:
+        return [None] * len(self.runs)
+
+    @np.errstate(over="ignore", invalid="ignore")  # Point.finite reports what diverges
+    def _point(self, z: Floats, groups: Sequence[sc.Group]) -> tuple[Any, ...]:
+        """Return the fields of the Point at z after z itself, of the runs in `groups` alone."""
+        table, slopes, matrices, diverged = self._derivatives(z, groups)
         run = [i for i, row in enumerate(table) if row is not None]
+        limits = [limit for limit in self.limits if table[limit.run] is not None]
+        margins = np.array([limit.margin(table[limit.run]) for limit in limits])
+        margin_slopes = np.array(
+            [-limit.sign * slopes[limit.run][limit.measure][limit.index] for limit in limits]
+        ).reshape(-1, len(z))
+        margin_slopes[np.abs(margins) >= UNDEFINED_MARGIN] = 0.0
         costs = np.array([self.cost(table[i]) for i in run])
         rates = np.array(
             [sum(w * slopes[i][m].sum(axis=0) for m, w in self.objective.items()) for i in run]
         )
         shares = self.shares(costs, run)
         matrix = sum(s * matrices[i] for s, i in zip(shares, run))
-        cost = np.nan if ruined else float(shares @ costs)
-        return (
-            cost,
-            shares @ rates,
-            matrix,
-            margins,
-            margin_slopes,
-            tuple(table[i] for i in run),
-            costs,
-            rates,
-        )
+        cost = np.nan if diverged else float(shares @ costs)
+        measures = tuple(table[i] for i in run)
+        return cost, shares @ rates, matrix, margins, margin_slopes, measures, costs, rates
 
-    def _squares(self):
-        """((measure, weight), ...) of the sums of squares that the Gauss-Newton matrix is made of."""
+    def _derivatives(
+        self, z: Floats, groups: Sequence[sc.Group]
+    ) -> tuple[list[Any], list[Any], list[Any], bool]:
+        """Return (measures, their slopes by z, Gauss-Newton) of each run, None where not run.
+
+        And whether one of them diverged.
+        """
+        values = {name: np.float64(v) for name, v in self.values(z).items()}
+        per_z = np.array(
+            [float(b.slope(np.float64(v))) for b, v in zip(self.bounds, values.values())]
+        )
+        table, slopes, matrices, diverged = *(self._per_run() for _ in range(3)), False
+        for group in groups:
+            measures, rates, curvature, broken = self._run(group, values)
+            diverged = diverged or bool(np.any(broken))
+            for j, i in enumerate(group.runs):
+                table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
+                slopes[i] = {
+                    m: np.asarray(v)[j].reshape(-1, len(z)) * per_z for m, v in rates.items()
+                }
+                matrices[i] = self._curvature(
+                    np.asarray(curvature)[j] * np.outer(per_z, per_z), table[i], slopes[i]
+                )
+        return table, slopes, matrices, diverged
+
+    def _squares(self) -> tuple[tuple[str, float], ...]:
+        """Return ((measure, weight), ...) of the squares of the Gauss-Newton matrix."""
         own = tuple((m, w) for m, w in self.objective.items() if m in ms.squares())
         return (("mean_square_error", 1.0),) if ROOT in self.objective or not own else own
 
-    def _curvature(self, matrix, measures, slopes):
+    def _curvature(self, matrix: Floats, measures: Row, slopes: Row) -> Floats:
         if self.model != "cost" or ROOT not in self.objective:
             return matrix
         # of a root: (matrix of its square / 2 - slope slope') / root, which is never negative
         root, slope = max(float(measures[ROOT]), 1e-12), slopes[ROOT][0]
         return self.objective[ROOT] * (0.5 * matrix - np.outer(slope, slope)) / root
 
-    def _run(self, group, values):
+    def _run(self, group: sc.Group, values: Mapping[str, Any]) -> tuple[Row, Row, Any, Any]:
+        """Return (measures, slopes, Gauss-Newton, diverged) of a group, each (runs, ...)."""
         if len(values) <= FORWARD_LIMIT:
-            needed = tuple(
-                dict.fromkeys(
-                    [
-                        *self.needed,
-                        *([ROOT] if self.model == "cost" and ROOT in self.objective else []),
-                    ]
-                )
-            )
+            root = [ROOT] if self.model == "cost" and ROOT in self.objective else []
+            needed = tuple(dict.fromkeys([*self.needed, *root]))
             return sc.slopes_of(group, needed, values, self._squares())
         measures, slopes = sc.reverse_slopes_of(group, self.needed, values)
         broken = not all(np.all(np.isfinite(v)) for v in slopes.values())
-        return (
-            measures,
-            slopes,
-            np.full((len(group.lanes), len(values), len(values)), np.nan),
-            broken,
-        )
+        none = np.full((len(group.runs), len(values), len(values)), np.nan)
+        return measures, slopes, none, broken

@@ -3,6 +3,9 @@
 The base classes of the results of `tuning`; their reports are opened when they are asked for.
 """
 
+# `report`, which is opened when it is asked for, is not strict
+# pyright: reportUnknownVariableType=false
+
 import importlib
 from pathlib import Path
 from typing import Any, ClassVar

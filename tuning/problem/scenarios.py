@@ -1,7 +1,16 @@
-"""Several runs behind one cost: scenarios that differ in numbers run as lanes of one compiled loop."""
+"""Several runs behind one cost: scenarios that differ in numbers run as one compiled batch.
+
+Imported by `problem`, `search` and `uncertainty`.
+"""
+
+# jax's transformations have no complete types
+# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
 
 import dataclasses
 import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,16 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import rig
-from jaxtank.case import Scenario
+from jaxtank.case import Case, Scenario
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla import flags
 
 MANY = 1024
 """Scenarios that one tuning may have."""
-
 
 COARSE = 10
 """How many samples of the case make one of the coarse stage."""
@@ -26,19 +36,37 @@ COARSE = 10
 FEWEST = 200
 """Samples that a first local search needs at least."""
 
+Measures = dict[str, Any]
+"""{name: array}."""
 
-def coarse_clock(clock):
-    """The clock of the coarse stage: ten times the step, where that leaves at least a thousand
-    samples; else the clock itself.
+Shape = tuple[Any, tuple[bool, ...], int]
+"""Structure of the loop, which leaves differ, number of runs."""
+
+
+def screening_clock(clock: Clock) -> Clock:
+    """Return the clock of the screening: ten times the step.
+
+    Where that leaves at least a thousand samples; else the clock itself.
+
+    Examples
+    --------
+    >>> screening_clock(Clock(dt=0.01, duration=200.0)).dt
+    0.1
     """
     if clock.samples < 1000 * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
 
 
-def rough_clock(clock):
-    """The clock of a first local search: ten times the step, where that leaves at least FEWEST
-    samples; else the clock itself.
+def coarse_clock(clock: Clock) -> Clock:
+    """Return the clock of a first local search: ten times the step.
+
+    Where that leaves at least FEWEST samples; else the clock itself.
+
+    Examples
+    --------
+    >>> coarse_clock(Clock(dt=0.01, duration=20.0)).dt
+    0.1
     """
     return (
         clock
@@ -47,63 +75,84 @@ def rough_clock(clock):
     )
 
 
-class Lane(NamedTuple):
+class ScenarioRun(NamedTuple):
     """One scenario as it is run."""
 
     name: str
-    case: Any  # the case with the scenario's values set
+    case: Case  # with the scenario's values set
     key: Any  # of the sensor noise, None where there is none
-    weight: float  # share of the mean [-]; those of all lanes sum to 1
+    weight: float  # share of the mean [-]; those of all runs sum to 1
 
 
 class Group(NamedTuple):
-    """Lanes with one structure and one clock: what differs is stacked, what is shared is not."""
+    """Runs with one structure and one clock: what differs is stacked, what is shared is not."""
 
-    lanes: tuple  # their indices
-    clock: Any
+    runs: tuple[int, ...]  # their indices
+    clock: Clock
     structure: Any
-    leaves: tuple  # of the loop, stacked where `apart`
-    apart: tuple  # True where the lanes differ
-    keys: Any  # (lanes,) or None
+    leaves: tuple[Any, ...]  # of the loop, stacked where `apart`
+    apart: tuple[bool, ...]  # True where the runs differ
+    keys: Any  # (runs,) or None
+
+    @property
+    def shape(self) -> Shape:
+        """What the compiled functions are specialised to."""
+        return self.structure, self.apart, len(self.runs)
 
 
-def noisy(case):
-    """True if a run of the case draws noise."""
+def noisy(case: Case) -> bool:
+    """Return True if a run of the case draws noise.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> noisy(presets.find("gouta2015/backstepping"))
+    False
+    """
     return bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
-def check_scenarios(case, scenarios, free=()):
-    """`scenarios` as a tuple of Scenario, if each can be run and none sets what is free."""
+def check_scenarios(
+    case: Case, scenarios: Sequence[Any], free: Sequence[str] = ()
+) -> tuple[Scenario, ...]:
+    """Return `scenarios` as a tuple of Scenario, if each can be run and none sets what is free."""
     found = tuple(s if isinstance(s, Scenario) else Scenario(**s) for s in scenarios)
     if len(found) > MANY:
         raise InputError(f"scenarios: {len(found)} of them, must be at most {MANY}")
     for s in found:
-        if not np.isfinite(s.weight) or s.weight <= 0:
-            raise InputError(
-                f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
-            )
-        if isinstance(s.seed, bool) or not isinstance(s.seed, int) or not 0 <= s.seed < 2**31:
-            raise InputError(
-                f"scenario {s.name!r}: seed = {s.seed!r} must be a whole number from 0 to"
-                f" {2**31 - 1}"
-            )
-        for name in s.values:
-            for other in free:
-                if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
-                    raise InputError(f"scenario {s.name!r} sets {name}, which is free")
+        _check_scenario(s, free)
     if [s.name for s in found] != list(dict.fromkeys(s.name for s in found)):
         raise InputError("scenarios: two have the same name")
     return found
 
 
-def lanes_of(case, scenarios, seed):
-    """The Lanes of a case: one for each scenario, or one for the case itself. Raises InputError,
-    naming the scenario.
+def _check_scenario(s: Scenario, free: Sequence[str]) -> None:
+    """Raise InputError for a weight, a seed or a name that cannot be used."""
+    if not np.isfinite(s.weight) or s.weight <= 0:
+        raise InputError(
+            f"scenario {s.name!r}: weight = {s.weight!r} must be a finite number above 0"
+        )
+    seed: Any = s.seed  # of a file, where it may be anything
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**31:
+        raise InputError(
+            f"scenario {s.name!r}: seed = {seed!r} must be a whole number from 0 to {2**31 - 1}"
+        )
+    for name in s.values:
+        for other in free:
+            if name == other or split_index(name)[0] == other or name == split_index(other)[0]:
+                raise InputError(f"scenario {s.name!r} sets {name}, which is free")
+
+
+def runs_of(case: Case, scenarios: Sequence[Scenario], seed: int) -> list[ScenarioRun]:
+    """Return the ScenarioRuns of a case: one for each scenario, or one for the case itself.
+
+    Raises InputError, naming the scenario.
     """
     if not scenarios:
         key = jax.random.key(seed) if noisy(case) else None
-        return [Lane("", case, key, 1.0)]
-    total, found = sum(s.weight for s in scenarios), []
+        return [ScenarioRun("", case, key, 1.0)]
+    total = sum(s.weight for s in scenarios)
+    found: list[ScenarioRun] = []
     for s in scenarios:
         try:
             here = rig.set_scenario(case, s.values)
@@ -114,103 +163,106 @@ def lanes_of(case, scenarios, seed):
         except InputError as error:
             raise InputError(f"scenario {s.name!r}: {error}") from None
         key = jax.random.fold_in(jax.random.key(seed), s.seed) if noisy(here) else None
-        found.append(Lane(s.name, here, key, s.weight / total))
+        found.append(ScenarioRun(s.name, here, key, s.weight / total))
     return found
 
 
-def groups_of(lanes):
-    """The Groups of lanes that can share a compiled loop, in the order of their first lane."""
-    sorts = {}
-    for i, lane in enumerate(lanes):
-        leaves, structure = jax.tree.flatten(lane.case.loop)
-        sort = (structure, tuple(np.shape(v) for v in leaves), lane.case.clock, lane.key is None)
+def groups_of(runs: Sequence[ScenarioRun]) -> list[Group]:
+    """Return the Groups of runs that share a compiled loop, in the order of their first run."""
+    sorts: dict[Any, list[tuple[int, list[Any]]]] = {}
+    for i, run in enumerate(runs):
+        leaves: list[Any]
+        structure: Any
+        leaves, structure = jax.tree.flatten(run.case.loop)
+        sort: Any = (structure, tuple(np.shape(v) for v in leaves), run.case.clock, run.key is None)
         sorts.setdefault(sort, []).append((i, leaves))
-    found = []
+    found: list[Group] = []
     for (structure, _, clock, quiet), members in sorts.items():
         columns = list(zip(*(leaves for _, leaves in members)))
         apart = tuple(any(not np.array_equal(c[0], v) for v in c[1:]) for c in columns)
-        leaves = tuple(
+        stacked = tuple(
             np.stack([np.asarray(v) for v in c]) if a else c[0] for c, a in zip(columns, apart)
         )
-        keys = None if quiet else jnp.stack([lanes[i].key for i, _ in members])
-        found.append(Group(tuple(i for i, _ in members), clock, structure, leaves, apart, keys))
+        keys = None if quiet else jnp.stack([runs[i].key for i, _ in members])
+        found.append(Group(tuple(i for i, _ in members), clock, structure, stacked, apart, keys))
     return found
 
 
-def take(group, picked):
-    """The group with the lanes at the positions `picked` alone."""
+def take(group: Group, picked: Any) -> Group:
+    """Return the group with the runs at the positions `picked` alone."""
     picked = np.asarray(picked)
     leaves = tuple(v[picked] if a else v for v, a in zip(group.leaves, group.apart))
     keys = None if group.keys is None else group.keys[picked]
-    return group._replace(lanes=tuple(group.lanes[i] for i in picked), leaves=leaves, keys=keys)
+    return group._replace(runs=tuple(group.runs[i] for i in picked), leaves=leaves, keys=keys)
 
 
-def values_of(group, names, points, clock=None):
-    """(measures {name: (points, lanes, ...)}, (points, lanes) True where a run is not finite);
-    points {parameter: (points,)}.
+def values_of(
+    group: Group, names: Sequence[str], points: Mapping[str, Any], clock: Clock | None = None
+) -> tuple[Measures, Any]:
+    """Return (measures {name: (points, runs, ...)}, (points, runs) True where not finite).
+
+    points : {parameter: (points,)}. clock : the group's own where None.
     """
-    shape = (group.structure, group.apart, len(group.lanes))
-    return _values(group.leaves, group.keys, shape, clock or group.clock, names, points)
+    clock = clock or group.clock
+    return _values(group.leaves, group.keys, group.shape, clock, tuple(names), dict(points))
 
 
-def slopes_of(group, names, values, squares):
-    """(measures {name: (lanes, ...)}, slopes {name: (lanes, ..., P)}, (lanes, P, P) Gauss-Newton,
-    (lanes,) broken): forward mode.
+def slopes_of(
+    group: Group,
+    names: Sequence[str],
+    values: Mapping[str, Any],
+    squares: tuple[tuple[str, float], ...],
+) -> tuple[Measures, Measures, Any, Any]:
+    """Return measures, slopes, Gauss-Newton and flags of a group at `values`, by forward mode.
+
+    Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
+    P) of `squares`, and (runs,) True where a run is not finite.
     """
-    shape = (group.structure, group.apart, len(group.lanes))
+    order, theta = tuple(values), tuple(values.values())
     return _slopes(
-        group.leaves,
-        group.keys,
-        shape,
-        group.clock,
-        names,
-        tuple(values),
-        tuple(values.values()),
-        squares,
+        group.leaves, group.keys, group.shape, group.clock, tuple(names), order, theta, squares
     )
 
 
-def reverse_slopes_of(group, names, values):
-    """(measures, slopes) as `slopes_of`, by reverse mode through checkpointed pieces."""
-    shape = (group.structure, group.apart, len(group.lanes))
-    return _reverse(
-        group.leaves,
-        group.keys,
-        shape,
-        group.clock,
-        names,
-        tuple(values),
-        np.array(list(values.values())),
-    )
+def reverse_slopes_of(
+    group: Group, names: Sequence[str], values: Mapping[str, Any]
+) -> tuple[Measures, Measures]:
+    """Return (measures, slopes) as `slopes_of`, by reverse mode through checkpoints."""
+    order, theta = tuple(values), np.array(list(values.values()))
+    return _reverse(group.leaves, group.keys, group.shape, group.clock, tuple(names), order, theta)
 
 
-def _mapped(function, leaves, keys, shape):
-    """function(loop, key) over the lanes of a group; one lane runs as it would alone."""
+def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) -> Any:
+    """Return function(loop, key) over the runs of a group; one run runs as it would alone."""
     structure, apart, count = shape
+
+    def one(leaves: Any, key: Any) -> Any:
+        return function(jax.tree.unflatten(structure, leaves), key)
+
     if count == 1:
-        one = jax.tree.unflatten(
-            structure,
-            leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)],
-        )
-        return jax.tree.map(lambda v: v[None], function(one, None if keys is None else keys[0]))
-    return jax.vmap(
-        lambda leaves, key: function(jax.tree.unflatten(structure, leaves), key),
-        in_axes=(tuple(0 if a else None for a in apart), None if keys is None else 0),
-        axis_size=count,
-    )(leaves, keys)
+        mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
+        found: Any = one(mine, None if keys is None else keys[0])
+        return jax.tree.map(_first_axis, found)
+    axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
+    return jax.vmap(one, in_axes=axes, axis_size=count)(leaves, keys)
+
+
+def _first_axis(value: Any) -> Any:
+    """Return an array with an axis for its one run in front."""
+    return value[None]
 
 
 @functools.partial(
     jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE
 )
-def _values(leaves, keys, shape, clock, names, points):
-    def at(values):
-        return _mapped(
-            lambda loop, key: lp.evaluate_and_flag(with_values(loop, values), clock, names, key),
-            leaves,
-            keys,
-            shape,
-        )
+def _values(
+    leaves: Any, keys: Any, shape: Shape, clock: Clock, names: tuple[str, ...], points: Any
+) -> Any:
+    def at(values: Any) -> Any:
+        def one(loop: ClosedLoop, key: Any) -> Any:
+            return lp.evaluate_and_flag(with_values(loop, values), clock, names, key)
+
+        return _mapped(one, leaves, keys, shape)
 
     return jax.vmap(at)(points)
 
@@ -220,28 +272,42 @@ def _values(leaves, keys, shape, clock, names, points):
     static_argnames=("shape", "clock", "names", "order", "squares"),
     compiler_options=flags.WIDE,
 )
-def _slopes(leaves, keys, shape, clock, names, order, values, squares):
+def _slopes(
+    leaves: Any,
+    keys: Any,
+    shape: Shape,
+    clock: Clock,
+    names: tuple[str, ...],
+    order: tuple[str, ...],
+    values: Any,
+    squares: Any,
+) -> Any:
     several = shape[-1] > 1
-    return _mapped(
-        lambda loop, key: sensitivities_compiled(
-            loop, clock, names, order, values, key, squares, several
-        ),
-        leaves,
-        keys,
-        shape,
-    )
+
+    def one(loop: ClosedLoop, key: Any) -> Any:
+        return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
+
+    return _mapped(one, leaves, keys, shape)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order"))
-def _reverse(leaves, keys, shape, clock, names, order, theta):
-    def one(loop, key):
-        def run(theta):
-            measures = lp.evaluate_for_reverse(
-                with_values(loop, dict(zip(order, theta))), clock, names, key
-            )
+def _reverse(
+    leaves: Any,
+    keys: Any,
+    shape: Shape,
+    clock: Clock,
+    names: tuple[str, ...],
+    order: tuple[str, ...],
+    theta: Any,
+) -> Any:
+    def one(loop: ClosedLoop, key: Any) -> Any:
+        def run(theta: Any) -> Any:
+            here = with_values(loop, dict(zip(order, theta)))
+            measures: Any = lp.evaluate_for_reverse(here, clock, names, key)
             return measures, measures
 
-        slopes, measures = jax.jacrev(run, has_aux=True)(theta)
+        derivative: Any = jax.jacrev(run, has_aux=True)
+        slopes, measures = derivative(theta)
         return measures, slopes
 
     return _mapped(one, leaves, keys, shape)

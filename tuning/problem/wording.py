@@ -1,7 +1,7 @@
 """How numbers are put into sentences; any module of `tuning` may import it."""
 
 
-def count(number, thing):
+def count(number: int, thing: str) -> str:
     """Return a number with its noun in the singular or the plural.
 
     Examples

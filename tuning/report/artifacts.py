@@ -38,7 +38,7 @@ def run_for_people(case, key=None, rows=3000):
     steps = case.clock.samples - 1
     least = max(1, steps // rows)
     # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that
-    # rests; one that ends at the end, if any
+    # is constant; one that ends at the end, if any
     every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
     run = lp.simulate(case.loop, case.clock, key, save_every=every)
     return jax.tree.map(np.asarray, run)

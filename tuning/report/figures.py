@@ -1,5 +1,5 @@
 """Figures of what lies behind a run: the rig, its upper tanks and its pumps, the observer, the
-limits. What says nothing is not drawn.
+limits. Imported by the reports; a figure without content is left out.
 """
 
 import sys
@@ -11,9 +11,7 @@ from jaxtank.core.units import local
 
 
 def failed(name, error, *figures):
-    """Report on stderr that the picture `name` could not be made, and close its figures: the rest
-    of a result is given without it.
-    """
+    """Report on stderr that the picture `name` could not be drawn, and close its figures."""
     import matplotlib.pyplot as plt
 
     for figure in figures:
@@ -26,8 +24,9 @@ def failed(name, error, *figures):
 
 
 def rig(loop, run=None, title=""):
-    """{"rig": the schematic of the loop's plant, filled as at the end of `run`}; {} for a plant
-    that is no network of tanks.
+    """Return {"rig": schematic of the loop's plant, filled as at the end of `run`}.
+
+    {} for a plant that is no network of tanks.
     """
     from jaxtank.plots.run import rig
 
@@ -35,7 +34,7 @@ def rig(loop, run=None, title=""):
 
 
 def inner(loop, runs):
-    """{"inner": phase of the first two tanks that are not controlled}; {} where there are none.
+    """Return {"inner": phase plot of the first two tanks that are not controlled}, {} without.
 
     runs: {name: Trajectory}, before and after, or one.
     """
@@ -60,8 +59,9 @@ def inner(loop, runs):
 
 
 def saturation(loop, runs):
-    """{"saturation": when each pump was commanded past its limits}; {} where none ever was. runs:
-    {name: Trajectory}.
+    """Return {"saturation": when each pump was commanded beyond its limits}; {} where none was.
+
+    runs: {name: Trajectory}.
     """
     import matplotlib.pyplot as plt
 
@@ -80,8 +80,9 @@ def saturation(loop, runs):
 
 
 def estimates(loop, clock, run, title=""):
-    """{"estimates": levels and disturbances as the observer saw them}; {} where levels are taken as
-    they are measured.
+    """Return {"estimates": levels and disturbances as the observer estimated them}.
+
+    {} where the controller takes the levels as they are measured.
     """
     import matplotlib.pyplot as plt
 
@@ -126,7 +127,7 @@ def estimates(loop, clock, run, title=""):
 
 
 def margins(rows):
-    """{"margins": room to every limit}; {} where there are none."""
+    """Return {"margins": margin to every limit}; {} where there are none."""
     import matplotlib.pyplot as plt
 
     from jaxtank.plots import diagnostics, responses
@@ -142,8 +143,9 @@ def margins(rows):
 
 
 def tradeoff(found, unit, cost_unit):
-    """{"tradeoff": the least objective over a limit}; {} where none was asked. found: of
-    `tuning.tradeoff`, or None.
+    """Return {"tradeoff": least objective over a limit}; {} where `found` is None.
+
+    found: as `tuning.tradeoff` returns it.
     """
     import matplotlib.pyplot as plt
 

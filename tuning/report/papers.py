@@ -1,5 +1,6 @@
-"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict and the
-reason for a difference.
+"""`jaxtank compare`: what a paper prints beside what is measured here, with a verdict.
+
+Imported by the command line and the benchmarks.
 """
 
 import numbers
@@ -26,8 +27,9 @@ QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "no
 
 
 def runner(paper):
-    """run(case name, values={}, save_every=1) -> (Case with `values` set, Trajectory as host
-    arrays); each run is made once.
+    """Return run(case name, values={}, save_every=1) of a paper; each run is made once.
+
+    It returns (Case with `values` set, Trajectory as host arrays).
     """
     preset, known = presets.load(paper), {}
 
@@ -45,8 +47,9 @@ def runner(paper):
 
 
 def verdict(published, measured):
-    """(verdict, measured value or text) of one published quantity; measured: number, tuple, Claim
-    or None.
+    """Return (verdict, measured value or text) of one published quantity.
+
+    measured: number, tuple, Claim or None.
     """
     if isinstance(measured, Claim):
         return measured.verdict, measured.text
@@ -62,8 +65,9 @@ def verdict(published, measured):
 
 
 def measure(paper):
-    """The comparison of a paper: {"paper", "citation", "rows": [{quantity, unit, where, published,
-    measured, verdict, reason}]}.
+    """Return the comparison of a paper: {"paper", "citation", "notes", "rows"}.
+
+    The keys of a row: quantity, unit, where, published, measured, verdict, reason.
 
     A parameter that the paper prints is compared with the value in the preset's first case that has
     it. Raises InputError for an unknown paper, and KeyError if the preset measures something that
@@ -145,7 +149,7 @@ def _flat(value):
 
 
 def text(page):
-    """The page of `jaxtank compare PAPER`."""
+    """Return the page of `jaxtank compare PAPER`."""
     rows = [
         [r["quantity"], r["unit"], _cell(r["published"]), _cell(r["measured"]), r["verdict"]]
         for r in page["rows"]
@@ -170,9 +174,7 @@ def text(page):
 
 
 def save(pages, folder, command=None):
-    """Write result.json and report.html of {paper: page}, and a picture of the rig of each paper,
-    to `folder`; returns their paths.
-    """
+    """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
     check_folder(folder)
     captions = {}
 
@@ -204,7 +206,7 @@ def save(pages, folder, command=None):
     def page_of(drawn):
         return document(
             f"{', '.join(pages)}: published and measured",
-            "What is printed beside what the same rigs and laws do here, and why they differ.",
+            "Published numbers, those of the same rigs and controllers here, and why they differ.",
             f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured"
             " quantities and claims reproduced",
             True,
@@ -225,9 +227,7 @@ def save(pages, folder, command=None):
 
 
 def _in_full(found):
-    """The table of a page with room for what does not fit a line: where it is printed, and the
-    reason for a difference.
-    """
+    """The table of a page with where each number is printed and the reason for a difference."""
     rows = [
         [
             r["quantity"],
@@ -249,8 +249,9 @@ def _in_full(found):
 
 
 def markdown(pages):
-    """The table of tests/benchmarks/README.md: every measured quantity of {paper: page}; parameters
-    that are only quoted are left out.
+    """Return the table of tests/benchmarks/README.md: every measured quantity of {paper: page}.
+
+    Parameters that are only quoted are left out.
     """
     lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, page in pages.items():

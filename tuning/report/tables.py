@@ -1,4 +1,4 @@
-"""How results are written: numbers, tables and JSON, for people and for programs."""
+"""Numbers, tables and JSON of results, for people and for programs; imported by the reports."""
 
 import json
 import math
@@ -11,7 +11,13 @@ from jaxtank.core.units import DEFAULT
 
 
 def number(value, digits=5):
-    """A number for people: at most `digits` significant digits, a dash where there is none."""
+    """Return a number for people: at most `digits` significant digits, a dash where there is none.
+
+    Examples
+    --------
+    >>> number(1.23456789), number(1.5e-7), number(float("nan"))
+    ('1.2346', '1.5000e-07', '-')
+    """
     value = float(value)
     if not math.isfinite(value):
         return "-"
@@ -22,15 +28,39 @@ def number(value, digits=5):
 
 
 def numbers(value, digits=5):
-    """The entries of a measure, side by side."""
+    """Return the entries of a measure, side by side.
+
+    Examples
+    --------
+    >>> numbers([1.0, 2.5])
+    '1  2.5'
+    """
     return "  ".join(number(v, digits) for v in np.ravel(value))
 
 
 def reasons(measures):
-    """{measure: why} for every measure that is absent or has an entry that is not a number."""
-    absent = (m for m, v in measures.items() if not np.all(np.isfinite(np.asarray(v, dtype=float))))
-    found = {m: ms.MEASURES[m].undefined for m in absent}
+    """Return {measure: why} of every measure that is absent or has an entry that is not finite.
+
+    Examples
+    --------
+    >>> reasons({"settling_time": [3.0, float("inf")]})["settling_time"]
+    'the output was outside its band as the setpoint changed again or the run ended'
+    """
+    found = {m: why for m, values in measures.items() if (why := _why(m, values))}
     return {**found, **{m: why for m, why in _unserved().items() if m not in measures}}
+
+
+def _why(measure, values):
+    """Why entries of a measure are not finite, each cause once; "" where all are finite."""
+    spec, values = ms.MEASURES[measure], np.ravel(np.asarray(values, dtype=float))
+    causes = {
+        i: spec.nan_holds if np.isnan(v) and spec.nan_holds else spec.undefined
+        for i, v in enumerate(values)
+        if not np.isfinite(v)
+    }
+    if len(set(causes.values())) < 2:
+        return next(iter(causes.values()), "")
+    return ", ".join(f"{spec.per} {i + 1}: {why}" for i, why in causes.items())
 
 
 def _unserved():
@@ -39,7 +69,7 @@ def _unserved():
 
 
 def measures_json(measures):
-    """Measures as JSON; null for those that mean nothing for the case (`reasons` says why)."""
+    """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
     return {
         **dict.fromkeys(_unserved()),
         **clean({m: v for m, v in measures.items() if m not in ms.times()}),
@@ -47,28 +77,44 @@ def measures_json(measures):
 
 
 def dumps(table):
-    """One JSON object as text; refuses NaN."""
+    """Return one JSON object as text; ValueError for NaN.
+
+    Examples
+    --------
+    >>> dumps({"a": 1})
+    '{\\n  "a": 1\\n}'
+    """
     return json.dumps(table, indent=2, allow_nan=False)
 
 
 def units(rig_units):
-    """{measure: unit} of everything that is reported, on a rig with these (length, pump input)
-    units.
+    """Return {measure: unit} on a rig with these (length, pump input) units.
+
+    Examples
+    --------
+    >>> units(DEFAULT)["max_level"]
+    'cm'
     """
     return {m: ms.unit(m, rig_units) for m in ms.MEASURES}
 
 
 class Table(str):
-    """Aligned columns as text, which still knows its `head` and `rows`, so that a page may set them
-    in its own way.
-    """
+    """Aligned columns as text, with its `head` and `rows` for other ways of display."""
 
     head: list
     rows: list
 
 
 def table(rows, head=None):
-    """Rows of text as aligned columns, the first to the left: a Table."""
+    """Return rows of text as aligned columns: a Table.
+
+    Examples
+    --------
+    >>> print(table([["k", 1.5]], ["gain", "value"]))
+    gain  value
+    -----------
+    k     1.5
+    """
     body = [[str(c) for c in row] for row in rows]
     rows = ([head] if head else []) + body
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
@@ -93,10 +139,24 @@ def measure_table(values, rig_units=DEFAULT):
 
 
 def wrap(message):
+    """Return the parts of a message as lines that begin with a dash.
+
+    Examples
+    --------
+    >>> print(wrap("no limit is tight; the search converged"))
+    - no limit is tight
+    - the search converged
+    """
     return "\n".join(f"- {part}" for part in message.split("; "))
 
 
 def objective_unit(terms, rig_units=DEFAULT):
-    """Unit of a weighted sum: that of its only measure, or a plain number."""
+    """Return the unit of a weighted sum: that of its measures where they share one, else "-".
+
+    Examples
+    --------
+    >>> objective_unit({"rms_error": 1.0}), objective_unit({"rms_error": 1.0, "iae": 1.0})
+    ('cm', '-')
+    """
     found = {ms.unit(m, rig_units) for m in terms}
     return found.pop() if len(found) == 1 else "-"

@@ -9,18 +9,10 @@ from jaxtank.core.files import check_folder
 from jaxtank.loop.trajectory import csv
 from tuning.report import html
 from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
-from tuning.report.tables import (
-    clean,
-    dumps,
-    measures_json,
-    number,
-    objective_unit,
-    reasons,
-    units,
-    wrap,
-)
+from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
 from tuning.report.tuning_figures import CAPTIONS, figures, result_key
 from tuning.report.tuning_tables import parts_of, scenario_rows
+from tuning.search.result import Message
 
 
 def json_of(result):
@@ -31,6 +23,7 @@ def json_of(result):
         "success": result.success,
         "status": str(result.status),
         "message": result.message,
+        "messages": [{"code": m.code, "text": m.text} for m in result.messages],
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
@@ -40,11 +33,11 @@ def json_of(result):
         },
         "reasons": {**reasons(result.measures["before"]), **reasons(result.measures["after"])},
         "units": units(result.tuned.loop.units),
-        "constraints": clean(result.constraints),
+        "constraints": clean([c.to_json() for c in result.constraints]),
         "evaluations": result.evaluations,
         "scenarios": scenario_rows(result),
         "starts": clean(result.starts),
-        "mirror": clean(result.mirrored),
+        "symmetry": clean(result.symmetry),
         "choices": clean(result.choices),
         "optimality": clean(result.optimality),
         "curvature": clean(result.curvature),
@@ -59,7 +52,7 @@ def json_of(result):
 
 def lines(result):
     """Return what is printed of a TuningResult: lines and Tables."""
-    return [*parts_of(result), wrap(result.message)]
+    return [*parts_of(result), "\n".join(f"- {m.text}" for m in result.messages)]
 
 
 def page_of(result, drawn, command=None):
@@ -91,7 +84,7 @@ def page_of(result, drawn, command=None):
         + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
         facts,
-        result.message.split("; "),
+        [m.text for m in result.messages],
         html.drawings(drawn, CAPTIONS),
         parts_of(result)[1:],
         command,
@@ -123,7 +116,7 @@ def save(result, folder, command=None):
     rig, why = rig_of(result)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called result.save
-        result = result.replace(message=f"{result.message}; {why}")
+        result = result.replace(messages=(*result.messages, Message("no-rig-file", why)))
     key = result_key(result)
     runs = {"before": run_for_people(result.case, key), "after": run_for_people(result.tuned, key)}
     files = {

@@ -54,7 +54,7 @@ def _level_limits(result):
     limits = {
         limit.index: limit.value
         for limit in result.problem.limits
-        if limit.measure == "max_level" and limit.lane == 0
+        if limit.measure == "max_level" and limit.run == 0
     }
     rims = np.asarray(result.tuned.loop.plant.rim)
     return [limits.get(i, rims[i]) for i in range(result.tuned.loop.plant.tanks)]
@@ -162,22 +162,22 @@ def _curve(ax, result, unit):
     grid, b = np.linspace(0.0, 1.0, 128), result.problem.bounds[0]
     costs, margins = result.problem.screen(grid[:, None])
     violation = np.maximum(0.0, -margins).max(axis=1, initial=0.0)
-    ends = [(result.parameters[b.name][s], result.objective[s]) for s in ("before", "after")]
-    responses.curve(
-        ax, b.from_unit(grid), costs, violation, b.name, b.unit, unit, *ends, b.scale == "log"
-    )
+    before, after = ((result.parameters[b.name][s], result.objective[s]) for s in _sides(result))
+    axis = (b.name, b.unit, unit)
+    log = b.scale == "log"
+    responses.curve(ax, b.from_unit(grid), costs, violation, *axis, before, after, log)
 
 
 def _contours(ax, result, unit):
     """The objective over the two parameters that it is most sensitive to, the others as tuned."""
     from jaxtank.plots import responses
 
-    problem, after, before = result.problem, _unit_values(result), result.problem.start()
-    effect = [-(p["felt_percent"] or 0.0) for p in result.parameters.values()]
+    problem, tuned, start = result.problem, _unit_values(result), result.problem.start()
+    effect = [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()]
     pair = sorted(np.argsort(effect, kind="stable")[:2])
     side = np.linspace(0.0, 1.0, 24)
     across, up = np.meshgrid(side, side)
-    points = np.tile(after, (across.size, 1))
+    points = np.tile(tuned, (across.size, 1))
     points[:, pair[0]], points[:, pair[1]] = across.ravel(), up.ravel()
     costs, margins = problem.screen(points)
     worst = -margins.min(axis=1) if margins.size else np.zeros(len(costs))
@@ -191,8 +191,9 @@ def _contours(ax, result, unit):
         (x.name, y.name),
         (x.unit, y.unit),
         unit,
-        *((x.from_unit(z[pair[0]]), y.from_unit(z[pair[1]])) for z in (before, after)),
+        (x.from_unit(start[pair[0]]), y.from_unit(start[pair[1]])),
+        (x.from_unit(tuned[pair[0]]), y.from_unit(tuned[pair[1]])),
         (x.scale == "log", y.scale == "log"),
     )
-    if len(after) > 2:
+    if len(tuned) > 2:
         ax.set_title("landscape (the other parameters as tuned)")

@@ -48,7 +48,9 @@ def _parameter_table(result):
                 number(p["before"]),
                 number(p["after"]),
                 f"{number(p['lower'])} : {number(p['upper'])}",
-                "-" if p["felt_percent"] is None else f"{number(p['felt_percent'], 2)} %",
+                "-"
+                if p["sensitivity_percent"] is None
+                else f"{number(p['sensitivity_percent'], 2)} %",
                 remark if p["exercised"] else "without effect, kept",
             ]
         )
@@ -100,14 +102,14 @@ def _runs_of(result, others):
     if not problem.scenarios:
         return []
     what = "plants" if result.certificate is not None else "scenarios"
-    weighted = len({lane.weight for lane in problem.lanes}) > 1
+    weighted = len({run.weight for run in problem.runs}) > 1
     of = {
         "mean": "the weighted mean" if weighted else "the mean",
         "cvar": f"the mean of the worst {100 * TAIL:g} %",
         "worst": "the worst",
     }
     rest = "; the other rows: the case's own run, on its own plant" if others else ""
-    return [f"objective: {of[problem.risk]} of {len(problem.lanes)} {what}{rest}"]
+    return [f"objective: {of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
 
 
 def worst_of_scenarios(constraints):
@@ -115,7 +117,7 @@ def worst_of_scenarios(constraints):
 
     Parameters
     ----------
-    constraints : list of dict
+    constraints : list of ConstraintRow
         Rows of `TuningResult.constraints`.
 
     Returns
@@ -146,13 +148,13 @@ def scenario_rows(result):
     if not problem.scenarios:
         return []
     rows = []
-    for i, lane in enumerate(problem.lanes):
-        limits = [limit for limit in problem.limits if limit.lane == i]
+    for i, run in enumerate(problem.runs):
+        limits = [limit for limit in problem.limits if limit.run == i]
         sides = {side: tables[i] for side, tables in result.tables.items()}
         held = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
         costs = clean({side: problem.cost(table) for side, table in sides.items()})
         rows.append(
-            {"name": lane.name, "weight": lane.weight, "objective": costs, "limits_held": held}
+            {"name": run.name, "weight": run.weight, "objective": costs, "limits_held": held}
         )
     return rows
 
@@ -178,7 +180,9 @@ def _scenario_table(result):
         ]
         for s in shown
     ]
-    found = [table(rows, ["scenario", "weight", "objective before", "after", "limits held after"])]
+    found: list[str] = [
+        table(rows, ["scenario", "weight", "objective before", "after", "limits held after"])
+    ]
     if many:
         held = sum(s["limits_held"]["after"] for s in scenarios)
         kept = f"; limits held after in {held}" if limited else ""

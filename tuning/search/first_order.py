@@ -1,4 +1,4 @@
-"""L-BFGS and Adam on an augmented Lagrangian."""
+"""L-BFGS and Adam on an augmented Lagrangian, by optax; imported by `methods`."""
 
 import numpy as np
 
@@ -6,14 +6,15 @@ from tuning.search.driver import SETTLED
 from tuning.search.kkt import optimality
 
 STEEPEST = 10.0
-"""Longest gradient, of the scaled cost per unit of z, that a first-order method is shown: a cliff
-should turn it back, not throw it.
+"""Largest gradient, of the scaled cost per unit of z, that a first-order method is given: a steep
+cost near instability should turn it back, and not move it far away.
 """
 
 
 def lbfgs(search, z, iterations):
-    """optax's L-BFGS direction with halving steps, limits by augmented Lagrangian, projected into
-    the box.
+    """Return True if optax's L-BFGS converged: halving steps, projected onto the bounds.
+
+    Limits by augmented Lagrangian.
     """
     import optax
 
@@ -21,8 +22,9 @@ def lbfgs(search, z, iterations):
 
 
 def adam(search, z, iterations):
-    """optax's Adam, limits by augmented Lagrangian, projected into the box. Its steps are small:
-    five to an iteration.
+    """Return True if optax's Adam converged: five steps an iteration, projected onto the bounds.
+
+    Limits by augmented Lagrangian.
     """
     import optax
 
@@ -32,9 +34,10 @@ def adam(search, z, iterations):
 
 
 def minibatches(search, z, iterations, batch, rng):
-    """optax's Adam on the mean of `batch` scenarios drawn afresh for every step, limits of those by
-    a quadratic penalty. All scenarios are looked at ten times on the way, and they decide what is
-    best.
+    """Return True if optax's Adam converged on `batch` scenarios, drawn anew for every step.
+
+    Their limits by a quadratic penalty. All scenarios are evaluated ten times on the way, and those
+    evaluations decide what is best.
     """
     import optax
 
@@ -42,14 +45,14 @@ def minibatches(search, z, iterations, batch, rng):
     optimiser = optax.adam(optax.cosine_decay_schedule(0.05, steps, 0.002))
     state, every = optimiser.init(z), max(1, steps // 10)
     for k in range(steps):
-        point = search.problem.part(z, batch, rng)
-        search.passed()
+        point = search.problem.batch_point(z, batch, rng)
+        search.report(search)
         if not point.finite:
             z = 0.5 * (z + search.last_finite.z)
             continue
-        room = search.room[list(point.rows)]
-        push = 100.0 * np.maximum(0.0, -point.margins / room)
-        g = point.gradient / search.scale - push @ (point.margin_slopes / room[:, None])
+        scale = search.limit_scale[list(point.rows)]
+        penalty = 100.0 * np.maximum(0.0, -point.margins / scale)
+        g = point.gradient / search.scale - penalty @ (point.margin_slopes / scale[:, None])
         g = g * min(1.0, STEEPEST / max(float(np.linalg.norm(g)), 1e-300))
         update, state = optimiser.update(g, state, z)
         z = np.clip(z + np.asarray(update), 0.0, 1.0)
@@ -60,10 +63,12 @@ def minibatches(search, z, iterations, batch, rng):
 
 
 def _rounds(search):
+    """Return how often the multipliers of the limits are updated."""
     return 4 if search.problem.limits else 1
 
 
 def _augmented(search, z, iterations, optimiser, descend):
+    """Return True if an optax optimiser converged on the augmented Lagrangian of the limits."""
     weights, stiffness, rounds = np.zeros(len(search.problem.limits)), 100.0, _rounds(search)
 
     def value(z):
@@ -71,8 +76,8 @@ def _augmented(search, z, iterations, optimiser, descend):
         if not len(weights):
             return f, g
         m, slopes = search.margins(z)
-        push = np.maximum(0.0, weights - stiffness * m)
-        return f + float(push @ push) / (2 * stiffness), g - push @ slopes
+        penalty = np.maximum(0.0, weights - stiffness * m)
+        return f + float(penalty @ penalty) / (2 * stiffness), g - penalty @ slopes
 
     for _ in range(rounds):
         state = optimiser.init(z)

@@ -1,22 +1,37 @@
-"""First-order optimality of an answer, and a step downhill where it does not hold."""
+"""First-order optimality of a point, and a step downhill where it does not hold.
+
+Karush-Kuhn-Tucker conditions; imported by the methods, `stages` and `tuner`.
+"""
 
 import numpy as np
 import scipy
 
 SLOPING = 0.05
-"""KKT residual, of the scaled cost per unit of z, above which an answer is looked at once more: see
-`downhill`.
+"""KKT residual, of the scaled cost per unit of z, above which `downhill` looks for a lower
+point.
 """
+
+STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+"""Steps along the gradient that is left, in the unit cube, at which `downhill` looks for a lower
+point.
+"""
+
+UNSTABLE = 1.0 / STRIDES[-1]
+"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the
+least of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step.
+"""
+
+LOWER_BY = 1e-4
+"""Share by which the cost must fall for a point to count as lower than one at a kink [-]."""
 
 
 def optimality(search, point):
-    """(gradient norm, KKT residual, multipliers of the limits) at a point, all of the scaled cost
-    per unit of z.
+    """Return (gradient norm, KKT residual, multipliers of the limits) at a point.
 
-    The residual is what is left of the gradient after the best non-negative combination of the
-    slopes of active limits and bounds.
+    All of the scaled cost per unit of z. The residual is what is left of the gradient after the
+    best non-negative combination of the slopes of active limits and bounds.
     """
-    residual, multipliers = _left(search, point)
+    residual, multipliers = _residual(search, point)
     return (
         float(np.linalg.norm(point.gradient / search.scale)),
         float(np.linalg.norm(residual)),
@@ -24,13 +39,14 @@ def optimality(search, point):
     )
 
 
-def _left(search, point):
-    """(what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
+def _residual(search, point):
+    """Return (what is left of the gradient (P,), multipliers (limits,)); see `optimality`."""
     g = point.gradient / search.scale
     columns, owners = [], []
-    room = point.margins / search.room - search.backoff
-    for i, (m, slope) in enumerate(zip(room, point.margin_slopes / search.room[:, None])):
-        if m < 1e-4:
+    margins = point.margins / search.limit_scale - search.tightening
+    slopes = point.margin_slopes / search.limit_scale[:, None]
+    for i, (margin, slope) in enumerate(zip(margins, slopes)):
+        if margin < 1e-4:
             columns.append(slope)
             owners.append(i)
     for p, z in enumerate(point.z):
@@ -49,27 +65,13 @@ def _left(search, point):
     return residual, multipliers
 
 
-STRIDES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
-"""Steps along the slope that is left at an answer, in the unit cube, at which something better is
-looked for.
-"""
-
-UNSTABLE = 1.0 / STRIDES[-1]
-"""KKT residual, of the scaled cost per unit of z, by which the cost would fall below 0 within the
-least
-of STRIDES: the derivative of an unstable or chaotic run, exact, and of no use for a step.
-"""
-
-LOWER_BY = 1e-4
-"""Share by which the cost must fall for a point to count as better than an answer at a kink [-]."""
-
-
 def downhill(search, point):
-    """A Point within the limits that is lower than `point` by more than the cost can be trusted to,
-    found along the slope that is left of it;
-    None where there is none: the point is an optimum, or at a kink.
+    """Return a feasible Point that is lower than `point`, found along the gradient that is left.
+
+    Lower by more than the cost can be trusted to. None where there is none: the point is an
+    optimum, or at a kink.
     """
-    residual, _ = _left(search, point)
+    residual, _ = _residual(search, point)
     if np.linalg.norm(residual) <= SLOPING:
         return None
     for stride in STRIDES:

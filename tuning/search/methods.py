@@ -1,31 +1,43 @@
-"""Local searches from one start. Each takes a Search, which counts, remembers and shields; each may
-stop early, none may fail.
+"""Local searches from one start: each takes a Search, may stop early, and may not fail.
+
+Imported by `stages` and `pareto`.
 """
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from tuning.problem.problem import EXPLODED, ROOT
-from tuning.search.driver import Rough
+from tuning.problem.point import DIVERGED
+from tuning.problem.problem import ROOT
+from tuning.search.driver import CoarseSearch
 from tuning.search.first_order import adam, lbfgs
 from tuning.search.kkt import LOWER_BY
 
-STILL, LONG = 1e-9, 25
-"""Share by which the best cost must fall within LONG evaluations for a search to go on: at a kink a
-line search never ends by itself [-].
+PROGRESS, PATIENCE = 1e-9, 25
+"""Share by which the best cost must fall within PATIENCE evaluations for a search to go on: at a
+kink a line search does not end by itself [-].
 """
 
 ITERATION_LIMIT = 9
 """Status of scipy's SLSQP that has used up its iterations."""
 
-ROUGHLY = 1e-4
+COARSE_TOLERANCE = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
 
+NEAR, HALVINGS = 0.1, 10
+"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
+
+OFFERED = ("trf", "coarse-trf", "slsqp", "lbfgs", "adam")
+"""Methods that can be asked for by name."""
+
+UNCONSTRAINED = ("trf", "coarse-trf")
+"""Those that ignore limits."""
+
+
 def slsqp(search, z, iterations, tolerance=None):
-    """Sequential quadratic programming on the exact maxima. Returns True if it converged."""
+    """Return True if sequential quadratic programming converged, on the exact maxima."""
     tolerance = search.tolerance if tolerance is None else tolerance
-    if getattr(search.problem, "risk", "mean") == "worst" and len(search.problem.lanes) > 1:
+    if search.problem.risk == "worst" and len(search.problem.runs) > 1:
         return _epigraph(search, z, iterations, tolerance)
     constraints = []
     if search.problem.limits:
@@ -46,7 +58,7 @@ def slsqp(search, z, iterations, tolerance=None):
             constraints=constraints,
             options={"maxiter": iterations, "ftol": tolerance},
         )
-    except _Settled:
+    except _NoProgress:
         return True
     search.exhausted = done.status == ITERATION_LIMIT
     # 8: no further descent along the search direction, which is how a solver ends at the precision
@@ -54,12 +66,12 @@ def slsqp(search, z, iterations, tolerance=None):
     return bool(done.success) or done.status == 8
 
 
-class _Settled(Exception):
-    """The best point is as good as the cost can tell."""
+class _NoProgress(Exception):
+    """The best point is as good as the precision of the cost allows."""
 
 
 class _Watch:
-    """`Search.cost`, until points within the limits have not become better for long."""
+    """`Search.cost`, until feasible points have not become better for PATIENCE evaluations."""
 
     def __init__(self, search):
         self.search, self.least, self.since = search, np.inf, 0
@@ -69,19 +81,20 @@ class _Watch:
         point = self.search.point(z)
         if point.finite:
             held = self.search.violation(point) == 0
-            better = held and found[0] < self.least - STILL * abs(
+            better = held and found[0] < self.least - PROGRESS * abs(
                 self.least if np.isfinite(self.least) else 0.0
             )
             self.since = 0 if better or not np.isfinite(self.least) else self.since + 1
             self.least = min(self.least, found[0]) if held else self.least
-        if self.since > LONG:
-            raise _Settled
+        if self.since > PATIENCE:
+            raise _NoProgress
         return found
 
 
 def _epigraph(search, z, iterations, tolerance):
-    """`slsqp` of the worst scenario: t made small under cost_i <= t, which is smooth where the
-    largest cost is not.
+    """Return True if `slsqp` of the worst scenario converged.
+
+    min t subject to cost_i <= t, which is smooth where the largest cost is not.
     """
 
     def known(z):
@@ -90,17 +103,17 @@ def _epigraph(search, z, iterations, tolerance):
 
     def holds(y):
         point = known(y[:-1])
-        return np.append(y[-1] - point.lane_costs / search.scale, search.margins(y[:-1])[0])
+        return np.append(y[-1] - point.run_costs / search.scale, search.margins(y[:-1])[0])
 
     def slopes(y):
         point = known(y[:-1])
-        costs = np.hstack([-point.lane_slopes / search.scale, np.ones((len(point.lane_costs), 1))])
+        costs = np.hstack([-point.run_slopes / search.scale, np.ones((len(point.run_costs), 1))])
         rows = search.margins(y[:-1])[1].reshape(-1, len(y) - 1)
         return np.vstack([costs, np.hstack([rows, np.zeros((len(rows), 1))])])
 
     done = scipy.optimize.minimize(
         lambda y: (y[-1], np.eye(len(y))[-1]),
-        np.append(z, known(z).lane_costs.max() / search.scale),
+        np.append(z, known(z).run_costs.max() / search.scale),
         jac=True,
         method="SLSQP",
         bounds=[(0.0, 1.0)] * len(z) + [(None, None)],
@@ -112,16 +125,18 @@ def _epigraph(search, z, iterations, tolerance):
 
 
 def trf(search, z, iterations, tolerance=1e-10):
-    """Bounded Gauss-Newton trust region on P + 1 residuals that have the cost's value, slope and
-    second derivative (the latter without the residuals' own curvature). Limits are not looked at.
-    Returns True if it converged.
+    """Return True if a bounded Gauss-Newton trust region converged, without the limits.
+
+    On P + 1 residuals that have the cost's value, gradient and second derivative, the latter
+    without the residuals' own curvature: with value c, gradient g and normal matrix L L', the
+    residuals are (L^-1 g, sqrt(c - |L^-1 g|^2)) and their Jacobian is (L', 0).
     """
     squared = search.problem.model == "square"
     weight = search.problem.objective[ROOT] if squared else 1.0
 
     def model(z):
         point = search.point(z)
-        if not point.finite or not np.all(np.abs(point.gauss_newton) < EXPLODED**2):
+        if not point.finite or not np.all(np.abs(point.gauss_newton) < DIVERGED**2):
             return np.full(len(z) + 1, 1e3), np.eye(len(z) + 1, len(z))
         cost = point.cost / search.scale
         if squared:
@@ -159,22 +174,24 @@ def trf(search, z, iterations, tolerance=1e-10):
 
 
 def coarse_first(search, z, iterations):
-    """`trf` at a tenth of the samples, then at all of them from where that ended: most of the way
-    is gone where a step is cheap. Where the rough runs mislead (at ten times the step a loop may
-    chatter), the second part begins at z. Limits are not looked at.
+    """Return True if `trf` at a tenth of the samples, then at all of them, converged.
+
+    The second search begins where the first ended, or at z where the coarse runs mislead (at ten
+    times the step a loop may chatter). Limits are ignored.
     """
-    rough = Rough(search)
-    began = rough.point(z)
-    trf(rough, z, iterations, tolerance=ROUGHLY)
-    if rough.best is not None and began.finite:
-        near = search.point(rough.best.z)
+    coarse = CoarseSearch(search)
+    began = coarse.point(z)
+    trf(coarse, z, iterations, tolerance=COARSE_TOLERANCE)
+    if coarse.best is not None and began.finite:
+        near = search.point(coarse.best.z)
         z = near.z if near.finite and near.cost < began.cost else z
     return trf(search, z, iterations)
 
 
 def gauss_newton_first(search, z, iterations):
-    """`trf` as if there were no limits; where it ends outside one, `slsqp` from where it began. The
-    cheapest way where limits are slack.
+    """Return True if `trf` without the limits converged to a feasible point, else `slsqp` from z.
+
+    The cheapest way where no limit is active.
     """
     mark = len(search.history)
     converged = trf(search, z, iterations, tolerance=1e-6)
@@ -185,8 +202,9 @@ def gauss_newton_first(search, z, iterations):
 
 
 def restore(search, z, iterations):
-    """The least largest violation, as a share of each limit: slsqp on (z, t), t made small, with
-    every margin at least -t. True if it came to its end.
+    """Return True if a search for the least violation of the limits converged.
+
+    min t subject to scaled margin_i >= -t, t >= 0, by SLSQP on (z, t).
     """
     if not search.problem.limits:
         return True
@@ -214,7 +232,7 @@ def restore(search, z, iterations):
 def approach(search):
     """Move the best feasible point towards a lower infeasible one, by halving the distance.
 
-    Only where each limit that is broken there has no slope at the feasible point: a measure that
+    Only where each limit that is violated there has no slope at the feasible point: a measure that
     changes in steps, or is 0 in all of the feasible set (overshoot), gives SLSQP no direction along
     its boundary.
     """
@@ -239,10 +257,6 @@ def approach(search):
             inside = middle.z
         else:
             out = middle.z
-
-
-NEAR, HALVINGS = 0.1, 10
-"""Largest violation of a point that `approach` moves towards [-], and number of halvings."""
 
 
 METHODS = {

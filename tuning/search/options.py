@@ -1,4 +1,4 @@
-"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam; `tuner` imports it."""
+"""How `tune` searches, as frozen dataclasses: SQP, TRF, LBFGS, Adam; imported by `tuner`."""
 
 import dataclasses
 from typing import ClassVar
@@ -9,29 +9,37 @@ from tuning.problem.problem import Problem
 PROBLEM = ("free", "objective", "limits", "scenarios", "risk")
 """Keywords of `tune` that a Problem has of its own."""
 
-USUAL = {"starts": 8, "screening": 64, "iterations": 60, "batch": None, "tolerance": None}
+DEFAULTS = {"starts": 8, "screening": 64, "iterations": 60, "batch": None, "tolerance": None}
 """Defaults of the keywords of `tune` that solver options have too."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solver:
-    """What every method has: local searches, Sobol points they begin at, iterations of each.
+    """What every method has.
 
-    Raises InputError, when it is made, for a number that is out of range.
+    Parameters
+    ----------
+    starts : number of local searches.
+    screening : number of Sobol points, of which the best are starts.
+    iterations : of each local search.
+
+    Raises
+    ------
+    InputError : when it is made, for a number that is out of range.
     """
 
     method: ClassVar[str]
-    starts: int = USUAL["starts"]
-    screening: int = USUAL["screening"]
-    iterations: int = USUAL["iterations"]
+    starts: int = DEFAULTS["starts"]
+    screening: int = DEFAULTS["screening"]
+    iterations: int = DEFAULTS["iterations"]
 
     def __post_init__(self):
         check_options(**self.options())
 
     def options(self):
-        """{keyword of `tune`: value}."""
+        """Return {keyword of `tune`: value}."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return {name: value for name, value in fields.items() if name in USUAL}
+        return {name: value for name, value in fields.items() if name in DEFAULTS}
 
     @property
     def name(self):
@@ -43,9 +51,13 @@ class Solver:
 class SQP(Solver):
     """Sequential quadratic programming, which holds limits ("slsqp").
 
-    tolerance: change of the objective, as a share of its first value, below which a search has
-    arrived; None for 1e-8 and a polish of the best point to 1e-12.
+    Parameters
+    ----------
+    tolerance : change of the objective, as a share of its first value, below which a search has
+        converged; None for 1e-8 and a last search to 1e-12.
 
+    Examples
+    --------
     >>> SQP(starts=4).options()["starts"]
     4
     """
@@ -58,7 +70,14 @@ class SQP(Solver):
 class TRF(Solver):
     """Bounded Gauss-Newton trust region on squares, without limits ("trf").
 
-    coarse: first with a tenth of the samples ("coarse-trf").
+    Parameters
+    ----------
+    coarse : first with a tenth of the samples ("coarse-trf").
+
+    Examples
+    --------
+    >>> TRF(coarse=True).name
+    'coarse-trf'
     """
 
     method: ClassVar[str] = "trf"
@@ -76,21 +95,37 @@ class TRF(Solver):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LBFGS(Solver):
-    """Limited-memory BFGS on an augmented Lagrangian ("lbfgs")."""
+    """Limited-memory BFGS on an augmented Lagrangian ("lbfgs").
+
+    Examples
+    --------
+    >>> LBFGS(iterations=20).name
+    'lbfgs'
+    """
 
     method: ClassVar[str] = "lbfgs"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Adam(Solver):
-    """Adam on an augmented Lagrangian ("adam"). batch: scenarios drawn for each step, None for all."""
+    """Adam on an augmented Lagrangian ("adam").
+
+    Parameters
+    ----------
+    batch : scenarios drawn for each step, None for all.
+
+    Examples
+    --------
+    >>> Adam(batch=4).options()["batch"]
+    4
+    """
 
     method: ClassVar[str] = "adam"
     batch: int | None = None
 
 
 def check_options(*, tolerance=None, **counts):
-    """Raise InputError for a number of searches, points, iterations or runs that is out of range."""
+    """Raise InputError for a number of searches, points, iterations or runs out of range."""
     for name, value in counts.items():
         low = 0 if name == "validation" else 1
         if name == "batch" and value is None:
@@ -102,7 +137,7 @@ def check_options(*, tolerance=None, **counts):
 
 
 def spelled_out(case, method, options):
-    """(Case, name of the method, keywords of `tune`) of a Case or Problem and a name or Solver.
+    """Return (Case, name of the method, keywords of `tune`) of a Problem or a Solver.
 
     Raises InputError for a keyword that contradicts what the Problem or the Solver has.
     """
@@ -117,7 +152,7 @@ def spelled_out(case, method, options):
     if isinstance(method, Solver):
         for name, value in method.options().items():
             kind = type(method).__name__
-            if value is not None and options[name] not in (USUAL[name], value):
+            if value is not None and options[name] not in (DEFAULTS[name], value):
                 raise InputError(f"{name} = {options[name]!r}: {kind} has {name} = {value!r}")
             options[name] = options[name] if value is None else value
         method = method.name

@@ -1,5 +1,6 @@
-"""What a limit costs: the problem solved again for a row of values of one limit, each search begun
-where a neighbour's ended.
+"""The trade-off between the objective and one limit, by the epsilon-constraint method.
+
+Imported by the command line and as `tuning.tradeoff`.
 """
 
 import math
@@ -33,23 +34,40 @@ def tradeoff(
     iterations: int = 60,
     screening: int = 64,
     start: Any = None,
-    progress: Callable | None = None,
+    progress: Callable[[Search], Any] | None = None,
 ) -> dict[str, Any]:
-    """The least objective for each of `values` as the limit of `measure` (the epsilon-constraint
-    method), the loosest first.
+    """Return the least objective for each of `values` as the limit of `measure`, the loosest first.
 
     Each value is searched from the answer of the next looser one (from the first point too, where
     that leads to none that keeps the limit) and from that of the next tighter one, and the best is
-    kept: a tighter limit's answer holds a looser one too, so that the objective never falls as the
-    limit is drawn in. Where one of `screening` Sobol points, or a point that was evaluated for
+    kept: a tighter limit's answer keeps a looser one too, so that the objective never falls as the
+    limit is tightened. Where one of `screening` Sobol points, or a point that was evaluated for
     another value, keeps the limit at a lower objective, the search is begun again from it.
 
-    case, free, objective, limits, scenarios, seed, iterations, screening: as in `tune`; the limit
-    holds for every entry of the measure, the other limits stay; start: {name: value} to begin at,
-    the case's own where None; progress: called after every evaluation. Returns {"measure",
-    "points": [{"limit", "status" ("converged", "not_converged" or "infeasible"), "objective",
-    "violation", "parameters"}]}. Raises InputError for an unknown measure and for values that are
-    not finite.
+    Parameters
+    ----------
+    case, free, objective, limits, scenarios, seed, iterations, screening : as in `tune`; the other
+        limits stay.
+    measure : name of a measure; the limit holds for every entry of it.
+    values : values of its limit, in its unit.
+    start : {name: value} to begin at, the case's own values where None.
+    progress : called after every evaluation.
+
+    Returns
+    -------
+    {"measure", "points": [{"limit", "status" ("converged", "not_converged" or "infeasible"),
+        "objective", "violation", "parameters"}]}
+
+    Raises
+    ------
+    InputError : for an unknown measure and for values that are not finite.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets
+    >>> case = presets.find("cascaded/pi")
+    >>> tuning.tradeoff(case, "input_travel", [80.0, 40.0])  # doctest: +SKIP
     """
     ms.check_names([measure])
     values = [float(v) for v in values]
@@ -57,102 +75,116 @@ def tradeoff(
         raise InputError(f"tradeoff of {measure}: must have 1 to {MANY} finite values of its limit")
     others = {m: v for m, v in (case.limits if limits is None else limits).items() if m != measure}
     values = sorted(values, reverse=ms.MEASURES[measure].sense > 0)
+    steps = [{**others, measure: value} for value in values]
     problem = Problem(
-        case,
-        free=free,
-        objective=objective,
-        limits={**others, measure: values[0]},
-        scenarios=scenarios,
-        seed=seed,
+        case, free=free, objective=objective, limits=steps[0], scenarios=scenarios, seed=seed
     )
     z = problem.start()
     if start is not None:
         z = np.clip([float(b.to_unit(start[b.name])) for b in problem.bounds], 0.0, 1.0)
-    found, begin, known = [], z, {}
-
-    def solve(value, z):
-        answer = _solve(problem, {**others, measure: value}, z, iterations, progress)
-        known.update(answer.search.memory)
-        return answer
-
-    for value in values:
-        found.append(solve(value, z))
-        if found[-1].broken and z is not begin:
-            found[-1] = _better(found[-1], solve(value, begin))
-        z = z if found[-1].best is None else found[-1].best.z
-    for k in reversed(range(len(values))):
-        if k + 1 < len(values) and not found[k + 1].broken:
-            found[k] = _better(found[k], solve(values[k], found[k + 1].best.z))
-        problem.limit({**others, measure: values[k]})
-        search = found[k].search
-        other = best_screened(search, *_candidates(problem, known, screening, seed))
-        if other is not None:
-            found[k] = _Answer(search, slsqp(search, other, iterations))
-        approach(search)
-        known.update(search.memory)
+    sweep = _Sweep(problem, steps, iterations, progress or (lambda search: None))
+    z = sweep.tighten(z)
+    sweep.loosen(screening, seed)
     return {
         "measure": measure,
-        "points": [_told(problem, value, answer, z) for value, answer in zip(values, found)],
+        "points": [_row(problem, value, answer, z) for value, answer in zip(values, sweep.found)],
     }
 
 
-def _candidates(problem, known, screening, seed):
-    """Return (zs, costs, margins under the problem's limits) of screened points and of the finite
-    Points among `known`.
-    """
-    zs, costs, margins, _ = screen(problem, screening, seed)
-    points = [p for p in known.values() if p.finite]
-    old = [problem.margins(p.measures) for p in points]
-    return (
-        np.concatenate([zs, [p.z for p in points]]),
-        np.concatenate([costs, [p.cost for p in points]]),
-        np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),
-    )
-
-
 class _Answer(NamedTuple):
-    """What a search for one value of the limit came to."""
+    """The result of a search for one value of the limit."""
 
     search: Search
     converged: bool
 
     @property
     def best(self):
+        """The best Point; None where nothing finite was found."""
         return self.search.best
 
     @property
-    def broken(self):
-        """Largest share by which a limit is broken; infinite where nothing finite was found."""
+    def violation(self):
+        """Largest violation as a share of its limit; infinite where nothing finite was found."""
         return np.inf if self.best is None else self.search.violation(self.best)
 
 
+class _Sweep:
+    """The problem solved for a row of limits, first from loose to tight, then back."""
+
+    def __init__(self, problem, steps, iterations, progress):
+        self.problem, self.steps, self.iterations = problem, steps, iterations
+        self.progress = progress
+        self.found: list[_Answer] = []
+        self.known = {}  # every Point that was evaluated
+
+    def tighten(self, begin):
+        """Solve each step from the answer before it, the first from `begin` (P,).
+
+        Returns z of the last.
+        """
+        z = begin
+        for limits in self.steps:
+            answer = self._solve(limits, z)
+            if answer.violation and z is not begin:
+                answer = _better(answer, self._solve(limits, begin))
+            self.found.append(answer)
+            z = z if answer.best is None else answer.best.z
+        return z
+
+    def loosen(self, screening, seed):
+        """Solve each step again from the answer of the tighter one and from better known points."""
+        for k in reversed(range(len(self.steps))):
+            if k + 1 < len(self.steps) and not self.found[k + 1].violation:
+                nearby = self._solve(self.steps[k], self.found[k + 1].best.z)
+                self.found[k] = _better(self.found[k], nearby)
+            self.problem.limit(self.steps[k])
+            search = self.found[k].search
+            other = best_screened(search, *self._candidates(screening, seed))
+            if other is not None:
+                self.found[k] = _Answer(search, slsqp(search, other, self.iterations))
+            approach(search)
+            self.known.update(search.memory)
+
+    def _solve(self, limits, z):
+        """Return the _Answer under `limits` {measure: value}, searched from z (P,)."""
+        problem = self.problem
+        problem.limit(limits)
+        search = Search(problem, problem.point(problem.start()), self.progress)
+        converged = slsqp(search, z, self.iterations)
+        if search.best is not None and search.violation(search.best) > 0:
+            restore(search, search.best.z, self.iterations)
+            converged = slsqp(search, search.best.z, self.iterations)
+        self.known.update(search.memory)
+        return _Answer(search, converged)
+
+    def _candidates(self, screening, seed):
+        """Return (zs, costs, margins under the present limits) of screened and of known points."""
+        zs, costs, margins, _ = screen(self.problem, screening, seed)
+        points = [p for p in self.known.values() if p.finite]
+        old = [self.problem.margins(p.measures) for p in points]
+        return (
+            np.concatenate([zs, [p.z for p in points]]),
+            np.concatenate([costs, [p.cost for p in points]]),
+            np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),
+        )
+
+
 def _better(one, other):
-    """The _Answer to keep of two for the same limits."""
+    """Return the _Answer to keep of two for the same limits."""
     if one.best is None or other.best is None:
         return other if one.best is None else one
     return other if one.search.better(other.best, one.best) else one
 
 
-def _solve(problem, limits, z, iterations, progress=None):
-    """The _Answer of `problem` under `limits` {measure: value}, searched from z (P,)."""
-    problem.limit(limits)
-    search = Search(problem, problem.point(problem.start()), progress or (lambda search: None))
-    converged = slsqp(search, z, iterations)
-    if search.best is not None and search.violation(search.best) > 0:
-        restore(search, search.best.z, iterations)
-        converged = slsqp(search, search.best.z, iterations)
-    return _Answer(search, converged)
-
-
-def _told(problem, value, answer, z):
-    """One row of `tradeoff`'s points; z: (P,) what to name where nothing finite was found."""
-    best, broken = answer.best, answer.broken
+def _row(problem, value, answer, z):
+    """Return one row of `tradeoff`; z (P,): what to name where nothing finite was found."""
+    best, violation = answer.best, answer.violation
     return {
         "limit": value,
         "status": (
-            "infeasible" if broken > 0 else "converged" if answer.converged else "not_converged"
+            "infeasible" if violation > 0 else "converged" if answer.converged else "not_converged"
         ),
         "objective": np.nan if best is None else float(best.cost),
-        "violation": float(broken),
+        "violation": float(violation),
         "parameters": problem.values(z if best is None else best.z),
     }

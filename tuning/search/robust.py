@@ -1,5 +1,6 @@
-"""Robust tuning: gains for many plants at once, and what can be promised of a plant that was not
-among them.
+"""Robust tuning: gains for many plants at once, and the violation probability on new plants.
+
+Imported by the command line and as `tuning.tune_robust`.
 """
 
 import math
@@ -15,37 +16,41 @@ from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
-from tuning.search.baseline import own_values
-from tuning.search.diagnostics import HELD_OUT, summary_of, validate
-from tuning.search.result import TuningResult
+from tuning.search.result import Message, TuningResult
 from tuning.search.tuner import tune
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson, probabilities, spread_of
 from tuning.uncertainty.study import ensemble
+from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 
 CONFIDENCE = 1e-6
 """Probability beta with which the scenario bound may fail [-]."""
 
 TOLERANCE = 1e-4
 """Change of the objective, as a share of its first value, at which a search over drawn plants has
-arrived: their mean is itself known to a few percent only [-].
+converged: their mean is itself known to a few percent only [-].
 """
 
 
 class Certificate(NamedTuple):
-    """What is known of a fresh plant: by the scenario theory before any is run, and by running
-    some.
+    """The violation probability of a new plant: a bound before any is run, and an estimate by runs.
+
+    Examples
+    --------
+    >>> known = Certificate(64, 1, round(scenario_bound(64, 1), 3), 1024, 3, [0.0006, 0.0085])
+    >>> known.bound, known.broken / known.fresh
+    (0.296, 0.0029296875)
     """
 
-    scenarios: int  # N plants that the search was held to
-    support: int  # of those, how many hold the answer in place
+    scenarios: int  # N plants in the search
+    support: int  # of those, the support scenarios
     # probability of breaking a limit, at most, with confidence 1 - 1e-6 (Campi, Garatti, Ramponi
     # 2018)
     bound: float
-    fresh: int  # plants run afterwards
-    broken: int  # of those, how many broke a limit
+    fresh: int  # new plants run afterwards
+    broken: int  # of those, how many violated a limit
     interval95: list  # Clopper and Pearson
 
     _repr_html_ = Shown._repr_html_
@@ -57,17 +62,18 @@ class Certificate(NamedTuple):
             "plants of the search": self.scenarios,
             "support scenarios": self.support,
             "scenario bound": f"{self.bound:.2g} (confidence 1 - {CONFIDENCE:g})",
-            "validation plants": self.fresh,
-            "validation plants that break a limit": self.broken,
-            "probability of breaking a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
+            "new plants": self.fresh,
+            "new plants that violate a limit": self.broken,
+            "probability of violating a limit": f"{low:.2g} to {high:.2g} (95 % interval)",
         }
         return "\n".join(f"{name}: {value}" for name, value in rows.items())
 
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):
-    """`samples` Scenarios of a case: each of its own in turn (its own run, where it has none) on a
-    plant drawn from `distributions`, with noise of its own. Latin hypercube draws. Raises
-    InputError for what cannot be drawn.
+    """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`.
+
+    The case's own scenarios in turn (its own run, where it has none), each with noise of its own.
+    Latin hypercube draws. Raises InputError for what cannot be drawn.
     """
     distributions = spread_of(case) if distributions is None else stated(distributions)
     space = Draws(case.loop, distributions)
@@ -90,17 +96,23 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
 
 
 def scenario_bound(scenarios, support, beta=CONFIDENCE):
-    """Largest probability of breaking a limit, with confidence 1 - beta, of an answer that
-    `support` of `scenarios` plants hold in place.
+    """Return the largest violation probability of an answer, with confidence 1 - beta.
+
+    scenarios : N plants in the search. support : k of them that determine the answer.
 
     eps(k) = 1 - (beta / (N C(N, k)))^(1 / (N - k)): M. C. Campi, S. Garatti, F. A. Ramponi, A
     general scenario theory for nonconvex optimization and decision making, IEEE TAC 63(12), 2018.
-    It holds whatever the distribution and however the answer was found, for independent plants and
-    the support by which the same answer is found. What is counted here are the plants at a limit
-    and (for the worst case) at the cost: for the mean, and in part for cvar, every plant moves the
-    gains a little, by the theorem's letter the support is then all of them and the bound 1, and
-    this figure is an indication. Latin hypercube draws are not independent either. The fresh plants
-    are the proof.
+    It holds for any distribution and any way to find the answer, for independent plants and the
+    support by which the same answer is found. What is counted here are the plants at a limit and
+    (for the worst case) at the cost: for the mean, and in part for cvar, every plant changes the
+    gains a little; strictly, the support is then all of them and the bound 1, and this figure is an
+    indication. Latin hypercube draws are not independent either. The runs on new plants are the
+    evidence.
+
+    Examples
+    --------
+    >>> round(scenario_bound(64, 1), 3)
+    0.296
     """
     if not 0 <= support <= scenarios:
         raise InputError(f"support = {support}: must be from 0 to the {scenarios} scenarios")
@@ -130,33 +142,45 @@ def tune_robust(
     validation: int = 64,
     **options: Any,
 ) -> TuningResult:
-    """`tune` on `samples` plants drawn from `distributions` (the case's own spread where None),
-    every limit held on every plant.
+    """Return the result of `tune` on `samples` drawn plants, every limit held on every plant.
 
-    risk: "mean", "cvar" or "worst" of their costs; fresh: plants drawn afterwards, with seeds of
-    their own, on which the values before and after are run; back_off: share of each limit [-] that
-    the search keeps off it, while fresh plants are judged by the limit itself: a limit that one of
-    N plants holds in place is broken by about one fresh plant in N + 1; validation: runs of a case
-    that has scenarios of its own, 0 for none (any other is validated by the fresh plants);
-    tolerance and other options: as in `tune`. Returns a TuningResult with a Certificate. Raises
-    InputError as `tune` and `ensemble` do.
+    Parameters
+    ----------
+    case : the Case.
+    distributions : {name: distribution or share}; the case's own spread where None.
+    risk : "mean", "cvar" or "worst" of the costs of the plants.
+    samples : plants in the search.
+    fresh : new plants drawn afterwards, with seeds of their own, on which the values before and
+        after are run.
+    seed : of the draws, the Sobol points and the sensor noise.
+    back_off : constraint tightening, as a share of each limit [-]: the search keeps that far inside
+        each limit, while new plants are judged by the limit itself. A limit that is active on one
+        of N plants is violated on about one new plant in N + 1.
+    tolerance, options : as in `tune`.
+    validation : runs of a case that has scenarios of its own, 0 for none (any other is validated on
+        the new plants).
+
+    Returns
+    -------
+    TuningResult, with a Certificate.
+
+    Raises
+    ------
+    InputError : as `tune` and `ensemble`.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets
+    >>> case = presets.find("gouta2015/backstepping")
+    >>> tuning.tune_robust(case, samples=16, back_off=0.03).certificate  # doctest: +SKIP
     """
-    for name, value, low in (("samples", samples, 2), ("fresh", fresh, 1)):
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= 100_000:
-            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
-    if (
-        isinstance(back_off, bool)
-        or not isinstance(back_off, (int, float))
-        or not 0.0 <= back_off < 1.0
-    ):
-        raise InputError(
-            f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1"
-        )
+    _check(samples, fresh, back_off)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = check_limits(
         case.loop, case.limits if options.get("limits") is None else options["limits"]
     )
-    options["limits"] = _kept_off(case, limits, back_off)
+    options["limits"] = _tightened(case, limits, back_off)
     plants = scenarios_of(case, distributions, samples, seed)
     result = tune(
         case, scenarios=plants, risk=risk, seed=seed, tolerance=tolerance, validation=0, **options
@@ -168,60 +192,85 @@ def tune_robust(
         found = (None, None)
         if validation and result.status != "interrupted":
             values = {n: p["after"] for n, p in result.parameters.items()}
-            found = validate(judge, own_values(judge), values, validation, seed)
+            found = validate(judge, judge.own_values(), values, validation, seed)
     else:
-        *found, broken = _on_fresh(result, judge, distributions, limits, fresh, seed)
+        *found, broken = _on_new_plants(result, judge, distributions, limits, fresh, seed)
     support = _support(result)
     interval = clopper_pearson(broken, fresh)
     certificate = Certificate(
         samples, support, scenario_bound(samples, support), fresh, broken, interval
     )
-    words = _words(certificate, risk, back_off)
     return result.replace(
         certificate=certificate,
         validation=found[0],
         cloud=found[1],
-        message=f"{words}; {result.message}",
+        messages=(*certificate_messages(certificate, risk, back_off), *result.messages),
     )
 
 
-def _words(known, risk, back_off):
-    """A Certificate in words, joined by semicolons."""
+def _check(samples, fresh, back_off):
+    """Raise InputError for a number of plants or a tightening that is out of range."""
+    for name, value, low in (("samples", samples, 2), ("fresh", fresh, 1)):
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= 100_000:
+            raise InputError(f"{name} = {value!r}: must be a whole number from {low} to 100000")
+    number = isinstance(back_off, (int, float)) and not isinstance(back_off, bool)
+    if not number or not 0.0 <= back_off < 1.0:
+        raise InputError(
+            f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1"
+        )
+
+
+def certificate_messages(known: Certificate, risk: str, back_off: float) -> tuple[Message, ...]:
+    """Return the Messages of a Certificate: what was measured, and what was to be expected.
+
+    Examples
+    --------
+    >>> for m in certificate_messages(Certificate(16, 0, 0.4, 256, 0, [0.0, 0.0143]), "worst", 0.0):
+    ...     print(m.text)
+    on 256 new plants a limit was violated 0 times (95 % interval 0 to 0.014)
+    the scenario theory bounds the probability by 0.4 (N 16, support 0, confidence 1 - 1e-6)
+    """
     low, high = known.interval95
-    words = (
-        f"on {known.fresh} fresh plants a limit was broken {known.broken} times (95 % interval"
-        f" {low:.2g} to {high:.2g}); the scenario theory bounds the probability by"
-        f" {known.bound:.2g} (N {known.scenarios}, support {known.support}, confidence 1 - 1e-6"
-        + (
-            ")"
-            if risk == "worst"
-            else (
-                f", an indication: plants at no limit move the {risk} too, and count for nothing"
-                " in it)"
+    indication = (
+        ""
+        if risk == "worst"
+        else f", an indication: plants at no limit change the {risk} too, and are not counted in it"
+    )
+    found = [
+        Message(
+            "limit-violated-out-of-sample" if known.broken else "limits-hold-out-of-sample",
+            f"on {known.fresh} new plants a limit was violated {known.broken} times (95 % interval"
+            f" {low:.2g} to {high:.2g})",
+        ),
+        Message(
+            "scenario-bound",
+            f"the scenario theory bounds the probability by {known.bound:.2g} (N"
+            f" {known.scenarios}, support {known.support}, confidence 1 - 1e-6{indication})",
+        ),
+    ]
+    if back_off:
+        found.append(
+            Message(
+                "constraints-tightened",
+                f"the search tightened every limit by {100 * back_off:g} %, new plants are judged"
+                " by the limits themselves",
             )
         )
-    )
-    if back_off:
-        return (
-            f"{words}; the search kept {100 * back_off:g} % off every limit, fresh plants are"
-            " judged by the limits themselves"
+    elif known.broken and known.support:
+        expected = 100 * known.support / (known.scenarios + 1)
+        found.append(
+            Message(
+                "support-scenarios",
+                f"{known.support} of {known.scenarios} plants determine the answer: up to about"
+                f" {expected:.2g} % of new plants were to be expected past a limit (more plants or"
+                " a constraint tightening, --back-off 0.03, reduce both)",
+            )
         )
-    if not (known.broken and known.support):
-        return words
-    many = (
-        f"{known.support} of {known.scenarios} plants hold{'s' if known.support == 1 else ''} the"
-        " answer in place"
-    )
-    return (
-        f"{words}; {many}: before any fresh one was run up to about"
-        f" {100 * known.support / (known.scenarios + 1):.2g} % of them were to be expected past a"
-        " limit, what they then did is said above (more plants or a back-off, --back-off 0.03,"
-        " bring both down)"
-    )
+    return tuple(found)
 
 
-def _kept_off(case, limits, share):
-    """`limits` with `share` of each taken off, the rim being that of the plant."""
+def _tightened(case, limits, share):
+    """Return `limits` tightened by `share` of each, the rim being that of the plant."""
     if not share:
         return limits
     rim = np.asarray(case.loop.plant.rim).tolist()
@@ -232,31 +281,30 @@ def _kept_off(case, limits, share):
 
 
 def _run(case, distributions, limits, names, fresh, seed):
-    """(Ensemble of `fresh` plants that the search never saw, (fresh,) True where one breaks a limit
-    or leaves the numbers).
-    """
-    seen = cast(
+    """Return (Ensemble of new plants, (fresh,) True where one violates a limit or diverges)."""
+    found = cast(
         Ensemble,
         ensemble(
             case,
             distributions,
             samples=fresh,
-            key=(HELD_OUT + seed) % 2**31,
+            key=(SEED_OFFSET + seed) % 2**31,
             measures=names,
             limits=limits,
             fan=False,
         ),
     )
     past = [
-        limit.margins(seen.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
-        for limit in seen.limits
+        limit.margins(found.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
+        for limit in found.limits
     ]
-    return seen, seen.failed | np.any(past, axis=0) if past else seen.failed
+    return found, found.failed | np.any(past, axis=0) if past else found.failed
 
 
-def _on_fresh(result, judge, distributions, limits, fresh, seed):
-    """(summary, cloud, how many break a limit after tuning): fresh plants before and after tuning,
-    the same draws on both sides.
+def _on_new_plants(result, judge, distributions, limits, fresh, seed):
+    """Return (summary, cloud, how many violate a limit after tuning) on new plants.
+
+    Before and after tuning on the same draws.
     """
     names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
     sides = [
@@ -264,30 +312,30 @@ def _on_fresh(result, judge, distributions, limits, fresh, seed):
         for case in (result.case, result.tuned)
     ]
     costs = [
-        sum(w * seen.measures[m].reshape(fresh, -1).sum(axis=1) for m, w in judge.objective.items())
-        for seen, _ in sides
+        sum(
+            w * found.measures[m].reshape(fresh, -1).sum(axis=1) for m, w in judge.objective.items()
+        )
+        for found, _ in sides
     ]
     held = np.stack([~past for _, past in sides], axis=1)
-    levels = np.stack([seen.measures["max_level"] for seen, _ in sides], axis=1)
+    levels = np.stack([found.measures["max_level"] for found, _ in sides], axis=1)
     failed = sides[0][0].failed | sides[1][0].failed
     spread = {n: getattr(d, "relative", None) for n, d in distributions.items()}
-    noise = judge.lanes[0].key is not None
+    noise = judge.runs[0].key is not None
     found = summary_of(judge, np.stack(costs, axis=1), held, levels, failed, spread, noise)
     return *found, int((~held[:, 1]).sum())
 
 
 def _support(result):
-    """How many plants hold the answer in place: those at a limit, and for the worst case those at
-    the largest cost.
-    """
+    """Return how many plants determine the answer: at a limit or, by risk, at the largest cost."""
     held = {
-        c["scenario"]
-        for c, room in zip(result.constraints, result.problem.rooms)
-        if c["margin"] < 1e-3 * room
+        c.scenario
+        for c, scale in zip(result.constraints, result.problem.limit_scales)
+        if c.margin < 1e-3 * scale
     }
     if result.problem.risk != "mean":
         costs = np.array([result.problem.cost(row) for row in result.tables["after"]])
         share = result.problem.shares(costs, range(len(costs)))
         at = costs >= costs[share > 0].min() * (1 - 1e-4)
-        held |= {result.problem.lanes[i].name for i in np.flatnonzero(at)}
+        held |= {result.problem.runs[i].name for i in np.flatnonzero(at)}
     return len(held)

@@ -1,5 +1,6 @@
-"""Where to start: Sobol points at a coarse step, and which of them only the coarse step makes
-unstable.
+"""Where to start: Sobol points at a coarse step, and which of them only that step makes unstable.
+
+Imported by `stages` and `pareto`.
 """
 
 import functools
@@ -16,32 +17,39 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import Inputs, initial
 from jaxtank.loop.step import step
-from tuning.problem.scenarios import coarse_clock
+from tuning.problem.scenarios import screening_clock
 
 TRIED = 3
 """Screened points that are run again at the true step, at most, to find one that is better than the
 best: the coarse step may rate many too low."""
 
 LARGEST_STATE = 60
-"""Numbers in the loop's state above which its stability is not looked into: eigenvalues cost their
+"""Numbers in the loop's state above which its stability is not computed: eigenvalues cost their
 cube.
 """
 
 
 def sobol(count, dimensions, seed):
-    """(count, dimensions) scrambled Sobol points in the unit cube; count should be a power of 2."""
+    """Return (count, dimensions) scrambled Sobol points in the unit cube.
+
+    count : should be a power of 2. seed : of the scrambling.
+
+    Examples
+    --------
+    >>> sobol(4, 2, seed=0).shape
+    (4, 2)
+    """
     return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
         count
     )
 
 
 def spectral_radius(problem, zs, clock):
-    """(points,) largest modulus of the eigenvalues of one sample of the loop, linearised at the
-    reference's plateaus.
+    """Return (points,) the largest eigenvalue modulus of one sample of the linearised loop.
 
-    Above 1, the sampled loop is unstable there: it chatters between the limits of the pumps however
-    good its gains would be at a smaller step. Points (points, P); NaN where no plateau has a steady
-    state, or a transport delay makes the state too long to ask.
+    Linearised at the reference's plateaus, at zs (points, P). Above 1, the sampled loop is unstable
+    there: it chatters between the limits of the pumps however good its gains would be at a smaller
+    step. NaN where no plateau has a steady state, or a transport delay makes the state too long.
     """
     steady = []
     plateaus = problem.loop.reference.plateaus()
@@ -68,9 +76,7 @@ def spectral_radius(problem, zs, clock):
 
 @functools.partial(jax.jit, static_argnames=("clock",))
 def _one_step_jacobians(loop, clock, values, r, x, u):
-    """(points, plateaus, n, n) derivative of the loop's state after a sample by the state before
-    it.
-    """
+    """Return (points, plateaus, n, n) derivative of the loop's state by that a sample before."""
 
     def jacobian(values, r, x, u):
         here = with_values(loop, {**values, "x0": x, "actuator.initial": u})
@@ -109,13 +115,14 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
 
 def screen(problem, count, seed):
-    """(zs, costs, margins, redone): `count` Sobol points, costs in the order of zs.
+    """Return (zs, costs, margins, redone) of `count` Sobol points.
 
-    Points that the coarse step alone makes unstable, or whose coarse run is not finite, are run
-    again at the true step; `redone` counts the first.
+    zs (points, P), costs (points,), margins (points, limits). Points that the coarse step alone
+    makes unstable, or whose coarse run is not finite, are run again at the true step; `redone`
+    counts the first.
     """
     zs = sobol(count, len(problem.bounds), seed)
-    clock = coarse_clock(problem.clock)
+    clock = screening_clock(problem.clock)
     costs, margins = problem.screen(zs, coarse=True)
     unstable = np.zeros(count, dtype=bool)
     if clock != problem.clock:
@@ -124,7 +131,7 @@ def screen(problem, count, seed):
         )
         suspect = unstable | ~np.isfinite(costs)
         if suspect.any():
-            # always the same number of lanes, so that one compiled program serves every search
+            # always the same number of points, so that one compiled program serves every search
             again = np.concatenate(
                 [zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)]
             )
@@ -137,8 +144,13 @@ def screen(problem, count, seed):
 
 
 def distinct_starts(zs, merits, count, first):
-    """Up to `count` points: `first`, then those of lowest merit that keep their distance from all
-    taken so far.
+    """Return up to `count` points: `first`, then those of lowest merit at a distance from these.
+
+    Examples
+    --------
+    >>> zs = np.array([[0.5], [0.51], [0.9]])
+    >>> [float(z[0]) for z in distinct_starts(zs, np.array([1.0, 2.0, 3.0]), 3, np.array([0.1]))]
+    [0.1, 0.5, 0.9]
     """
     taken = [np.asarray(first, dtype=float)]
     apart = 0.5 / max(2, count) * np.sqrt(len(first))

@@ -1,16 +1,21 @@
-"""Finished batches as files: each whole or not at all, read back without trust."""
+"""Finished batches of an ensemble as files: each whole or not at all, read back without trust.
 
-import hashlib
+Imported by `uncertainty`, and by `report` to remove what is no longer needed.
+"""
+
 import io
 import json
 import re
 import zipfile
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.files import check_folder, refusal, untouched, write_atomic
+from jaxtank.core.files import refusal, write_atomic
+from tuning.storage.checkpoint import Checkpoint, Folder
 
 MANIFEST = "manifest.json"
 LARGEST = 1 << 28
@@ -19,112 +24,122 @@ LARGEST = 1 << 28
 NAME = re.compile(r"part-(\d{6})\.npz")
 
 
-def digest(arrays):
-    """Hexadecimal digest of arrays, their shapes and types."""
-    found = hashlib.sha256()
-    for a in arrays:
-        found.update(f"{a.dtype.str}{a.shape}".encode() + np.ascontiguousarray(a).tobytes())
-    return found.hexdigest()
+class BatchStore:
+    """The finished batches of an ensemble in a folder, with a manifest of the problem they are of.
 
+    Parameters
+    ----------
+    folder : where the files are, or will be; shards of one ensemble may share it.
+    problem : the `fingerprint` of the ensemble, with "measures", a list of names.
+    origin : what the manifest holds besides, for `merge`; it does not decide a number.
+    resume : True to continue with the batches that are there.
+    shared : True where other shards write there, too.
+    begin : whether resume may begin one of which a kill left nothing but its lock.
 
-class Store:
-    """The finished batches of an ensemble in a folder, with a manifest that says what they are of.
+    Raises
+    ------
+    InputError : for a folder that holds another ensemble, for one that holds batches where neither
+        resume nor shared is True, and for one with nothing to resume.
 
-    Shards of one ensemble may share a folder: the manifest is the same for all. anew: resume may
-    begin one of which a kill left nothing but its lock. Raises InputError for a folder that holds
-    another ensemble, for one that holds batches where neither resume nor shared is True, and for
-    one with nothing to resume.
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     store = BatchStore(folder, {"measures": ["ise"]})
+    ...     store.put(0, {"ise": np.ones(4), "failed": np.zeros(4)})
+    ...     store.get(0, {"ise": (4,), "failed": (4,)})["ise"]
+    array([1., 1., 1., 1.])
     """
 
-    def __init__(self, folder, manifest, resume=False, shared=False, anew=True):
-        check_folder(folder)
-        self.folder = Path(folder)
-        self.manifest = json.loads(json.dumps(manifest))
+    def __init__(
+        self,
+        folder: Folder,
+        problem: Mapping[str, Any],
+        origin: Any = None,
+        *,
+        resume: bool = False,
+        shared: bool = False,
+        begin: bool = True,
+    ):
+        self.checkpoint = Checkpoint(folder, problem)
+        self.folder = self.checkpoint.folder
         path = self.folder / MANIFEST
         if path.exists():
-            check_same(self.manifest, read_manifest(self.folder), self.folder)
+            theirs = read_manifest(self.folder)
+            theirs.pop("origin", None)
+            self.checkpoint.check_same(theirs)
             if not (resume or shared) and any(self.folder.glob("part-*.npz")):
                 raise InputError(
-                    f"{str(folder)!r} holds finished batches of this ensemble: --resume goes on"
+                    f"{str(folder)!r} holds finished batches of this ensemble: --resume continues"
                     " with them"
                 )
-        # a kill came before the first file
-        elif resume and not path.exists() and not (anew and untouched(self.folder)):
-            raise InputError(f"--resume {str(folder)!r}: there is no ensemble to go on with")
-        if not path.exists():
-            self._write(path, json.dumps(self.manifest, indent=1) + "\n")
+            return
+        if resume and not (begin and self.checkpoint.begun()):
+            self.checkpoint.refuse_empty(MANIFEST)
+        self._write(
+            path, json.dumps({**self.checkpoint.problem, "origin": origin}, indent=1) + "\n"
+        )
 
-    def path(self, k):
-        """The file of batch k."""
+    def path(self, k: int) -> Path:
+        """Return the file of batch k."""
         return self.folder / f"part-{k:06d}.npz"
 
-    def has(self, k):
-        """True if batch k is finished."""
+    def has(self, k: int) -> bool:
+        """Return True if batch k is finished."""
         return self.path(k).exists()
 
-    def put(self, k, batch):
+    def put(self, k: int, batch: Mapping[str, Any]) -> None:
         """Write batch k, {name: array}."""
         out = io.BytesIO()
         np.savez(out, **batch, seal=np.bytes_(self._seal(k, batch)))
         self._write(self.path(k), out.getvalue())
 
-    def _write(self, path, data):
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+    def _write(self, path: Path, data: str | bytes) -> None:
+        """Write a file, whole or not at all."""
+        with self.checkpoint.writing(path):
             write_atomic(path, data)
-        except OSError as error:
-            raise InputError(
-                f"{str(path)!r} cannot be written ({error.strerror}): make room, then --resume"
-            ) from None
 
-    def get(self, k, shapes):
-        """Batch k as {name: array} of these {name: shape}. Raises InputError for a file that is not
-        one of ours, or not what was written as
-        batch k of this ensemble: its seal says so, which whoever has this program can make, or what
-            it holds does.
+    def get(self, k: int, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Any]:
+        """Return batch k as {name: array} of these {name: shape}.
+
+        Raises InputError for a file that is not one of ours, or not what was written as batch k of
+        this ensemble, by its seal (which whoever has this program can make) or by what it holds.
         """
         path = self.path(k)
-        found = read_part(path, set(self.manifest["measures"]) | {"failed", "seal"})
+        found = read_batch(path, {*self.checkpoint.problem["measures"], "failed", "seal"})
         seal = found.pop("seal")
         odd = [
             n
             for n, a in found.items()
             if a.dtype not in (np.float64, np.float32) or a.shape != shapes[n]
         ]
-        if (
-            odd
-            or seal.dtype.kind != "S"
-            or seal.shape != ()
-            or bytes(seal).decode("ascii", "replace") != self._seal(k, found)
-        ):
+        text = seal.dtype.kind == "S" and seal.shape == ()
+        if odd or not text or bytes(seal).decode("ascii", "replace") != self._seal(k, found):
             raise InputError(
-                f"{path.name}: is not what was written as batch {k} of this ensemble: remove it and"
-                " run its share again"
+                f"{path.name}: is not what was written as batch {k} of this ensemble: delete it"
+                " and run its share again"
             )
         return found
 
-    def _seal(self, k, batch):
-        """Digest of a batch, its number and what it is of: it tells a file that was changed or
-        exchanged, by accident or by hand.
-        """
-        mine = json.dumps({n: v for n, v in self.manifest.items() if n != "origin"}, sort_keys=True)
-        return digest(
-            [
-                np.frombuffer(f"{mine} {k}".encode(), dtype=np.uint8),
-                *(np.asarray(batch[n]) for n in sorted(batch)),
-            ]
-        )
-
-    def clear(self):
-        """Remove the batches and the manifest: the result is whole."""
-        for path in [*self.folder.glob("part-*.npz"), self.folder / MANIFEST]:
-            if NAME.fullmatch(path.name) or path.name == MANIFEST:
-                path.unlink(missing_ok=True)
+    def _seal(self, k: int, batch: Mapping[str, Any]) -> str:
+        """Return the seal of a batch, its number included."""
+        return self.checkpoint.seal(str(k), *(np.asarray(batch[n]) for n in sorted(batch)))
 
 
-def read_part(path, names):
-    """{name: array} of a batch file; nothing is unpickled, and nothing larger than it should be is
-    unpacked.
+def remove_batches(folder: Folder) -> None:
+    """Remove the batches and the manifest of a folder, if it has one: the result is complete."""
+    if not (Path(folder) / MANIFEST).exists():
+        return
+    for path in (*Path(folder).glob("part-*.npz"), Path(folder) / MANIFEST):
+        if NAME.fullmatch(path.name) or path.name == MANIFEST:
+            path.unlink(missing_ok=True)
+
+
+def read_batch(path: Path, names: Iterable[str]) -> dict[str, Any]:
+    """Return {name: array} of a batch file.
+
+    Nothing is unpickled, and nothing larger than it should be is unpacked. Raises InputError for a
+    file that is not one of ours.
     """
     try:
         if why := refusal(path, LARGEST):
@@ -147,8 +162,8 @@ def read_part(path, names):
         ) from None
 
 
-def read_manifest(folder):
-    """The manifest of a folder. Raises InputError where there is none, or it is no manifest."""
+def read_manifest(folder: Folder) -> dict[str, Any]:
+    """Return the manifest of a folder. Raises InputError where there is none, or it is none."""
     path = Path(folder) / MANIFEST
     try:
         if why := refusal(path, 1 << 20):
@@ -163,24 +178,3 @@ def read_manifest(folder):
     if not isinstance(found, dict):
         raise InputError(f"{str(path)!r} is not a manifest")
     return found
-
-
-def check_same(mine, theirs, folder):
-    """Raise InputError, naming what differs, unless two manifests are of one ensemble. "origin" is
-    for people and `merge`: the limits in it decide nothing that is in a batch.
-    """
-    other = [k for k in mine if k != "origin" and mine[k] != theirs.get(k)]
-    if other:
-        raise InputError(
-            f"{str(folder)!r} holds another ensemble; what differs: {', '.join(other)}"
-        )
-
-
-def missing(folder, count):
-    """The batches of `count` that a folder does not hold."""
-    have = {
-        int(m.group(1))
-        for m in (NAME.fullmatch(p.name) for p in Path(folder).glob("part-*.npz"))
-        if m
-    }
-    return [k for k in range(count) if k not in have]

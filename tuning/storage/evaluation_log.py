@@ -1,177 +1,164 @@
-"""What was evaluated before: a log that a killed run is continued from, to the same bits."""
+"""Results of evaluations, kept in memory or as lines of a file that a killed run continues from.
+
+Imported by `problem` (the cache) and by `tune` and `identify` (the file).
+"""
 
 import contextlib
-import hashlib
 import json
 import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.files import refusal, untouched
+from jaxtank.core.files import refusal
+from tuning.storage.checkpoint import Checkpoint, Folder
+from tuning.storage.fingerprint import digest
 
 NAME = "evaluations.jsonl"
 LARGEST = 1 << 30
 """Largest log that is read [bytes]."""
 
 MARK, SIZE = b', "digest": "', 16
-"""What stands before the digest that closes a line, and the digest's length."""
+"""What stands before the digest that ends a line, and the digest's length."""
 
-BROKEN = (ValueError, KeyError, TypeError, RecursionError)
+MALFORMED = (ValueError, KeyError, TypeError, RecursionError)
 """What reading a line of JSON raises that is not one of ours; the last where it is nested without
 end.
 """
 
 
-def folder_of(checkpoint, **former):
-    """The folder where a search or study keeps what is done, None for none.
+class EvaluationCache:
+    """Results by what was evaluated.
 
-    former: {its former keyword: value}. Raises InputError where both are given, for two folders.
+    A search evaluates in an order that its results alone decide, so one that is started again and
+    finds its earlier results here follows the same path, and continues where they end.
 
-    >>> folder_of("run1", log=None)
-    'run1'
-    """
-    ((name, folder),) = former.items()
-    if checkpoint is None or folder is None or Path(checkpoint) == Path(folder):
-        return folder if checkpoint is None else checkpoint
-    raise InputError(f"checkpoint and {name} are two names of one folder: give one of them")
-
-
-class Memo:
-    """Results by what was asked. A search asks in an order that its results alone decide, so one
-    that is started again and finds its earlier results here walks the same path, and goes on where
-    the log ends.
+    Examples
+    --------
+    >>> cache = EvaluationCache()
+    >>> cache.recall("cost", [np.zeros(2)], lambda: (1.5,))
+    (1.5,)
+    >>> cache.recall("cost", [np.zeros(2)], lambda: (7.0,))
+    (1.5,)
     """
 
     def __init__(self):
-        self.found = {}
+        self.found: dict[str, Any] = {}
 
-    def recall(self, kind, asked, compute):
-        """compute(), or what it gave when the same was asked before. asked: list of arrays and
-        plain values.
-        """
-        key = _digest(kind, asked)
+    def recall(self, kind: str, arguments: Sequence[Any], compute: Callable[[], Any]) -> Any:
+        """Return compute(), or what it gave for the same kind and arguments (arrays, numbers)."""
+        key = digest(kind, *arguments)
         if key not in self.found:
             self.found[key] = self.keep(kind, key, compute())
         return self.found[key]
 
-    def keep(self, kind, key, result):
-        """`result`, entered wherever it is to be kept."""
+    def keep(self, kind: str, key: str, result: Any) -> Any:
+        """Return `result`, entered wherever it is to be kept."""
         return result
 
+    def in_memory(self) -> "EvaluationCache":
+        """Return a cache of the same results that writes nothing."""
+        cache = EvaluationCache()
+        cache.found = self.found
+        return cache
 
-class Log(Memo):
-    """A Memo that is also a file, a line per evaluation, numbers in hexadecimal so that not a bit
-    is lost.
 
-    The first line says what problem it belongs to, and every other one ends with a digest of itself
-    and that problem: a line that was changed, by hand or by a bad disk, or that comes from another
-    log is refused. One that a kill cut short is dropped. Raises InputError for those, for a log of
-    another problem, and for what is no log.
+class EvaluationLog(EvaluationCache):
+    """An EvaluationCache that is also a file: a line for each evaluation, numbers in hexadecimal.
+
+    The first line holds the problem, and every other one ends with its seal (`Checkpoint.seal`). A
+    line that a kill cut short is dropped.
+
+    Parameters
+    ----------
+    folder : where the file is, or will be.
+    problem : the `fingerprint` of the run.
+    resume : True to continue from the lines that are there.
+
+    Raises
+    ------
+    InputError : for a line that was changed, a log of another problem, and what is no log.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     log = EvaluationLog(folder, {"seed": 0})
+    ...     _ = log.recall("cost", [0.5], lambda: (1.5,))
+    ...     EvaluationLog(folder, {"seed": 0}, resume=True).resumed
+    1
     """
 
-    def __init__(self, folder, problem, resume=False):
+    def __init__(self, folder: Folder, problem: Mapping[str, Any], resume: bool = False):
         super().__init__()
-        self.path, head = (
-            Path(folder) / NAME,
-            json.dumps({"jaxtank": 2, "problem": problem}, sort_keys=True),
-        )
-        self.head = head.encode()
-        whole = self._read(head) if resume else b""
-        with self._told():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "r+b" if whole else "wb") as file:
-                if whole:
-                    file.truncate(len(whole))
-                else:
-                    file.write(head.encode() + b"\n")
+        self.checkpoint = Checkpoint(folder, problem)
+        self.path = self.checkpoint.folder / NAME
+        whole = self._read() if resume else b""
+        with self.checkpoint.writing(self.path), open(self.path, "r+b" if whole else "wb") as file:
+            if whole:
+                file.truncate(len(whole))
+            else:
+                file.write(json.dumps({"problem": self.checkpoint.problem}).encode() + b"\n")
         self.resumed = len(self.found)
 
-    def _read(self, head):
-        try:
-            if why := refusal(self.path, LARGEST):
-                raise InputError(
-                    f"--resume: {NAME} in {str(self.path.parent)!r} {why}, so it is no log of this"
-                    " program"
-                )
-            data = self.path.read_bytes()
-        except FileNotFoundError:
-            if untouched(self.path.parent):  # a kill came before the first line
-                return b""
-            done = (self.path.parent / "result.json").exists()
-            why = (
-                "that run had ended, and its answer is in result.json"
-                if done
-                else f"there is no {NAME}"
-            )
-            raise InputError(
-                f"--resume: {str(self.path.parent)!r} cannot be read as a search to go on with:"
-                f" {why}"
-            ) from None
-        except OSError as error:
-            raise InputError(
-                f"--resume: {NAME} in {str(self.path.parent)!r} cannot be read ({error.strerror})"
-            ) from None
+    def _read(self) -> bytes:
+        """Return the whole lines of the file, their results entered in `found`."""
+        data = self._data()
         lines = data[: data.rfind(b"\n") + 1].splitlines(keepends=True)
         if not lines:
             return b""
         try:
-            mine, theirs = json.loads(head)["problem"], json.loads(lines[0])["problem"]
-        except BROKEN:
+            theirs = json.loads(lines[0])["problem"]
+        except MALFORMED:
             raise InputError(f"--resume: {NAME} is not a log of this program") from None
-        if mine != theirs:
-            other = [k for k in mine if not isinstance(theirs, dict) or mine[k] != theirs.get(k)]
-            raise InputError(
-                f"--resume: the run in {str(self.path.parent)!r} was of another problem; what"
-                f" differs: {', '.join(other)}"
-            )
+        self.checkpoint.check_same(theirs)
         for i, line in enumerate(lines[1:]):
             try:
                 body, mark, tail = line.rpartition(MARK)
                 if not mark or tail != self._tail(body):
                     raise ValueError(tail)
                 entry = json.loads(body + b"}")
-                self.found[entry["key"]] = tuple(_read(v) for v in entry["result"])
-            except BROKEN:
+                self.found[entry["key"]] = tuple(_from_json(v) for v in entry["result"])
+            except MALFORMED:
                 raise InputError(
                     f"--resume: line {i + 2} of {NAME} is not one of its entries, or was changed:"
                     " without that line it is evaluated again"
                 ) from None
         return b"".join(lines)
 
-    def keep(self, kind, key, result):
-        body = json.dumps(
-            {"kind": kind, "key": key, "result": [_write(v) for v in result]}
-        ).encode()[:-1]
-        with self._told(), open(self.path, "ab") as file:
-            file.write(body + MARK + self._tail(body))
-        return tuple(_read(json.loads(json.dumps(_write(v)))) for v in result)
-
-    def _tail(self, body):
-        """What follows MARK on the line that begins with `body`."""
-        return hashlib.sha256(self.head + body).hexdigest()[:SIZE].encode() + b'"}\n'
-
-    @contextlib.contextmanager
-    def _told(self):
-        """A log that cannot be written is an InputError: what it holds so far is good to go on
-        from.
-        """
+    def _data(self) -> bytes:
+        """Return the bytes of the file; none where a run was killed before its first line."""
+        folder = str(self.checkpoint.folder)
         try:
-            yield
+            if why := refusal(self.path, LARGEST):
+                raise InputError(f"--resume: {NAME} in {folder!r} {why}, so it is no log of ours")
+            return self.path.read_bytes()
+        except FileNotFoundError:
+            if self.checkpoint.begun():
+                return b""
+            self.checkpoint.refuse_empty(NAME)
         except OSError as error:
             raise InputError(
-                f"{str(self.path)!r} cannot be written ({error.strerror}): make room, then --resume"
+                f"--resume: {NAME} in {folder!r} cannot be read ({error.strerror})"
             ) from None
 
-    def memo(self):
-        """A Memo of what the log holds, for what is asked later and need not be kept."""
-        memo = Memo()
-        memo.found = self.found
-        return memo
+    def keep(self, kind: str, key: str, result: Any) -> Any:
+        """Return `result` as it is read back from the line that is written."""
+        entries = [_to_json(v) for v in result]
+        body = json.dumps({"kind": kind, "key": key, "result": entries}).encode()[:-1]
+        with self.checkpoint.writing(self.path), open(self.path, "ab") as file:
+            file.write(body + MARK + self._tail(body))
+        return tuple(_from_json(json.loads(json.dumps(entry))) for entry in entries)
+
+    def _tail(self, body: bytes) -> bytes:
+        """Return what follows MARK on the line that begins with `body`."""
+        return self.checkpoint.seal(body)[:SIZE].encode() + b'"}\n'
 
 
-def discard(folder):
+def discard(folder: Folder) -> None:
     """Remove the log of a folder, if it has one, and those of a search over choices."""
     for log in (Path(folder) / NAME, *Path(folder).glob(f"choice_*/{NAME}")):
         with contextlib.suppress(FileNotFoundError):
@@ -181,31 +168,24 @@ def discard(folder):
                 log.parent.rmdir()
 
 
-def _digest(kind, asked):
-    digest = hashlib.sha256(kind.encode())
-    for value in asked:
-        array = np.asarray(value)
-        digest.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()
-
-
-def _write(value):
-    """A number, an array, a dict or a tuple of them as JSON without loss."""
+def _to_json(value: Any) -> dict[str, Any]:
+    """Return a number, an array, a dict or a tuple of them as JSON without loss."""
     if isinstance(value, dict):
-        return {"of": {k: _write(v) for k, v in value.items()}}
+        return {"of": {k: _to_json(v) for k, v in value.items()}}
     if isinstance(value, (tuple, list)):
-        return {"all": [_write(v) for v in value]}
+        return {"all": [_to_json(v) for v in value]}
     array = np.asarray(value)
     if array.dtype != np.float64:
         raise TypeError(f"a log holds float64, not {array.dtype}")
     return {"shape": array.shape, "hex": [float(v).hex() for v in array.ravel()]}
 
 
-def _read(entry):
+def _from_json(entry: Any) -> Any:
+    """Return what `_to_json` was given."""
     if "of" in entry:
-        return {k: _read(v) for k, v in entry["of"].items()}
+        return {k: _from_json(v) for k, v in entry["of"].items()}
     if "all" in entry:
-        return tuple(_read(v) for v in entry["all"])
+        return tuple(_from_json(v) for v in entry["all"])
     array = np.array([float.fromhex(v) for v in entry["hex"]], dtype=np.float64).reshape(
         [int(n) for n in entry["shape"]]
     )

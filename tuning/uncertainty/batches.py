@@ -111,7 +111,7 @@ class Runs:
     """
 
     def __init__(self, case, draws, names, key, batch=None, progress=None, devices=1):
-        (self.group,) = sc.groups_of([sc.Lane("", case, key, 1.0)])
+        (self.group,) = sc.groups_of([sc.ScenarioRun("", case, key, 1.0)])
         self.own = {
             name: np.asarray(get_value(case.loop, name))[None]
             for name in draws.values(np.zeros((0, draws.dimensions)))

@@ -1,5 +1,7 @@
 """Sensitivity of any function on the unit cube: designs and estimators, plain arrays in and out.
 
+Imported by `sensitivity_study`.
+
 Elementary effects: Morris, Technometrics 33(2) 1991, 161; their absolute mean: Campolongo, Cariboni
 and Saltelli, Environ. Model. Softw. 22(10) 2007, 1509. Shares of the variance: Saltelli et al.,
 Comput. Phys. Commun. 181(2) 2010, 259, first order by its table 2 (b), total order by Jansen's
@@ -19,17 +21,28 @@ BLOCK = 1 << 22
 """Bootstrap weights held at once."""
 
 FLAT = 1e-10
-"""Spread of an output, as a share of its size, that is rounding rather than an answer to the
-parameters [-].
-"""
+"""Standard deviation of an output, as a share of its size, that is rounding alone [-]."""
 
 
 def sobol_points(dimensions, samples, seed):
-    """(samples, D + 2, D) points for `sobol_indices`: in each row A, then A with one column of B
-    for each of the D columns, then B.
+    """Return the points that `sobol_indices` needs.
 
-    A and B are the two halves of a scrambled Sobol sequence in 2 D dimensions; samples is best a
-    power of 2.
+    In each row A, then A with one column of B for each of the D columns, then B; A and B are the
+    two halves of a scrambled Sobol sequence in 2 D dimensions.
+
+    Parameters
+    ----------
+    dimensions, samples, seed : int
+        samples is best a power of 2.
+
+    Returns
+    -------
+    (samples, D + 2, D) array
+
+    Examples
+    --------
+    >>> sobol_points(3, 8, seed=0).shape
+    (8, 5, 3)
     """
     base = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
         samples
@@ -43,15 +56,33 @@ def sobol_points(dimensions, samples, seed):
 
 
 def sobol_indices(y, seed=0):
-    """Shares of the variance of y (samples, D + 2), the outputs at `sobol_points`, that each input
-    has: alone and in all.
+    """Return the shares of the variance of y that each input has: alone and in all.
 
     S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
     over A and B. A row with an output that is not finite is left out whole, so that what remains
-    stays paired. Returns {"first", "total": (D,), "first_interval95",
-    "total_interval95": (D, 2), "kept": rows used, "sd": standard deviation of y}; shares are NaN
-    where y does not vary or fewer than 2 rows remain. The intervals are quantiles of a bootstrap
-    over rows; for Sobol points, more even than random ones, they are on the wide side.
+    stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
+
+    Parameters
+    ----------
+    y : (samples, D + 2) array
+        Outputs at `sobol_points`.
+    seed : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    dict
+        "first", "total": (D,); "first_interval95", "total_interval95": (D, 2), quantiles of a
+        bootstrap over rows (for Sobol points, more even than random ones, too wide); "kept": rows
+        used; "sd": standard deviation of y. Shares are NaN where y does not vary or fewer than 2
+        rows remain.
+
+    Examples
+    --------
+    >>> points = sobol_points(2, 256, seed=0)
+    >>> found = sobol_indices(points @ np.array([1.0, 2.0]))  # variances 1 : 4
+    >>> found["total"].round(1).tolist()
+    [0.2, 0.8]
     """
     y = np.asarray(y, dtype=float)
     dimensions = y.shape[1] - 2
@@ -95,7 +126,7 @@ def sobol_indices(y, seed=0):
 
 
 def bootstrap_means(terms, seed, resamples=RESAMPLES):
-    """(resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
+    """Return (resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
     n, rng, found = len(terms), np.random.default_rng(seed), []
     rows = max(1, BLOCK // n)
     for start in range(0, resamples, rows):
@@ -106,9 +137,25 @@ def bootstrap_means(terms, seed, resamples=RESAMPLES):
 
 
 def morris_points(dimensions, trajectories, seed, levels=LEVELS):
-    """(trajectories, D + 1, D) points for `morris_effects`: from a random point of the grid, each
-    coordinate in a random order steps once by levels / (2 (levels - 1)), to the side that stays
-    inside. levels is even.
+    """Return the points that `morris_effects` needs.
+
+    From a random point of the grid, each coordinate in a random order steps once by
+    levels / (2 (levels - 1)), to the side that stays inside.
+
+    Parameters
+    ----------
+    dimensions, trajectories, seed : int
+    levels : int
+        Of the grid; even.
+
+    Returns
+    -------
+    (trajectories, D + 1, D) array
+
+    Examples
+    --------
+    >>> morris_points(3, 4, seed=0).shape
+    (4, 4, 3)
     """
     rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
     base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
@@ -123,8 +170,27 @@ def morris_points(dimensions, trajectories, seed, levels=LEVELS):
 # outputs near the largest number come out as not finite
 @np.errstate(over="ignore", invalid="ignore")
 def morris_effects(points, y):
-    """(trajectories, D) elementary effects of outputs y (trajectories, D + 1) at `morris_points`:
-    change of y over the step, per unit of the cube; NaN where an end of the step is not finite.
+    """Return the elementary effects: change of y over the step, per unit of the cube.
+
+    Source: Morris 1991.
+
+    Parameters
+    ----------
+    points : (trajectories, D + 1, D) array
+        Of `morris_points`.
+    y : (trajectories, D + 1) array
+        Outputs there.
+
+    Returns
+    -------
+    (trajectories, D) array
+        NaN where an end of the step is not finite.
+
+    Examples
+    --------
+    >>> points = morris_points(2, 3, seed=0)
+    >>> morris_effects(points, points @ np.array([1.0, 2.0])).round(6).tolist()[0]
+    [1.0, 2.0]
     """
     y = np.where(np.isfinite(y), y, np.nan)
     change = np.diff(points, axis=1)
@@ -138,13 +204,26 @@ def morris_effects(points, y):
 # outputs near the largest number come out as not finite
 @np.errstate(over="ignore", invalid="ignore")
 def morris_indices(effects):
-    """Mean, mean size and standard deviation of the elementary effects (trajectories, D) of each
-    input.
+    """Return mean, mean size and standard deviation of the elementary effects of each input.
 
-    Returns {"mu", "mu_star", "sigma": (D,), "mu_interval95", "mu_star_interval95": (D, 2), "kept":
-    (D,) effects used}: mu near mu_star in size says that the effect has one sign, sigma near
-    mu_star that it depends on the other inputs or is curved. Effects that are not finite are left
-    out; the intervals are Student's, trajectories being independent; NaN below 2 effects.
+    mu near mu_star in size: the effect has one sign; sigma near mu_star: it depends on the other
+    inputs or is curved. Source: Campolongo, Cariboni and Saltelli 2007.
+
+    Parameters
+    ----------
+    effects : (trajectories, D) array
+        Those that are not finite are left out.
+
+    Returns
+    -------
+    dict
+        "mu", "mu_star", "sigma": (D,); "mu_interval95", "mu_star_interval95": (D, 2), Student's,
+        trajectories being independent; "kept": (D,) effects used. NaN below 2 effects.
+
+    Examples
+    --------
+    >>> morris_indices(np.array([[1.0], [-1.0]]))["mu_star"].tolist()
+    [1.0]
     """
     dimensions = effects.shape[1]
     found = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}

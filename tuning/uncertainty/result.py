@@ -50,7 +50,7 @@ class Ensemble(Result):
         "random", "latin" or "sobol".
     """
 
-    REPORT = "tuning.report.uncertainty"
+    REPORT = "tuning.report.studies.uncertainty"
 
     case: Any
     distributions: dict

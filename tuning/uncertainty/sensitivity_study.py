@@ -63,7 +63,7 @@ class SensitivityResult(Result):
         [s].
     """
 
-    REPORT = "tuning.report.sensitivity_report"
+    REPORT = "tuning.report.studies.sensitivity_page"
 
     case: Any
     method: str

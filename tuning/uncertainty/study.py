@@ -17,8 +17,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.loop import run as lp
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
-from tuning.storage import batch_store
-from tuning.storage.evaluation_log import folder_of
+from tuning.storage.batch_store import BatchStore
+from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
 from tuning.uncertainty.distributions import stated
@@ -107,7 +108,7 @@ def ensemble(
     >>> found.samples, found.measures["max_level"].shape
     (4, (4, 2))
     """
-    began, folder = time.perf_counter(), folder_of(checkpoint, folder=folder)
+    began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     _check_arguments(shard, samples, key)
     check_devices(devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
@@ -116,9 +117,10 @@ def ensemble(
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
     store = None
     if folder is not None:
-        manifest = _manifest(case, distributions, limits, samples, key, draws, names, plan.batch)
+        what = _what(case, distributions, samples, key, draws, names, plan.batch)
+        origin = shards.origin_of(case, case.limits if limits is None else limits)
         shared = shard is not None or jax.process_count() > 1
-        store = batch_store.Store(folder, manifest, resume, shared=shared, anew=not merge)
+        store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
     batches = _batches(plan, store, Runner(case, names, plan.seed, devices), shard, merge, progress)
     if shard is not None:
         return None
@@ -236,20 +238,14 @@ def _run_missing(plan, store, runner, numbers, report):
     return found
 
 
-def _manifest(case, distributions, limits, samples, key, draws, names, batch):
-    """What the batches of an ensemble are of, as JSON: those of another one are refused."""
-    leaves, structure = jax.tree.flatten(case.loop)
-    return {
-        "case": case.name,
-        "loop": batch_store.digest([np.asarray(v) for v in leaves]),
-        "structure": batch_store.digest([np.frombuffer(str(structure).encode(), dtype=np.uint8)]),
-        "clock": repr(case.clock),
-        "distributions": shards.to_json(distributions),
-        "samples": samples,
-        "key": key,
-        "draws": draws,
-        "measures": list(names),
-        "batch": batch,
-        "jax": jax.__version__,
-        "origin": shards.origin_of(case, case.limits if limits is None else limits),
-    }
+def _what(case, distributions, samples, key, draws, names, batch):
+    """Return the fingerprint of an ensemble: batches of another one are refused."""
+    return fingerprint(
+        case,
+        distributions=shards.to_json(distributions),
+        samples=samples,
+        key=key,
+        draws=draws,
+        measures=names,
+        batch=batch,
+    )

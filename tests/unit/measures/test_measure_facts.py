@@ -55,6 +55,16 @@ def test_a_measure_added_from_outside_is_listed_where_it_asks_to_be(with_mine):
     assert shown[shown.index(with_mine) - 1] == "max_level"
 
 
+def test_a_settling_time_that_is_none_has_the_one_cause_that_applies():
+    outside, inside = (
+        reasons({"settling_time": [v, v]})["settling_time"] for v in (np.inf, np.nan)
+    )
+    assert "the run ended" in outside and "took the output out of its band" in inside
+    both = reasons({"settling_time": [np.inf, 2.0, np.nan]})["settling_time"]
+    assert both == f"output 1: {outside}, output 3: {inside}"
+    assert "settling_time" not in reasons({"settling_time": [1.0, 2.0]})
+
+
 def test_what_a_measure_added_from_outside_states_is_reported_and_enforced(with_mine):
     case = presets.find("cascaded/pi")
     assert reasons({with_mine: [np.nan, 1.0]})[with_mine] == "no reason of its own"

@@ -78,6 +78,7 @@ def filtered(observer, ys, us, x0, dt):
     return np.array(found), state
 
 
+@pytest.mark.slow_for("measured0", "measured2")
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])
 def test_on_a_linear_model_the_extended_filter_is_the_ordinary_one(measured):
     """Joint correction and matrix inverse in numpy; the step's matrix is Taylor's series to h^4,
@@ -189,6 +190,7 @@ def test_gradients_by_the_variances(gouta, make):
     np.testing.assert_allclose(jax.jacfwd(f)(z), differences, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.slow_for("kalman")
 @pytest.mark.parametrize("make", [kalman, extended])
 def test_the_loop_still_compiles_to_one_function(gouta, make):
 

@@ -166,7 +166,8 @@ def test_margins_beyond_what_can_be_shown_are_counted(ax):
     diagnostics.margins(
         ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(diagnostics.MANY + 3)]
     )
-    assert len(ax.patches) == diagnostics.MANY and "3 with larger margins not shown" in ax.get_title()
+    assert len(ax.patches) == diagnostics.MANY
+    assert "3 with larger margins not shown" in ax.get_title()
     assert ax.get_yticklabels()[0].get_text().startswith(f"tank {diagnostics.MANY + 2}")
 
 

@@ -13,11 +13,12 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.presets import Scenario, Symmetry
+from jaxtank.presets import Symmetry, Scenario
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.search import diagnostics, methods
 from tuning.search.driver import Search
+from tuning.uncertainty import validation
 
 FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 SQUARES = {"mean_square_error": 1.0, "mean_square_travel": 5.0}
@@ -170,7 +171,7 @@ def test_limits_hold_in_every_scenario(gouta):
             <= 32.0
         )
     tight = min(result.constraints, key=lambda c: c["margin"])
-    assert tight["scenario"] in tight["name"] and f"tight: {tight['name']}" in result.message
+    assert tight["scenario"] in tight["name"] and f"active limit: {tight['name']}" in result.message
 
 
 @pytest.mark.slow_for("objective0", "objective1", "objective2")
@@ -215,7 +216,7 @@ def test_minibatches_come_near_the_whole(case):
 
 def lanes(case):
     """{scenario: loop} of what `tune` judges a case by."""
-    return {lane.name: lane.case for lane in Problem(case).lanes}
+    return {run.name: run.case for run in Problem(case).runs}
 
 
 def test_scenarios_of_a_preset_are_changes_of_the_case_as_it_stands():
@@ -380,9 +381,9 @@ def test_scenarios_that_cannot_be_run_are_refused(case, scenarios, words):
 def test_validation_is_of_runs_the_search_never_saw(case):
     case = case.replace(uncertain={"plant.drain": 0.1})
     problem = Problem(case, scenarios=SEVERAL[:2], seed=0)
-    lanes = diagnostics.perturbed(problem, 6, 0)
+    lanes = validation.perturbed(problem, 6, 0)
     drains = np.array([lane.case.loop.plant.drain for lane in lanes])
-    base = np.array([problem.lanes[i % 2].case.loop.plant.drain for i in range(6)])
+    base = np.array([problem.runs[i % 2].case.loop.plant.drain for i in range(6)])
     assert (
         len(np.unique(drains[:, :2])) == 12
         and 0.05 < np.abs(drains[:, :2] / base[:, :2] - 1).max() <= 0.1
@@ -391,7 +392,7 @@ def test_validation_is_of_runs_the_search_never_saw(case):
         {"controller.k": 0.03, "controller.k1": 0.088},
         {"controller.k": 0.3, "controller.k1": 0.2},
     )
-    found, cloud = diagnostics.validate(problem, own, tuned, 6, 0)
+    found, cloud = validation.validate(problem, own, tuned, 6, 0)
     costs = []
     for lane in lanes:
         costs.append(
@@ -411,8 +412,8 @@ def test_validation_is_of_runs_the_search_never_saw(case):
     np.testing.assert_allclose(cloud["objective"], costs, rtol=1e-9)
     assert (
         found
-        == diagnostics.validate(problem, own, tuned, 6, 0)[0]
-        != diagnostics.validate(problem, own, tuned, 6, 1)[0]
+        == validation.validate(problem, own, tuned, 6, 0)[0]
+        != validation.validate(problem, own, tuned, 6, 1)[0]
     )
 
 
@@ -429,8 +430,9 @@ class Quadratic:
             np.array(b),
         )
         self.limits = [Limit("max_level", i, 1.0) for i in range(len(self.b))]
-        self.rooms = np.ones(len(self.b))
+        self.limit_scales = np.ones(len(self.b))
         self.names, self.model, self.objective = list(names), "cost", {"mean_square_error": 1.0}
+        self.risk, self.runs = "mean", ()
         self.bounds = [tuning.Bound(n, 0.01, 100.0, "log", "1/s") for n in names]
 
     def point(self, z):
@@ -456,14 +458,14 @@ def test_curvature_and_the_flattest_direction():
     assert abs(first @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
     step = np.log(1.1) / np.log(1e4) / vectors[1, 0] * vectors[:, 0]
     # rounded, and run as they are said
-    said = np.log([found["flattest"]["factors"][n] for n in ("k", "l")]) / np.log(1e4)
-    assert found["flattest"]["changes_percent"] == pytest.approx(
+    said = np.log([found["least_sensitive"]["factors"][n] for n in ("k", "l")]) / np.log(1e4)
+    assert found["least_sensitive"]["changes_percent"] == pytest.approx(
         50 * said @ problem.H @ said, rel=1e-9
     )
     # what rounding may cost
     assert 50 * said @ problem.H @ said == pytest.approx(50 * step @ problem.H @ step, rel=0.05)
-    assert found["flattest"]["factors"]["l"] == 1.1
-    words = diagnostics.flat_words(problem, found)
+    assert found["least_sensitive"]["factors"]["l"] == 1.1
+    words = diagnostics.direction_words(problem, found)
     assert "k x 1.0" in words and "l x 1.1" in words
 
 
@@ -480,11 +482,11 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
         tuning.Bound("controller.k1", 0.0, 5.0, "linear", "-"),
     ]
     best = problem.point(np.array([0.5, 0.5]))
-    words = diagnostics.flat_words(
+    words = diagnostics.direction_words(
         problem, diagnostics.curvature(problem, Search(problem, best, lambda s: None), best)
     )
     said = re.fullmatch(
-        r"flattest direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective"
+        r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective"
         r" by (\S+) %",
         words,
     )
@@ -530,8 +532,8 @@ def test_mirror_images_are_named_and_counted_once():
     case = rig.set_values(presets.find("calofir/backstepping"), {"clock.substeps": 1})
     result = tuning.tune(case, starts=4, screening=16, validation=0)
     a, b = (result.parameters[n]["after"] for n in ("controller.K_phi", "controller.K_y"))
-    assert result.mirrored["values"] == {"controller.K_phi": b, "controller.K_y": a}
-    assert result.mirrored["objective"] == pytest.approx(result.objective["after"], rel=1e-6)
+    assert result.symmetry["values"] == {"controller.K_phi": b, "controller.K_y": a}
+    assert result.symmetry["objective"] == pytest.approx(result.objective["after"], rel=1e-6)
     assert (
         "K_phi and K_y exchange roles" in result.message and "the same objective" in result.message
     )
@@ -539,11 +541,11 @@ def test_mirror_images_are_named_and_counted_once():
     assert 0.0205 <= min(a, b) <= 0.024 and max(a, b) >= 0.1
     # an image outside the ranges, and a case without one
     assert (
-        diagnostics.mirror_of(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0})
+        diagnostics.symmetric(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0})
         is None
     )
     other = Problem(case.replace(symmetry=Symmetry("none", lambda v: {})))
-    assert diagnostics.mirror_of(other, [], result.problem.values(result.problem.start())) is None
+    assert diagnostics.symmetric(other, [], result.problem.values(result.problem.start())) is None
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.presets import Scenario
 from tuning.report import tuning as report
-from tuning.search.robust import Certificate, _words
+from tuning.search.robust import Certificate, certificate_messages
 
 SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}
 RESTS = "; the other rows: the case's own run, on its own plant"
@@ -63,24 +63,31 @@ def test_a_single_run_needs_no_such_line(case):
     assert "other rows" not in repr(tuning.tune(case, validation=0, **SEARCH))
 
 
-def test_what_was_expected_is_not_said_of_what_was_measured():
-    """One plant of 16 at a limit: 1/17 is expected before a fresh one is run, 2 of 256 is what was
+def test_what_was_expected_stands_apart_from_what_was_measured():
+    """One plant of 16 at a limit: 1/17 is expected before a new one is run, 2 of 256 is what was
     found.
     """
     known = Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028])
-    measured, bound, expected = _words(known, "worst", 0.0).split("; ")
+    measured, bound, expected = certificate_messages(known, "worst", 0.0)
+    assert measured.code == "limit-violated-out-of-sample"
     assert (
-        measured
-        == "on 256 fresh plants a limit was broken 2 times (95 % interval 0.00095 to 0.028)"
+        measured.text
+        == "on 256 new plants a limit was violated 2 times (95 % interval 0.00095 to 0.028)"
     )
-    assert "bounds the probability by 0.8 (N 16, support 1, confidence 1 - 1e-6)" in bound
-    assert expected.startswith(
-        "1 of 16 plants holds the answer in place: before any fresh one was run up to about 5.9 %"
-        " of them were"
+    assert "bounds the probability by 0.8 (N 16, support 1, confidence 1 - 1e-6)" in bound.text
+    assert expected.code == "support-scenarios"
+    assert expected.text.startswith(
+        "1 of 16 plants determine the answer: up to about 5.9 % of new plants were"
     )
-    assert "leaves" not in expected and "--back-off 0.03" in expected
+    assert "--back-off 0.03" in expected.text
 
 
-def test_nothing_is_expected_where_nothing_was_broken_or_a_back_off_was_kept():
-    assert "expected" not in _words(Certificate(16, 1, 0.8, 256, 0, [0.0, 0.0143]), "mean", 0.0)
-    assert "expected" not in _words(Certificate(16, 1, 0.8, 256, 2, [0.00095, 0.028]), "mean", 0.03)
+def test_nothing_is_expected_where_nothing_was_violated_or_limits_were_tightened():
+    for broken, back_off, code in (
+        (0, 0.0, "limits-hold-out-of-sample"),
+        (2, 0.03, "limit-violated-out-of-sample"),
+    ):
+        known = Certificate(16, 1, 0.8, 256, broken, [0.0, 0.028])
+        codes = [m.code for m in certificate_messages(known, "mean", back_off)]
+        assert codes[0] == code and "support-scenarios" not in codes
+        assert ("constraints-tightened" in codes) == (back_off > 0)

@@ -14,7 +14,7 @@ from jaxtank.loop.derivatives import OUTER
 from jaxtank.rig.schedule import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.problem import Problem
-from tuning.problem.scenarios import rough_clock
+from tuning.problem.scenarios import coarse_clock
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS
 
@@ -65,9 +65,9 @@ def quick(gouta, **changes):
 
 def test_a_short_run_has_no_rough_one(gouta):
     clock = quick(gouta).clock
-    assert rough_clock(clock) == clock
+    assert coarse_clock(clock) == clock
     longer = dataclasses.replace(clock, duration=400.0)
-    assert rough_clock(longer).dt == 10 * clock.dt and rough_clock(longer).duration == 400.0
+    assert coarse_clock(longer).dt == 10 * clock.dt and coarse_clock(longer).duration == 400.0
 
 
 def test_rough_search_starts_the_true_one(gouta):

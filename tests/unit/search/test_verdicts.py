@@ -14,7 +14,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.signals.setpoints import ramps
 from tuning.cli import main
-from tuning.problem.limits import Limit, resolve_limits, room_of
+from tuning.problem.limits import Limit, limit_scale, resolve_limits
 from tuning.problem.problem import Point
 from tuning.search.driver import Search
 from tuning.search.kkt import downhill
@@ -25,8 +25,8 @@ class Valley:
     """|z1 - 0.6| + slope * (z2 - 0.3)^2 under z2 >= floor: a kink along z1 = 0.6."""
 
     limits = (Limit("min_level", 0, 1.0),)
-    rooms = np.ones(1)
-    bounds, model = (), None
+    limit_scales = np.ones(1)
+    bounds, model, risk = (), None, "mean"
 
     def __init__(self, floor=0.0):
         self.floor = floor
@@ -60,12 +60,12 @@ def test_slsqp_on_the_kink_is_no_false_success():
 @pytest.mark.parametrize(
     "name", ["calofir/backstepping", "cascaded/pi", "gouta2015/backstepping", "khalid/gpc"]
 )
-def test_room_of_a_limit_is_of_its_own_size_in_any_unit(name):
+def test_limit_scale_a_limit_is_of_its_own_size_in_any_unit(name):
     """A back-off of 1e-6 of it must leave room below the limit, which in cubic metres is 1e-8."""
     case = presets.find(name)
     for limits in (None, {"max_level": "rim", "input_travel": 1e-4, "saturated_fraction": 0.0}):
         for limit in resolve_limits(case, limits):
-            room = room_of(limit, case.loop)
+            room = limit_scale(limit, case.loop)
             assert room > 0 and (limit.value == 0 or 1e-6 * room < 1e-2 * abs(limit.value))
 
 
@@ -85,7 +85,8 @@ def test_a_limit_in_cubic_metres_is_met_where_it_is_tight():
     assert result.success and result.objective["after"] < 0.0059715
     travel = next(c for c in result.constraints if c["measure"] == "input_travel")
     assert (
-        0 <= travel["margin"] < 1e-3 * travel["limit"] and "tight: input_travel" in result.message
+        0 <= travel["margin"] < 1e-3 * travel["limit"]
+        and "active limit: input_travel" in result.message
     )
 
 
@@ -113,7 +114,7 @@ def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure(quick):
     share = max(-c["margin"] / c["limit"] for c in missed)
     start = tuning.Problem(quick, limits=impossible)
     _, margins = start.screen(np.array([start.start()]))
-    before = max(-margins[0] / start.rooms)
+    before = max(-margins[0] / start.limit_scales)
     assert share <= before * (1 + 1e-9)
 
 
@@ -304,7 +305,7 @@ def test_robust_tuning_with_one_start_leaves_an_unstable_one(capsys):
 @pytest.mark.parametrize(
     "limit, why",
     [
-        ("settling_time=10", "no setpoint is stepped within its 40 s"),
+        ("settling_time=10", "no setpoint has a step within its 40 s"),
         ("overshoot_percent=5", "--limit overshoot_percent=none"),
     ],
 )
@@ -331,14 +332,14 @@ def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
     still = case.replace(clock=dataclasses.replace(case.clock, duration=4.0))
     with pytest.raises(
         jaxtank.InputError,
-        match=r"settling_time = 50 s: undefined on this run: no setpoint is stepped within its 4 s",
+        match=r"settling_time = 50 s: undefined on this run: no setpoint has a step within its 4 s",
     ):
         resolve_limits(still, {"settling_time": 50.0})
     quiet = presets.find("gouta2022/chadpc")
     quiet = quiet.replace(clock=dataclasses.replace(quiet.clock, duration=400.0))
     with pytest.raises(
         jaxtank.InputError,
-        match="recovery_time = 5 s: undefined on this run: nothing is poured within its 400 s",
+        match="recovery_time = 5 s: undefined on this run: no inflow disturbance begins within its 400 s",
     ):
         resolve_limits(quiet, {"recovery_time": 5.0})
 

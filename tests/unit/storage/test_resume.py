@@ -13,9 +13,8 @@ import pytest
 import tuning
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
-from tuning.storage import batch_store
-from tuning.storage import evaluation_log as memo
-from tuning.storage.evaluation_log import NAME, Log, Memo
+from tuning.storage import batch_store, evaluation_log
+from tuning.storage.evaluation_log import NAME, EvaluationCache, EvaluationLog
 
 FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
 OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
@@ -65,7 +64,7 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
 
 def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes(whole[1])
-    monkeypatch.setattr(Log, "keep", lambda *_: pytest.fail("something was evaluated"))
+    monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
     assert told(
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
     ) == told(whole[0])
@@ -75,7 +74,7 @@ def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
     (tmp_path / NAME).write_bytes(whole[1])
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, seed=1, **OPTIONS)
-    with pytest.raises(InputError, match="what differs: case"):
+    with pytest.raises(InputError, match="what differs: loop"):
         tuning.tune(
             gouta("backstepping", {**FAST, "controller.k": 0.031}),
             log=tmp_path,
@@ -83,7 +82,7 @@ def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
             **OPTIONS,
         )
     assert (tmp_path / NAME).read_bytes() == whole[1]
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="holds no checkpoint to continue"):
         tuning.tune(gouta("backstepping", FAST), log=tmp_path / "none", resume=True, **OPTIONS)
 
 
@@ -107,7 +106,7 @@ def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
 )
 def test_a_line_that_was_changed_is_refused(tmp_path, change):
     """Every one of them is JSON that could be an entry; the file is left as it is."""
-    log = Log(tmp_path, {"p": 1})
+    log = EvaluationLog(tmp_path, {"p": 1})
     for i in range(3):
         log.recall("x", [np.array(float(i))], lambda i=i: (1.0 + i, np.arange(2.0)))
     lines = (tmp_path / NAME).read_bytes().splitlines(keepends=True)
@@ -119,7 +118,7 @@ def test_a_line_that_was_changed_is_refused(tmp_path, change):
         lines[2] = lines[2].replace(keys[1], keys[1][::-1])
     elif change == "a line of another log":
         (tmp_path / "other").mkdir()
-        other = Log(tmp_path / "other", {"p": 2})
+        other = EvaluationLog(tmp_path / "other", {"p": 2})
         other.recall("x", [np.array(1.0)], lambda: (9.0, np.arange(2.0)))
         lines[2] = other.path.read_bytes().splitlines(keepends=True)[1]
     else:
@@ -131,10 +130,10 @@ def test_a_line_that_was_changed_is_refused(tmp_path, change):
         InputError,
         match=r"^--resume: line 3 of evaluations\.jsonl is not one of its entries, or was changed",
     ):
-        Log(tmp_path, {"p": 1}, resume=True)
+        EvaluationLog(tmp_path, {"p": 1}, resume=True)
     assert (tmp_path / NAME).read_bytes() == data
     (tmp_path / NAME).write_bytes(b"".join(lines[:2] + lines[3:]))  # as the message says
-    assert Log(tmp_path, {"p": 1}, resume=True).resumed == 2
+    assert EvaluationLog(tmp_path, {"p": 1}, resume=True).resumed == 2
 
 
 def test_numbers_go_through_a_log_without_loss(tmp_path):
@@ -144,9 +143,9 @@ def test_numbers_go_through_a_log_without_loss(tmp_path):
         ({"a": np.array([1 / 3])},),
         np.zeros((0, 2)),
     )
-    log = Log(tmp_path, {"p": 1})
+    log = EvaluationLog(tmp_path, {"p": 1})
     first = log.recall("x", [np.arange(2.0)], lambda: result)
-    again = Log(tmp_path, {"p": 1}, resume=True).recall(
+    again = EvaluationLog(tmp_path, {"p": 1}, resume=True).recall(
         "x", [np.arange(2.0)], lambda: pytest.fail("run again")
     )
     for a, b in ((first, result), (again, result)):
@@ -156,14 +155,14 @@ def test_numbers_go_through_a_log_without_loss(tmp_path):
 
 
 def test_what_is_asked_decides(tmp_path):
-    memo, calls = Memo(), []
+    cache, calls = EvaluationCache(), []
     for asked in (
         [np.zeros(2), False],
         [np.zeros(2), True],
         [np.zeros((1, 2)), False],
         [np.zeros(2), False],
     ):
-        memo.recall("screen", asked, lambda: calls.append(1) or (0.0,))
+        cache.recall("screen", asked, lambda: calls.append(1) or (0.0,))
     assert len(calls) == 3
 
 
@@ -217,7 +216,10 @@ def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
     assert files.untouched(tmp_path)
     (tmp_path / "note.txt").write_text("mine")
     assert not files.untouched(tmp_path)
-    with pytest.raises(InputError, match=r"evaluations\.jsonl|no ensemble"):
+    with pytest.raises(
+        InputError,
+        match=r"no checkpoint to continue: there is no (evaluations\.jsonl|manifest\.json)",
+    ):
         began(command, tmp_path)
     (tmp_path / "note.txt").unlink()
     began(command, tmp_path)
@@ -227,7 +229,7 @@ def test_a_run_that_was_killed_before_its_first_line_goes_on(command, tmp_path):
 def began(command, folder):
     """Open the log, or the store of batches, of a run that goes on in `folder`."""
     (
-        memo.Log(folder, {}, resume=True)
+        evaluation_log.EvaluationLog(folder, {}, resume=True)
         if command == "tune"
-        else batch_store.Store(folder, {}, resume=True)
+        else batch_store.BatchStore(folder, {}, resume=True)
     )

@@ -20,9 +20,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import Scenario
-from tuning.search import diagnostics, robust
+from tuning.search import robust
 from tuning.storage import batch_store
-from tuning.uncertainty import manifest
+from tuning.uncertainty import manifest, validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
@@ -97,7 +97,7 @@ def test_a_run_cut_off_goes_on_to_the_same_bits(case, whole, tmp_path, done):
             tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, progress=stop)
         assert len(list(tmp_path.glob("part-*.npz"))) == done
     else:
-        with pytest.raises(InputError, match="no ensemble to go on with"):
+        with pytest.raises(InputError, match="holds no checkpoint to continue"):
             tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
     assert same(tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=done > 0), whole)
 
@@ -106,7 +106,7 @@ def test_folders_of_another_ensemble_are_refused(case, tmp_path):
     tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 2))
     with pytest.raises(InputError, match="what differs: key"):
         tuning.ensemble(case, TWO, **{**OPTIONS, "key": 4}, folder=tmp_path, resume=True)
-    with pytest.raises(InputError, match="--resume goes on"):
+    with pytest.raises(InputError, match="--resume continues"):
         tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path)
     path = tmp_path / "part-000000.npz"
     path.write_bytes(b"PK not a batch")
@@ -116,7 +116,7 @@ def test_folders_of_another_ensemble_are_refused(case, tmp_path):
     with pytest.raises(InputError, match="does not hold the measures"):
         tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, resume=True)
     with pytest.raises(InputError, match="not a batch"):
-        batch_store.read_part(path, {"failed"})  # a pickle inside is never opened
+        batch_store.read_batch(path, {"failed"})  # a pickle inside is never opened
 
 
 LAYOUT = """
@@ -343,8 +343,8 @@ def test_a_batch_whose_seal_is_right_is_not_trusted_either(case, name, forged, t
     options = {"samples": 8, "batch": 4, "measures": ("max_level", "rms_error_total"), "fan": False}
     for i in (1, 2):
         tuning.ensemble(case, folder=tmp_path, shard=(i, 2), **options)
-    store = batch_store.Store.__new__(batch_store.Store)
-    store.folder, store.manifest = tmp_path, batch_store.read_manifest(tmp_path)
+    problem = batch_store.read_manifest(tmp_path)
+    store = batch_store.BatchStore(tmp_path, problem | {"origin": None}, resume=True)
     with np.load(store.path(1)) as table:
         arrays = {n: table[n] for n in table.files if n != "seal"}
     store.put(1, arrays | {name: forged(arrays[name])})
@@ -611,7 +611,7 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
     assert all(c["margin"] >= 0 for c in result.constraints) and len(result.constraints) == 48
     costs = []
     values = {n: p["after"] for n, p in result.parameters.items()}
-    for lane in result.problem.lanes:
+    for lane in result.problem.runs:
         loop = with_values(lane.case.loop, values)
         found = jaxtank.evaluate(loop, lane.case.clock, ["rms_error_total", "max_level"])
         assert np.asarray(found["max_level"]).max() <= 33.0
@@ -624,7 +624,7 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
         12, known.support
     )
     np.testing.assert_allclose(known.interval95, clopper_pearson(known.broken, 64), atol=1e-12)
-    assert "fresh plants" in result.message
+    assert "new plants" in result.message
 
 
 @pytest.mark.slow
@@ -652,7 +652,7 @@ def test_a_back_off_is_kept_in_the_search_and_fresh_plants_are_judged_without(go
         seen = tuning.ensemble(
             there,
             samples=48,
-            key=diagnostics.HELD_OUT,
+            key=validation.SEED_OFFSET,
             measures=("rms_error_total", "max_level"),
             fan=False,
         )
@@ -844,7 +844,7 @@ def test_sigkill_and_resume_of_the_command(tmp_path):
 
 def test_distributions_are_put_into_words():
     from tuning import Correlated, Normal, Uniform
-    from tuning.report.uncertainty import in_words
+    from tuning.report.studies.uncertainty import in_words
 
     pair = Correlated(names=("a", "b"), covariance=((1.0, 0.0), (0.0, 1.0)))
     assert in_words(Uniform(relative=0.1)) == "+-10 % (uniform)"

@@ -19,8 +19,8 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses
-from tuning.problem.scenarios import Lane, groups_of, values_of
-from tuning.report import sensitivity_tables
+from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
+from tuning.report.studies import sensitivity_tables
 from tuning.uncertainty import distributions, indices, local
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
@@ -345,7 +345,7 @@ def test_runs_that_fail_are_counted_and_told(case):
     )
     draws = Draws(case.loop, study.distributions)
     points = indices.sobol_points(3, 32, 0)
-    (group,) = groups_of([Lane("", case, None, 1.0)])
+    (group,) = groups_of([ScenarioRun("", case, None, 1.0)])
     _, broken = values_of(group, ("max_level",), draws.values(points.reshape(-1, 3)))
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count

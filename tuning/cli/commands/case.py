@@ -112,15 +112,16 @@ def simulate(args):
     import jax
 
     from jaxtank.loop import run, step_size
+    from tuning.problem import reported
     from tuning.problem.scenarios import noisy
     from tuning.report import artifacts, tables
     from tuning.report import case as manual
-    from tuning.search import baseline, provenance
+    from tuning.search import provenance
 
     key = jax.random.key(seed) if noisy(case) else None
     if step_size.step_warnings(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
-    values = dict(baseline.run_measures(case.loop, case.clock, key))
+    values = dict(reported.run_measures(case.loop, case.clock, key))
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),

@@ -117,8 +117,8 @@ def merge(args):
     ]
     if given or args.samples != "1000" or args.draws != "random" or args.seed != "0":
         raise InputError(
-            f"merge {args.case!r}: the folder says what its shards are of; leave the other options"
-            " out (but --limit)"
+            f"merge {args.case!r}: its manifest has the options of the shards; leave out all"
+            " options but --limit"
         )
     case, options = restore(args.case)
     if args.limit:

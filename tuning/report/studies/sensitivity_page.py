@@ -9,7 +9,7 @@ from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-from tuning.report.sensitivity_tables import (
+from tuning.report.studies.sensitivity_tables import (
     HEADS,
     TITLES,
     derivative_unit,

@@ -12,7 +12,7 @@ from jaxtank.loop import step_size
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
 from tuning.search import provenance
-from tuning.storage import batch_store
+from tuning.storage.batch_store import remove_batches
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
@@ -319,9 +319,5 @@ def save(ensemble, folder, command=None):
         lambda drawn: page_of(ensemble, drawn, command),
         artifacts.earlier(folder, CAPTIONS),
     )
-    if (folder / batch_store.MANIFEST).exists():
-        for path in folder.glob("part-*.npz"):
-            if batch_store.NAME.fullmatch(path.name):
-                path.unlink()
-        (folder / batch_store.MANIFEST).unlink()
+    remove_batches(folder)
     return written

@@ -1,0 +1,128 @@
+"""Elimination for the small systems of `jaxtank.analysis.qp`, without LAPACK.
+
+Its call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call divides
+its work among the threads on which it runs itself: as many such calls at once as there are threads
+wait for each other for ever. Imports jax only; imported by `qp`.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+UNROLLED = 40  # variables up to which the elimination is written out
+STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variables, 8 as much as 4
+
+
+def normal_matrix(H, G, weight):
+    """Return H + G' diag(weight) G (n, n) for H (n, n), G (rows, n) and weight (rows,).
+
+    Examples
+    --------
+    >>> normal_matrix(jnp.eye(1), jnp.array([[2.0]]), jnp.array([0.5])).tolist()
+    [[3.0]]
+    """
+    return H + (_weighted(G, weight) if H.shape[0] > UNROLLED else (G.T * weight) @ G)
+
+
+@jax.jit
+def _weighted(G, weight):
+    """Return G' diag(weight) G (n, n) for G (rows, n), row by row.
+
+    Inside a loop that is one compiled function XLA writes the product of a vector and a matrix for
+    the processor's vector unit, and that of two matrices as three plain loops.
+    """
+    product = jnp.zeros((G.shape[1], G.shape[1]), G.dtype)
+
+    def row(j, product):
+        new = (_entry(G, j, axis=1) * weight) @ G
+        return jax.lax.dynamic_update_index_in_dim(product, new, j, 0)
+
+    return jax.lax.fori_loop(0, G.shape[1], row, product)
+
+
+def factor(A):
+    """Return a factor of A (n, n) symmetric positive definite, for `_substitute`.
+
+    Up to UNROLLED variables: [(column of L, pivot), ...] of A = L D L', written out column by
+        column.
+    Above: `_cholesky`.
+
+    Examples
+    --------
+    >>> float(substitute(factor(jnp.array([[4.0]])), jnp.array([2.0]))[0])
+    0.5
+    """
+    if A.shape[0] > UNROLLED:
+        return _cholesky(A)
+    columns = []
+    for j in range(A.shape[0]):
+        columns.append((A[:, j] / A[j, j], A[j, j]))
+        A = A - jnp.outer(columns[-1][0], A[j])
+    return columns
+
+
+def substitute(factor, b):
+    """Return A^-1 b for the `_factor` of A; b: (n,)."""
+    if not isinstance(factor, list):
+        return _cholesky_solve(factor, b)
+    index = np.arange(len(factor))
+    for j, (column, _) in enumerate(factor):
+        b = b - jnp.where(index > j, column, 0.0) * b[j]
+    b = b / jnp.stack([pivot for _, pivot in factor])
+    for j, (column, _) in reversed(list(enumerate(factor))):
+        b = jnp.where(index == j, b - jnp.sum(jnp.where(index > j, column * b, 0.0)), b)
+    return b
+
+
+@jax.jit
+def _cholesky(A):
+    """Return U (n, n) upper triangular, A = U'U, for A symmetric positive definite (NaN where it is
+    not).
+
+    One row of U at a time, from a product of the rows before it. The rows are done in STAGES parts
+    of fixed shape, so that little of a product is spent on entries that are zero.
+    `jaxtank.export.lowering` writes this function, `_cholesky_solve` and `_weighted` as loops of
+    its own: it knows them by their names.
+    """
+    n = A.shape[0]
+    ends = [round(n * k / STAGES) for k in range(STAGES + 1)]
+    U = jnp.zeros((0, n), A.dtype)
+    for first, end in itertools.pairwise(ends):
+        index, left = np.arange(n - first), A[first:, first:]
+
+        def row(j, rows, first=first, index=index, left=left):
+            column = _entry(rows, j, axis=1)
+            new = _entry(left, j) - column @ rows
+            new = jnp.where(index < j, 0.0, new * jax.lax.rsqrt(_entry(new, j)))
+            return jax.lax.dynamic_update_index_in_dim(rows, new, first + j, 0)
+
+        rows = jnp.concatenate([U[:, first:], jnp.zeros((end - first, n - first), A.dtype)])
+        rows = jax.lax.fori_loop(0, end - first, row, rows)
+        U = jnp.concatenate([U, jnp.pad(rows[first:], ((0, 0), (first, 0)))])
+    return U
+
+
+@jax.jit
+def _cholesky_solve(U, b):
+    """Return x (n,) of U'U x = b; U (n, n) as `_cholesky` returns it; b: (n,)."""
+    n = b.shape[0]
+    index = np.arange(n)
+
+    def forward(j, b):
+        row = _entry(U, j)
+        y = _entry(b, j) / _entry(row, j)
+        return jnp.where(index < j, b, jnp.where(index == j, y, b - row * y))
+
+    def backward(k, x):
+        j = n - 1 - k
+        row = _entry(U, j)
+        y = (_entry(x, j) - jnp.sum(jnp.where(index > j, row * x, 0.0))) / _entry(row, j)
+        return jax.lax.dynamic_update_index_in_dim(x, y, j, 0)
+
+    return jax.lax.fori_loop(0, n, backward, jax.lax.fori_loop(0, n, forward, b))
+
+
+def _entry(array, j, axis=0):
+    return jax.lax.dynamic_index_in_dim(array, j, axis, keepdims=False)

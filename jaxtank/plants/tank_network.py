@@ -1,0 +1,267 @@
+"""TankNetwork: tanks joined by orifices and pipes, filled by pumps; one class serves every rig.
+
+Imports core and modules of plants; other folders import it from `jaxtank.plants`.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxtank.core.numerics import (
+    clip,
+    limited_flow,
+    limited_sqrt,
+    lower_clip,
+    smooth_signed_sqrt,
+    smooth_sqrt,
+)
+from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.units import DEFAULT
+from jaxtank.plants.base import Plant
+from jaxtank.plants.hydraulics import efflux
+
+
+@component
+class TankNetwork(Plant):
+    """n tanks joined by orifices that discharge from one tank into another or into the basin, and
+    by pipes below the surface; m pumps.
+
+        A_i h_i' = sum_j s_ji v_j - (s_i + sum_j s_ij) v_i + sum_j p_ij w_ji + pumped_i + d_i
+        v = sqrt(2 g h)   (Torricelli; gouta2015 eqs. 1-8),      w_ji = sgn(h_j - h_i) sqrt(2 g |h_j
+        - h_i|)   (gouta2022 eqs. 1-2)
+
+    Pump j delivers pump_gain_j u_j: the share split_j to its first tank and the rest to its second.
+    An orifice discharges freely, so its flow depends on the level above it alone; a pipe's flow
+    depends on the difference of the two levels and changes its direction with it. Levels may fall
+    to zero and stay there; with `overflow` they stop at the rim and what would rise past it
+    overflows (and is counted), except for the share `caught` that falls into another tank;
+    otherwise a rim is only a limit and levels may rise past it. With `bottom`, a level stops at
+    zero where a negative inflow would take it below, and no tank gives more in one integration step
+    than it holds (see `limited`). `jaxtank.plants.network` builds one from plain numbers.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import network
+    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[30.0])
+    >>> [round(float(rate), 3) for rate in tank.derivative(0.0, (4.0,), (6.0,), None)]
+    [0.857]
+    """
+
+    area: np.ndarray = leaf("cm^2", "(n,) cross-section A of each tank", low=0.0, strict=True)
+    drain: np.ndarray = leaf(
+        "cm^2", "(n,) effective orifice area from each tank to the basin; 0: closed", low=0.0
+    )
+    orifice: np.ndarray = leaf(
+        "cm^2",
+        "(links,) effective area of the orifices between tanks, in the order of `links`",
+        low=0.0,
+    )
+    pipe: np.ndarray = leaf(
+        "cm^2",
+        "(pipes,) effective area of the pipes between tanks, in the order of `pipes`",
+        low=0.0,
+    )
+    pump_gain: np.ndarray = leaf(
+        "cm^3/(s V)", "(m,) flow per unit of each pump's input (Kp)", low=0.0, strict=True
+    )
+    split: np.ndarray = leaf(
+        "-", "(m,) share of each pump that goes to its first tank", low=0.0, high=1.0
+    )
+    gravity: np.ndarray = leaf("cm/s^2", "acceleration g", low=0.0, strict=True)
+    rim: np.ndarray = leaf("cm", "(n,) height of each tank", low=0.0, strict=True)
+    caught: np.ndarray = leaf(
+        "-", "(spills,) share of what passes a rim that falls into another tank", low=0.0, high=1.0
+    )
+    links: tuple = static(doc="((from, to), ...) tanks joined by each orifice")
+    pipes: tuple = static(doc="((one, other), ...) tanks joined by each pipe", default=())
+    feeds: tuple = static(doc="((first tank, second tank or None), ...) one per pump")
+    spills: tuple = static(doc="((from, to), ...) where what passes a rim falls", default=())
+    outputs: tuple = static(doc="tanks whose levels are controlled")
+    units: tuple = static(doc="(length, pump input): the units of this rig", default=DEFAULT)
+    overflow: bool = static(
+        doc="rims are physics: a level stops there and the liquid overflows",
+        choices=(False, True),
+        default=False,
+    )
+    bottom: bool = static(
+        doc="a level stops at zero whatever is drawn from it", choices=(False, True), default=False
+    )
+    # lower bound: a nanometre or less, the root is then exact for any level that means something,
+    # and its power -3/2 is still finite
+    knee: float = static(
+        "cm", "level, or difference of levels, below which flow turns laminar", low=1e-15
+    )
+
+    @property
+    def tanks(self) -> int:
+        return np.shape(self.rim)[-1]
+
+    @property
+    def pumps(self) -> int:
+        return len(self.feeds)
+
+    def _shares(self):
+        """[(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
+        shares = []
+        for j, (first, second) in enumerate(self.feeds):
+            if second is None:
+                shares.append((j, first, self.pump_gain[j]))
+            else:
+                shares += [
+                    (j, first, self.pump_gain[j] * self.split[j]),
+                    (j, second, self.pump_gain[j] * (1.0 - self.split[j])),
+                ]
+        return shares
+
+    def derivative(self, t: ArrayLike, x: Sequence, u: Sequence, d: Sequence | None) -> tuple:
+        return self._flows(t, x, u, d)
+
+    def limited(self, step: ArrayLike) -> Callable:
+        """Return the vector field of one integration step of `step` [s]: `derivative`; with
+        `bottom`, no tank gives more than it holds.
+
+        In each stage an outlet of area s_k of tank i, orifice or pipe, passes at most its share
+        s_k / (sum of the tank's outlets) of A_i max(h_i, 0) / step. An rk4 step then ends at or
+        above zero where no inflow from outside is negative: stage s holds at most h_i plus what
+        flows in up to it, so the weighted sum of the outflows is less than h_i plus the sum of the
+        inflows (the
+        midpoint rule: where an inflow does not fall by half within half a step). What leaves one
+        tank arrives in the next, so volume is conserved whatever the step, and the lower clip in
+        `spill` adds only what a negative inflow could not take (`shortfall`).
+
+        The limit acts below h = (step sqrt(2 g) sum s_k / A)^2, where the tank holds less than it
+        gives in one step; elsewhere the rates are those of `derivative`, bit for bit. Where it
+        acts, what passes the tank is delayed by up to one step (`step_length` reports how high it
+        stands).
+        """
+        if not self.bottom or type(self).derivative is not TankNetwork.derivative:
+            return self.derivative
+        return functools.partial(self._flows, step=step)
+
+    def _supply(self, step):
+        """(n) largest ratio of root to level in a step [cm^-0.5]: at most that of `smooth_sqrt`."""
+        areas = [self.drain[i] for i in range(self.tanks)]
+        for k, (source, _) in enumerate(self.links):
+            areas[source] = areas[source] + self.orifice[k]
+        for k, ends in enumerate(self.pipes):
+            for i in ends:
+                areas[i] = areas[i] + self.pipe[k]
+        # of the inverse, which is 0 and not infinite for a tank without outlets
+        turnover = step * jnp.sqrt(2.0 * self.gravity)
+        return [
+            1.0 / lower_clip(turnover * s / self.area[i], self.knee**0.5 / 1.5)
+            for i, s in enumerate(areas)
+        ]
+
+    def _flows(self, t, x, u, d, step=None):
+        # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
+        # once by the loop. What u and d bring
+        # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
+        n, w = self.tanks, jnp.sqrt(2.0 * self.gravity)
+        out = [self.drain[i] for i in range(n)]
+        for k, (source, _) in enumerate(self.links):
+            out[source] = out[source] + self.orifice[k]
+        rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
+        for j, tank, gain in self._shares():
+            rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
+        supply = () if step is None else self._supply(step)
+        q = [
+            smooth_sqrt(h, self.knee) if step is None else limited_sqrt(h, self.knee, supply[i])
+            for i, h in enumerate(x)
+        ]
+        held = x if step is None else [lower_clip(h, 0.0) for h in x]
+        for k, (source, sink) in enumerate(self.links):
+            rate[sink] = rate[sink] + (self.orifice[k] * w / self.area[sink]) * q[source]
+        for k, (one, other) in enumerate(self.pipes):
+            s = smooth_signed_sqrt(held[one] - held[other], self.knee)
+            if step is not None:
+                s = limited_flow(s, supply[one] * held[one], supply[other] * held[other])
+            rate[one] = rate[one] - (self.pipe[k] * w / self.area[one]) * s
+            rate[other] = rate[other] + (self.pipe[k] * w / self.area[other]) * s
+        return tuple(rate[i] - (out[i] * w / self.area[i]) * q[i] for i in range(n))
+
+    def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        if type(self).derivative is not TankNetwork.derivative:
+            return super().rates(x, u)
+        x, u, w, orifice, pipe = (
+            jnp.asarray(x),
+            jnp.asarray(u),
+            jnp.sqrt(2.0 * self.gravity),
+            *map(jnp.asarray, (self.orifice, self.pipe)),
+        )
+        ends = lambda pairs: tuple(np.array(pairs, dtype=int).reshape(-1, 2).T)
+        (source, sink), (one, other) = ends(self.links), ends(self.pipes)
+        q = smooth_sqrt(x, self.knee)
+        discharged, piped = (
+            orifice * w * q[source],
+            pipe * w * smooth_signed_sqrt(x[one] - x[other], self.knee),
+        )
+        flow = -jnp.asarray(self.drain) * w * q
+        flow = (
+            flow.at[source]
+            .add(-discharged)
+            .at[sink]
+            .add(discharged)
+            .at[one]
+            .add(-piped)
+            .at[other]
+            .add(piped)
+        )
+        pump, tank, gain = (list(column) for column in zip(*self._shares()))
+        return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(
+            self.area
+        )
+
+    def net_inflow(self, x: Sequence, u: Sequence, d: Sequence | None) -> Any:
+        """Return the rate of change of the stored volume [cm^3/s]: inflow less outflow to the
+        basin.
+        """
+        inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
+        return inflow - sum(
+            self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks)
+        )
+
+    def shortfall(self, x: Sequence) -> tuple:
+        if not self.bottom:
+            return super().shortfall(x)
+        return tuple(self.area[i] * (lower_clip(h, 0.0) - h) for i, h in enumerate(x))
+
+    def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
+        overflow: list[Any] = [0.0] * self.tanks
+        if self.bottom:
+            x = tuple(lower_clip(h, 0.0) for h in x)
+        if not self.overflow:
+            return x, tuple(overflow)
+        x = list(x)
+        order, ring = _downwards(self.spills, self.tanks)
+        for i in order:
+            held = clip(x[i], -self.rim[i], self.rim[i])
+            over = self.area[i] * (x[i] - held)
+            overflow[i], x[i] = overflow[i] + over, held
+            for k, (source, sink) in enumerate(self.spills):
+                if source == i:
+                    overflow[i] = overflow[i] - self.caught[k] * over
+                    x[sink] = x[sink] + self.caught[k] * over / self.area[sink]
+        for i in ring:  # what has come back to a full tank leaves the rig there
+            held = clip(x[i], -self.rim[i], self.rim[i])
+            overflow[i], x[i] = overflow[i] + self.area[i] * (x[i] - held), held
+        return tuple(x), tuple(overflow)
+
+
+def _downwards(spills, tanks):
+    """(every tank, after those that overflow into it; the tanks of rings, where there is no such
+    order): what a tank receives must be in it before its own overflow is computed.
+    """
+    order, left = [], list(range(tanks))
+    while left:
+        free = [i for i in left if not any(sink == i and source in left for source, sink in spills)]
+        if not free:
+            return [*order, *left], left
+        order += free
+        left = [i for i in left if i not in free]
+    return order, []

@@ -1,0 +1,44 @@
+"""Measures that a result reports, of the case's own run and of every scenario.
+
+Imported by `search` and by `jaxtank simulate`.
+"""
+
+# functions of jax and of `measures` whose types are not complete
+# pyright: reportUnknownMemberType=false
+
+from typing import Any
+
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.core.clock import Clock
+from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import ClosedLoop
+from tuning.problem import scenarios as sc
+from tuning.problem.problem import Problem
+
+
+def run_measures(loop: ClosedLoop, clock: Clock, key: Any) -> dict[str, np.ndarray]:
+    """Return {measure: value} of everything that is reported of one run.
+
+    key : of the sensor noise, None where there is none.
+    """
+    values = lp.evaluate(loop, clock, _names(loop), key)
+    return {m: np.asarray(v) for m, v in values.items()}
+
+
+def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]:
+    """Return {measure: value} of every scenario at {parameter: value}."""
+    points = {n: np.array([v]) for n, v in values.items()}
+    table: list[Any] = [None] * len(problem.runs)
+    for group in problem.groups:
+        loop = problem.runs[group.runs[0]].case.loop
+        measures, _ = sc.values_of(group, _names(loop), points)
+        for j, i in enumerate(group.runs):
+            table[i] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
+    return table
+
+
+def _names(loop: ClosedLoop) -> tuple[str, ...]:
+    """Return the measures that are reported of a loop, and when levels were reached."""
+    return (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.times())

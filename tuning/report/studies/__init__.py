@@ -1,0 +1,1 @@
+"""Reports of studies of many runs: uncertainty and sensitivity."""

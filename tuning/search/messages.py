@@ -1,0 +1,357 @@
+"""Findings about a tuning result as Messages: one small function for each, in the order of RULES.
+
+Imported by `tuner`. The codes are stable: programs filter by them, and texts may change.
+
+===============================  =============================================================
+code                             reported when
+===============================  =============================================================
+step-too-long                    the integration step is too long for the answer
+no-feasible-point-found          the search ended before a point met every limit
+infeasible                       the least violation of the limits is not zero
+interrupted                      Ctrl-C ended the search
+objective-without-slope          the gradient of the objective is zero: it changes in steps
+gradient-not-zero                a gradient is left that no active limit balances
+kink                             the same, but nothing lower was found along it
+not-converged                    no search converged
+start-violates-limit             the values before tuning violate a limit
+limit-not-applicable             an output has no step, so a limit of its step does not apply
+limit-active                     a limit determines the answer
+no-limit-active                  limits are given, and none is active
+input-total-variation            the pumps move much more than before
+parameter-not-exercised          no run depends on the parameter
+parameter-at-bound               the value ended at an end of its range
+parameter-insensitive            10 % of the value hardly changes the objective
+least-sensitive-direction        the smallest eigenvalue of the second derivative
+starts-agree                     how many searches ended at the answer
+permutation-symmetry             exchanged gains give an equivalent answer
+limit-violated-out-of-sample     a limit is violated on the validation set or on new plants
+limits-hold-out-of-sample        no limit was violated on new plants (`tune_robust`)
+scenario-bound                   bound of the violation probability (`tune_robust`)
+constraints-tightened            the search kept inside the limits (`back_off=`)
+support-scenarios                violations on new plants that were to be expected
+screened-at-true-step            screening points were unstable at the coarse step only
+non-finite-points                trial points gave non-finite numbers
+best-of-choices                  which discrete choice is best (`choices=`)
+no-rig-file                      no rig file describes the case (`save`)
+===============================  =============================================================
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from jaxtank import measures as ms
+from tuning.problem.point import DIVERGED
+from tuning.problem.status import Status
+from tuning.search.diagnostics import direction_words
+from tuning.search.kkt import SLOPING, UNSTABLE
+from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
+
+INSENSITIVE = 0.5
+"""Change of the objective [%] for 10 % of a parameter, below which the objective is called
+insensitive to the parameter.
+"""
+
+CHATTER = 20.0
+"""Growth of the total variation of the input above which it is reported [-]."""
+
+LISTED = 4
+"""Limits that one message names at most."""
+
+AGREE = 1.001
+"""Two searches whose objectives differ by less than this factor agree [-]."""
+
+Found = Iterator[Message]
+ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
+
+
+def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
+    """Return the findings about a result, most important first.
+
+    steps : sentences on integration steps that are too long for the answer.
+    """
+    first = [Message("step-too-long", text) for text in steps]
+    return (*first, *(message for rule in RULES for message in rule(result)))
+
+
+def _violated(result: TuningResult) -> list[ConstraintRow]:
+    return [c for c in result.constraints if c.margin < 0]
+
+
+def _first(parts: list[str], joint: str = ", ") -> str:
+    """Return the first LISTED parts, and how many more there are."""
+    more = len(parts) - LISTED
+    return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
+
+
+def _no_feasible_point(result: TuningResult) -> Found:
+    violated = _violated(result)
+    if result.status == Status.NOT_CONVERGED and violated:
+        c = violated[0]
+        yield Message(
+            "no-feasible-point-found",
+            "no point that meets every limit was found before the search ended"
+            f" ({c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}): more --iterations,"
+            " --starts or --screening may find one",
+        )
+
+
+def _infeasible(result: TuningResult) -> Found:
+    if result.status != Status.INFEASIBLE:
+        return
+    scales = result.problem.limit_scales
+    shares = [c.margin / scale for c, scale in zip(result.constraints, scales)]
+    order = [i for i in np.argsort(shares, kind="stable") if shares[i] < 0]
+    worst = [result.constraints[i] for i in order]
+    missed = [
+        f"{c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}"
+        + ("" if c.reason else f", missed by {-c.margin:.3g} {c.unit}")
+        for c in worst
+    ]
+    least = (
+        ""
+        if worst[0].reason
+        else f"; the largest violation, {-100 * shares[order[0]]:.3g} % of its limit, is the least"
+        " that was found"
+    )
+    yield Message(
+        "infeasible", f"no point was found that meets every limit: {_first(missed)}{least}"
+    )
+
+
+def _interrupted(result: TuningResult) -> Found:
+    if result.status == Status.INTERRUPTED:
+        yield Message("interrupted", "interrupted: this is the best point so far")
+
+
+def _flat(result: TuningResult) -> bool:
+    """Return True if the gradient is exactly zero at an objective that is not."""
+    return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
+
+
+def _without_slope(result: TuningResult) -> Found:
+    if result.status != Status.INFEASIBLE and _flat(result):
+        yield Message(
+            "objective-without-slope",
+            "the gradient of the objective is zero here: the objective changes in steps, as times"
+            " and counts do, and a search by gradients cannot show that this is its minimum; add a"
+            " smooth measure to the objective",
+        )
+
+
+def _gradient_left(result: TuningResult) -> Found:
+    residual = result.optimality["kkt_residual"]
+    if _flat(result) or result.status not in ENDED or _violated(result):
+        return
+    if residual is not None and residual > SLOPING:
+        kink = result.status == Status.CONVERGED
+        yield Message(
+            "kink" if kink else "gradient-not-zero",
+            "a gradient is left that no active limit balances (KKT residual"
+            f" {residual:.2g} of the objective per range of a parameter): "
+            + (
+                "a kink, because steps along it find nothing lower within the limits"
+                if kink
+                else "not yet an optimum"
+            ),
+        )
+
+
+def _not_converged(result: TuningResult) -> Found:
+    zero = result.optimality["gradient_norm"] == 0.0
+    if result.status == Status.NOT_CONVERGED and not _violated(result) and not zero:
+        yield Message("not-converged", _why_not_converged(result))
+
+
+def _why_not_converged(result: TuningResult) -> str:
+    """Return why a search that violates no limit did not converge, and the remedy."""
+    if all(not np.isfinite(violation) for _, _, violation, _ in result.history):
+        return (
+            f"no search could begin: the objective, a limit or a derivative exceeds {DIVERGED:.0e}"
+            " at every point that was tried, as where noise and delay make the loop unstable;"
+            " start from other values (--set) or narrow the ranges (--free)"
+        )
+    if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
+        return (
+            "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
+            " a high gain give one), and points along it are not lower; try more --starts, or"
+            " other ranges (--free)"
+        )
+    if any(o["exhausted"] for o in result.starts):
+        return "no search converged within its iterations: raise --iterations, or try other starts"
+    return (
+        "the searches stopped before their iterations were used up, at a kink or in the noise of"
+        " the objective: no line search found a lower point, and the conditions of an optimum do"
+        " not hold there; try more --starts or other starting values"
+    )
+
+
+def _start_violates(result: TuningResult) -> Found:
+    over = constraint_rows(result.problem, result.tables["before"])
+    parts = [
+        f"{c.name} {c.amount()}"
+        if c.reason
+        else f"{c.name} {c.value:.4g} of {c.limit:.4g} {c.unit}"
+        for c in over
+        if c.margin < 0
+    ]
+    if parts and not _violated(result):
+        yield Message(
+            "start-violates-limit",
+            f"the starting values violate a limit ({_first(parts)}), so their objective is no"
+            " reference",
+        )
+
+
+def _not_applicable(result: TuningResult) -> Found:
+    """Entries of a limited measure that are undefined in every run."""
+    limits, plant = result.problem.limits, result.problem.loop.plant
+    for measure in dict.fromkeys(
+        x.measure for x in limits if "window" in ms.refers_to([x.measure])
+    ):
+        limited = {limit.index for limit in limits if limit.measure == measure}
+        for i in sorted(set(range(ms.entries(measure, plant))) - limited):
+            yield Message(
+                "limit-not-applicable",
+                f"{measure} of output {i + 1} is not limited: the setpoint has no step",
+            )
+
+
+def _active(result: TuningResult) -> Found:
+    for c in result.constraints:
+        if c.active:
+            when = f" at {c.time_s:.2f} s" if c.time_s is not None else ""
+            yield Message(
+                "limit-active",
+                f"active limit: {c.name}{when} ({c.value:.7g} of {c.limit:.7g} {c.unit})",
+            )
+    if result.constraints and not any(c.active or c.margin < 0 for c in result.constraints):
+        yield Message("no-limit-active", "no limit is active")
+
+
+def _total_variation(result: TuningResult) -> Found:
+    before, after = (float(result.measures[k]["input_travel"].sum()) for k in ("before", "after"))
+    if after > CHATTER * before > 0:
+        unit = ms.unit("input_travel", result.problem.loop.units)
+        yield Message(
+            "input-total-variation",
+            f"the total variation of the inputs is {after:.4g} {unit}, {after / before:.0f} times"
+            " that before: weigh it or limit it (--objective input_travel=..., --limit"
+            " input_travel=...), or take a smaller step",
+        )
+
+
+def _not_exercised(result: TuningResult) -> Found:
+    idle = [n for n in result if not result[n].exercised]
+    if idle:
+        kept = ", ".join(f"{n} {result[n].after:g} {result[n].unit}" for n in idle)
+        yield Message(
+            "parameter-not-exercised",
+            f"no run exercises {kept}: any value in the range gives the same run, so the start"
+            " value is kept",
+        )
+
+
+def _at_bound_or_insensitive(result: TuningResult) -> Found:
+    for name in result:
+        p = result[name]
+        change = p.sensitivity_percent
+        insensitive = change is not None and change < INSENSITIVE
+        changes = f"(10 % changes it by {change:.2g} %)" if insensitive else ""
+        if not p.exercised:
+            continue
+        if p.at_bound:
+            end = p.lower if p.at_bound == "lower" else p.upper
+            yield Message(
+                "parameter-at-bound",
+                f"{name} ended at its {p.at_bound} bound {end:g} {p.unit}"
+                + (f"; the objective is insensitive to it {changes}" if insensitive else ""),
+            )
+        elif insensitive:
+            yield Message(
+                "parameter-insensitive", f"the objective is insensitive to {name} {changes}"
+            )
+
+
+def _least_sensitive(result: TuningResult) -> Found:
+    words = direction_words(result.problem, result.curvature) if result.curvature else ""
+    if words:
+        yield Message("least-sensitive-direction", words)
+
+
+def _agreement(result: TuningResult) -> Found:
+    feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
+    if not feasible:  # nothing to agree on
+        return
+    alike = sum(cost <= min(feasible) * AGREE for cost in feasible)
+    yield Message(
+        "starts-agree", f"{alike} of {len(result.starts)} searches ended within 0.1 % of the best"
+    )
+    image = result.symmetry
+    if not image or image["objective"] is None:
+        return
+    at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
+    above = 100 * (image["objective"] / result.objective["after"] - 1)
+    same = (
+        "the same objective"
+        if abs(above) < 1e-3
+        else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
+    )
+    ended = (
+        f", {len(image['starts'])} of the searches ended there and count as this answer"
+        if image["starts"]
+        else ""
+    )
+    yield Message(
+        "permutation-symmetry", f"permutation symmetry: {image['words']}: {at} gives {same}{ended}"
+    )
+
+
+def _out_of_sample(result: TuningResult) -> Found:
+    found = result.validation
+    share = found["limits_held"]["after"] if found else None
+    if found and share is not None and share < 1.0 and result.problem.limits:
+        yield Message(
+            "limit-violated-out-of-sample",
+            f"on the validation set every limit holds in {100 * share:.0f} % of"
+            f" {found['samples']} runs: --robust tunes for perturbed plants",
+        )
+
+
+def _screened_again(result: TuningResult) -> Found:
+    count = result.evaluations["redone_at_true_step"]
+    if count:
+        yield Message(
+            "screened-at-true-step",
+            f"{count} screening points are unstable at the coarse step only and were run at the"
+            " true one",
+        )
+
+
+def _non_finite(result: TuningResult) -> Found:
+    count = result.evaluations["non_finite"]
+    if count:
+        yield Message(
+            "non-finite-points", f"{count} trial points gave non-finite numbers and were rejected"
+        )
+
+
+RULES: tuple[Callable[[TuningResult], Found], ...] = (
+    _no_feasible_point,
+    _infeasible,
+    _interrupted,
+    _without_slope,
+    _gradient_left,
+    _not_converged,
+    _start_violates,
+    _not_applicable,
+    _active,
+    _total_variation,
+    _not_exercised,
+    _at_bound_or_insensitive,
+    _least_sensitive,
+    _agreement,
+    _out_of_sample,
+    _screened_again,
+    _non_finite,
+)

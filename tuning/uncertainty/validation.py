@@ -1,0 +1,136 @@
+"""Values before and after tuning on a validation set: perturbed plants with other noise.
+
+Imported by `tuning.search`.
+"""
+
+import jax
+import numpy as np
+
+from jaxtank.core.tree import get_value, with_values
+from tuning.problem import scenarios as sc
+from tuning.uncertainty.distributions import Correlated
+from tuning.uncertainty.draws import Draws
+
+SEED_OFFSET = 1_000_003
+"""Offset of the seeds of the validation set from those of the search."""
+
+SIDES = ("before", "after")
+
+
+def perturbed(problem, samples, seed):
+    """Return `samples` ScenarioRuns that the search does not use.
+
+    Its scenarios in turn, with every uncertain parameter of the plant changed by its own factor,
+    uniform within the case's spread, what was identified together drawn from its covariance, and
+    other sensor noise.
+    """
+    rng, runs = np.random.default_rng([SEED_OFFSET, seed]), []
+    for i in range(samples):
+        run = problem.runs[i % len(problem.runs)]
+        loop = run.case.loop
+        for name, spread in problem.case.uncertain.items():
+            value = np.asarray(get_value(loop, name))
+            loop = with_values(
+                loop, {name: value * (1.0 + spread * rng.uniform(-1.0, 1.0, value.shape))}
+            )
+        if problem.case.covariance is not None:
+            names, matrix = problem.case.covariance
+            drawn = Draws(loop, {"identified": Correlated(names=names, covariance=matrix)}).values(
+                rng.uniform(size=(1, len(names)))
+            )
+            loop = with_values(loop, {name: value[0] for name, value in drawn.items()})
+        key = None
+        if run.key is not None:
+            key = jax.random.fold_in(jax.random.key(SEED_OFFSET + seed), i)
+        runs.append(
+            run._replace(
+                case=run.case.replace(loop=loop),
+                key=key,
+                name=f"validation {i + 1}",
+                weight=1.0 / samples,
+            )
+        )
+    return runs
+
+
+def validate(problem, before, after, samples, seed):
+    """Run the values `before` and `after` on `samples` perturbed runs; returns as `summary_of`."""
+    runs = perturbed(problem, samples, seed)
+    points = {n: np.array([before[n], after[n]]) for n in problem.names}
+    costs, held = np.zeros((samples, 2)), np.ones((samples, 2), dtype=bool)
+    diverged = np.zeros(samples, dtype=bool)
+    levels = np.zeros((samples, 2, problem.loop.plant.tanks))
+    names = tuple(dict.fromkeys([*problem.needed, "max_level"]))
+    for group in sc.groups_of(runs):
+        measures, flags = sc.values_of(group, names, points)
+        measures, flags = {m: np.asarray(v) for m, v in measures.items()}, np.asarray(flags)
+        for j, i in enumerate(group.runs):
+            mine = [limit for limit in problem.limits if limit.run == i % len(problem.runs)]
+            diverged[i] = flags[:, j].any()
+            for side in (0, 1):
+                row = {m: v[side, j] for m, v in measures.items()}
+                costs[i, side], levels[i, side] = problem.cost(row), row["max_level"]
+                held[i, side] = all(limit.margin(row) >= 0 for limit in mine)
+    noise = any(run.key is not None for run in runs)
+    spread = {n: float(s) for n, s in problem.case.uncertain.items()}
+    return summary_of(problem, costs, held, levels, diverged, spread, noise)
+
+
+def summary_of(problem, costs, held, levels, diverged, spread, noise):
+    """Return (summary, cloud) of runs before and after tuning, on the same draws.
+
+    Parameters
+    ----------
+    costs : (samples, 2) before and after.
+    held : (samples, 2) True where every limit holds.
+    levels : (samples, 2, tanks) highest [cm].
+    diverged : (samples,) True where a run is not finite.
+    spread : {name: share}; noise : True if the runs have noise of their own.
+
+    Returns
+    -------
+    summary : {"samples", "spread", "noise", "failed", "objective" {"before"/"after": {"mean",
+        "p05", "p50", "p95"}}, "better_share": of the runs in which the tuned values cost less,
+        "limits_held" {"before"/"after": share of the runs in which every limit holds},
+        "comparable": share of the runs in which both hold them, "better_share_of_comparable"}.
+    cloud : of the runs that did not fail, {"objective" (runs, 2), "level" (runs, 2) of the tank
+        that comes highest, "limit" [cm] or None, "past": True where the tanks' limits differ and
+        "level" is how far the worst is above its own, "held" (runs, 2)}.
+    """
+    good = ~diverged & np.isfinite(costs).all(axis=1)
+    both = good & held.all(axis=1)
+    found = {
+        "samples": len(costs),
+        "spread": spread,
+        "noise": noise,
+        "failed": int((~good).sum()),
+        "objective": {name: _quantiles(costs[good, side]) for side, name in enumerate(SIDES)},
+        "better_share": _share(costs[good, 1] < costs[good, 0]),
+        "limits_held": {name: _share(held[good, side]) for side, name in enumerate(SIDES)},
+        "comparable": _share(both[good]),
+        "better_share_of_comparable": _share(costs[both, 1] < costs[both, 0]),
+    }
+    limits = {limit.index: limit.value for limit in problem.limits if limit.measure == "max_level"}
+    levels = levels[good][:, :, sorted(limits) if limits else slice(None)]
+    differ = len(set(limits.values())) > 1
+    if differ:  # tanks with limits of their own: how far above its limit the worst is
+        levels = levels - np.array([limits[i] for i in sorted(limits)])
+    return found, {
+        "objective": costs[good],
+        "level": levels.max(axis=2) if levels.size else np.zeros((0, 2)),
+        "limit": 0.0 if differ else next(iter(limits.values()), None),
+        "past": differ,
+        "held": held[good],
+    }
+
+
+def _quantiles(column):
+    """Return the mean and quantiles of the costs of one side; NaN where there are none."""
+    column = column if column.size else np.array([np.nan])
+    values = (column.mean(), *np.quantile(column, (0.05, 0.5, 0.95)))
+    return dict(zip(("mean", "p05", "p50", "p95"), map(float, values)))
+
+
+def _share(flags):
+    """Return the share of True among flags; None where there are none."""
+    return float(np.mean(flags)) if flags.size else None
