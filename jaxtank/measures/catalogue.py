@@ -298,12 +298,9 @@ MEASURES: dict[str, Measure] = {
         counts=True,
         shown=70,
         summary=50,
-        undefined=(
-            "an output was still outside the band when its setpoint changed again or the run ended,"
-            " or its setpoint never changes"
-        ),
+        undefined="the output was outside its band as the setpoint changed again or the run ended",
         unserved=NO_CHANGES,
-        nan_holds="the output never left its band",
+        nan_holds="no change of its setpoint took the output out of its band",
     ),
     "recovery_time": Measure(
         "s",

@@ -83,7 +83,7 @@ class Plant(abc.ABC):
         """
         return self.derivative
 
-    def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
+    def shortfall(self, x: Sequence) -> tuple:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
         tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
         return (0.0,) * len(x)

@@ -69,8 +69,9 @@ def _example() -> Any:
     from jaxtank.loop.trajectory import COLUMNS, Trajectory
 
     t = np.linspace(0.0, 10.0, 11)
-    columns: dict[str, Any] = dict.fromkeys(COLUMNS, (t / 10.0)[:, None])
-    return Trajectory(**(columns | {"t": t}))
+    column = (t / 10.0)[:, None]
+    arrays: dict[str, Any] = dict.fromkeys(COLUMNS, column) | {"t": t}
+    return Trajectory(**arrays)
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):

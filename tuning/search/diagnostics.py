@@ -12,8 +12,8 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from jaxtank.loop import step_size
 from jaxtank.loop.step_size import StepWarning, check_run
-from jaxtank.loop.step_size import step_warnings as of_loop
 from tuning.problem.reported import table_of
 
 CHECKED_RUNS = 16
@@ -40,7 +40,7 @@ def step_warnings(problem, tuned, values, key=None):
         runs.append((f"scenario {run.name}: ", loop, run.case.clock, run.key))
     sentences = []
     for name, loop, clock, own in runs:
-        found = of_loop(loop, clock)
+        found = step_size.step_warnings(loop, clock)
         if found and (why := _unstable_step(loop, clock, own)):
             return [f"{name}this answer's run is wrong, and so are its numbers: {why}"]
         sentences += [f"{name}{sentence}" for sentence in found]

@@ -15,8 +15,8 @@ from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop.closed_loop import initial
-from jaxtank.loop.step import Inputs, step
+from jaxtank.loop.closed_loop import Inputs, initial
+from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
 TRIED = 3

@@ -71,7 +71,7 @@ def test_what_a_measure_added_from_outside_states_is_reported_and_enforced(with_
     with pytest.raises(InputError, match="counts whole samples"):
         check_measures(case, with_mine, "local")
     assert check_measures(case, with_mine, "morris") == (with_mine,)
-    with pytest.raises(InputError, match="has no slope in every input"):
+    with pytest.raises(InputError, match="has no derivative by every input"):
         tuning.bound(case, objective={with_mine: 1.0})
 
 

@@ -75,8 +75,7 @@ def test_what_was_expected_stands_apart_from_what_was_measured():
         == "on 256 new plants a limit was violated 2 times (95 % interval 0.00095 to 0.028)"
     )
     assert (
-        "the probability is at most 0.8 (confidence 1 - 1e-6, support 1 of 16 plants)"
-        in bound.text
+        "the probability is at most 0.8 (confidence 1 - 1e-6, support 1 of 16 plants)" in bound.text
     )
     assert expected.code == "support-scenarios"
     assert expected.text.startswith(
