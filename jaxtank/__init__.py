@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from jaxtank.core.errors import EquilibriumError as EquilibriumError
     from jaxtank.core.errors import InputError as InputError
     from jaxtank.core.errors import NonFiniteError as NonFiniteError
-    from jaxtank.core.records import Trajectory as Trajectory
     from jaxtank.core.tree import component as component
     from jaxtank.core.tree import leaf as leaf
     from jaxtank.core.tree import parameters as parameters
@@ -55,6 +54,7 @@ if TYPE_CHECKING:
     from jaxtank.loop.run import evaluate as evaluate
     from jaxtank.loop.run import sensitivities as sensitivities
     from jaxtank.loop.run import simulate as simulate
+    from jaxtank.loop.trajectory import Trajectory as Trajectory
     from jaxtank.loop.validation import check as check
 
 __version__ = "0.1.0"
@@ -72,7 +72,7 @@ _NAMES = {
     "leaf": "jaxtank.core.tree",
     "static": "jaxtank.core.tree",
     "Clock": "jaxtank.core.clock",
-    "Trajectory": "jaxtank.core.records",
+    "Trajectory": "jaxtank.loop.trajectory",
     "Case": "jaxtank.case",
     "ClosedLoop": "jaxtank.loop.closed_loop",
     "simulate": "jaxtank.loop.run",

@@ -1,26 +1,35 @@
-"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it."""
+"""A case: one rig, one controller, one reference, one clock, and what may be tuned on it.
+
+May import `jaxtank.loop` and below; rig files and pictures are opened when they are asked for.
+"""
 
 import dataclasses
+import json
+import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, cast
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
-
-from jaxtank.core.clock import Clock
+from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import InputError
-from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.core.files import write_folder
+from jaxtank.core.jsonable import clean
+from jaxtank.core.text import html_table
+from jaxtank.core.tree import describe, get_value, walk
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.plants.network import TankNetwork
-from jaxtank.safety import SafetyFilter, TankCertificate, design
-from jaxtank.safety.certificate import widths_of
-from jaxtank.signals.inflows import Pours
+from jaxtank.measures import MEASURES, unit
+from jaxtank.safety import SafetyFilter, TankCertificate, design_for
 
 
 class Free(NamedTuple):
     """Where a tunable parameter may lie, in its own unit; "log" for gains and times, "linear" for
     what may pass through 0.
+
+    Examples
+    --------
+    >>> from jaxtank.case import Free
+    >>> Free(0.001, 5.0)
+    Free(low=0.001, high=5.0, scale='log')
     """
 
     low: float
@@ -35,6 +44,12 @@ class Scenario(NamedTuple):
 
     A value is a number in the parameter's unit, or a text relative to the case as it stands:
     "x1.3", "by -0.5", "0.02 if zero", "steady" (`rig.set_scenario`).
+
+    Examples
+    --------
+    >>> from jaxtank.case import Scenario
+    >>> Scenario("weak pump", {"plant.pump_gain": "x0.7"}).weight
+    1.0
     """
 
     name: str
@@ -43,30 +58,63 @@ class Scenario(NamedTuple):
     weight: float = 1.0
 
 
-class Mirror(NamedTuple):
-    """Gains that exchange roles: image({name: value}) are the values, of some or all names, that
-    give the same loop or nearly so.
+class Symmetry(NamedTuple):
+    """A permutation symmetry of the gains: image({name: value}) are the values, of some or all
+    names, that give the same loop or nearly so.
+
+    Examples
+    --------
+    >>> from jaxtank.case import Symmetry
+    >>> both = Symmetry("a and b", lambda v: {"a": v["b"], "b": v["a"]})
+    >>> both.image({"a": 1, "b": 2})
+    {'a': 2, 'b': 1}
     """
 
     words: str
-    image: Callable
+    image: Callable[[Mapping[str, Any]], Mapping[str, Any]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
-    """One rig, one law, one reference, one clock, with the gains its paper prints.
+    """One rig, one controller, one reference, one clock, with the gains its paper prints.
 
-    limits: {measure: upper limit (number, or one per entry), or "rim" for the rim of each tank};
-    free: {parameter: Free}, what `tune` tunes unless told otherwise; objective: {measure: weight},
-    what it makes small; reachable: whether every plateau of the reference must have a steady state
-    within the pumps' direction (False where the paper asks for one that has none); scenarios: what
-    `tune` judges by instead of the case's own run, () for that alone; mirror: gains that exchange
-    roles, where the law has such;
-    uncertain: {parameter of the plant: spread as a share of it}, what a result is validated on;
-    covariance: (names (n,), covariance (n, n) in their units) of parameters that were identified
-    together, or None; log: {"t", "pump1", "h1", ..: column of a log, its unit in its header}, where
-    a log of this rig names them otherwise; names: {"tank" or "pump": a name of each, "" for none},
-    where a rig gives them; safety: settings of its safety filter (`with_safety_filter`), or None.
+    Parameters
+    ----------
+    name, title : str
+    loop : ClosedLoop
+    clock : Clock
+    limits : {measure: limit}
+        A number, one per entry, or "rim" for the rim of each tank.
+    free : {dotted name: Free}
+        What `tune` tunes unless others are named.
+    objective : {measure: weight}
+        What `tune` minimises.
+    reachable : bool
+        Whether every plateau of the reference must have a steady state within the pumps' direction
+        (False where the paper asks for one that has none).
+    scenarios : sequence of Scenario
+        What `tune` judges by instead of the case's own run; () for that alone.
+    symmetry : Symmetry, optional
+        Gains that exchange roles.
+    uncertain : {dotted name of the plant: spread as a share of it}
+        What a result is validated on.
+    covariance : (names (n,), matrix (n, n) in their units), optional
+        Of parameters that were identified together.
+    log : {"t", "pump1", "h1", ..: column of a data file, its unit in its header}
+        Where a data file of this rig names them otherwise.
+    names : {"tank" or "pump": a name of each, "" for none}
+        Where a rig gives them.
+
+    safety : settings of `with_safety_filter`, optional
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = presets.load("cascaded/pi")
+    >>> print(str(case).splitlines()[1])
+      2 tanks, 1 pump; controller PID, observer Direct
+    >>> case.replace(name="mine").name
+    'mine'
     """
 
     name: str
@@ -78,7 +126,7 @@ class Case:
     objective: Mapping[str, float]
     reachable: bool = True
     scenarios: tuple[Scenario, ...] = ()
-    mirror: Mirror | None = None
+    symmetry: Symmetry | None = None
     uncertain: Mapping[str, float] = dataclasses.field(default_factory=dict)
     covariance: tuple | None = None
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -86,32 +134,13 @@ class Case:
     safety: Mapping[str, Any] | None = None
 
     def replace(self, **changes: Any) -> "Case":
-        """A copy with the named fields changed."""
+        """Return a copy with the named fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def safety_design(
-        self,
-        *,
-        widths: Mapping[str, ArrayLike] | None = None,
-        limit: ArrayLike | None = None,
-        band: ArrayLike | None = None,
-        rate: float | None = None,
-    ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
+    def safety_design(self, **settings: Any) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
         """Return a safety filter for the case, and the certificate of each tank.
 
-        Parameters
-        ----------
-        widths : {parameter of the plant: half width of its interval, in its unit}, the box of
-            plants; left out: `uncertain`, or 99 % of `covariance`, or 5 % of every flow
-        limit : (n,) levels not to be passed [cm]; left out: limits on max_level, else the rims
-        band : (n,) largest difference of reading and level [cm]; left out: 6 standard deviations
-            of the noise, half an ADC step and the offset
-        rate : kappa, how fast a level may approach its limit [1/s]
-
-        Raises
-        ------
-        InputError
-            where the plant is no TankNetwork or a value is out of its range
+        Settings and their defaults, and errors, as in `jaxtank.safety.design_for`.
 
         Examples
         --------
@@ -120,28 +149,7 @@ class Case:
         >>> [(row.certified, row.reason) for row in rows]
         [(True, 'Theorem 1'), (True, 'Theorem 2')]
         """
-        loop, plant = self.loop, self.loop.plant
-        if not isinstance(plant, TankNetwork):
-            raise InputError("safety_filter: is for tank networks (plants.network) only")
-        inflow, volume = _disturbances(loop, self.clock)
-        share = max(
-            (s for n, s in self.uncertain.items() if n == "actuator.dead_zone"), default=0.0
-        )
-        return design(
-            plant,
-            loop.actuator,
-            cast(LevelSensor, loop.sensor),
-            self.clock.dt,
-            widths=self._widths() if widths is None else widths,
-            limit=_level_limits(self) if limit is None else limit,
-            inflow=inflow,
-            volume=volume,
-            offset=loop.actuator.offset * (1.0 - share),
-            band=band,
-            rate=rate,
-            substeps=self.clock.substeps,
-            start=loop.x0,
-        )
+        return design_for(self, **settings)
 
     def with_safety_filter(self, **settings: Any) -> "Case":
         """Return the case with a safety filter on its pumps; settings as in `safety_design`.
@@ -160,36 +168,91 @@ class Case:
         """Return the case without a safety filter."""
         return self.replace(loop=dataclasses.replace(self.loop, safety_filter=None), safety=None)
 
-    def _widths(self):
-        """The box of plants that the case itself describes."""
-        if self.covariance is not None:
-            names, matrix = self.covariance
-            flows = [i for i, n in enumerate(names) if n.startswith("plant.")]
-            sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[flows]
-            # of an ellipsoid that holds 99 % of a normal distribution, the box around it
-            reach = np.sqrt(2.0 * gammaincinv(0.5 * max(len(flows), 1), 0.99))
-            return {names[i]: reach * s for i, s in zip(flows, sigma)}
-        shares = {n: s for n, s in self.uncertain.items() if n.startswith("plant.")}
-        flows = ("drain", "orifice", "pipe", "pump_gain", "split")
-        return widths_of(self.loop.plant, shares or dict.fromkeys(flows, 0.05))
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON object: name, clock, every parameter with its unit, limits, objective, what
+        is free, scenarios; null for what is not finite. `jaxtank show --json` adds the paper's.
+        """
+        parameters = {
+            name: {"value": clean(value), "unit": meta["unit"]}
+            for kind in ("leaf", "static")
+            for name, value, meta in walk(self.loop, kind=kind)
+        }
+        for name, of in CLOCK_UNITS.items():
+            parameters[f"clock.{name}"] = {"value": getattr(self.clock, name), "unit": of}
+        return {
+            "case": self.name,
+            "title": self.title,
+            "parameters": parameters,
+            "free": {name: list(Free(*spec)) for name, spec in self.free.items()},
+            "limits": clean(dict(self.limits)),
+            "objective": clean(dict(self.objective)),
+            "scenarios": clean(
+                [s._replace(values=dict(s.values))._asdict() for s in self.scenarios]
+            ),
+            "uncertain": clean(dict(self.uncertain)),
+        }
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {"rig": the schematic}; {} for a plant that is no network of
+        tanks. The figures of a run are those of its Trajectory.
+        """
+        from jaxtank.plots.run import rig
+
+        return rig(self.loop.plant, title=self.name)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return
+        the paths.
+
+        A case that no rig file can describe (with a plant or a controller class of one's own that
+        has no name in a file) has no rig.toml: a UserWarning gives the reason. Raises InputError
+        for a folder that cannot be written to.
+        """
+        from jaxtank.plots.run import pngs
+        from jaxtank.rig.write import dump
+
+        files: dict[str, Any] = {
+            "case.json": json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n"
+        }
+        try:
+            files["rig.toml"] = dump(self)
+        except InputError as error:
+            warnings.warn(f"rig.toml is not written ({error})", stacklevel=2)
+        return write_folder(folder, files | pngs(self.plot()))
+
+    def __str__(self) -> str:
+        heading, *lines = (f"{what}: {text}" if what else text for what, text in self._summary())
+        return "\n".join([heading, *(f"  {line}" for line in lines)])
+
+    def _repr_html_(self) -> str:
+        (_, caption), *rows = self._summary()
+        return html_table(rows, caption=caption)
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """(what, text) of each line for people."""
+        plant, loop, clock = self.loop.plant, self.loop, self.clock
+        sizes = f"{_count(plant.tanks, 'tank')}, {_count(plant.pumps, 'pump')}"
+        parts = (
+            f"controller {type(loop.controller).__name__}, observer {type(loop.observer).__name__}"
+        )
+        rows = [
+            ("", f"{self.name}: {self.title}"),
+            ("", f"{sizes}; {parts}"),
+            ("", f"{clock.duration:g} s in samples of {clock.dt:g} s"),
+        ]
+        for name, spec in self.free.items():
+            free, of = Free(*spec), describe(loop, name)["unit"]
+            value = clean(get_value(loop, name))
+            rows.append(
+                ("tunable", f"{name} = {value} {of}, from {free.low:g} to {free.high:g} {of}")
+            )
+        for measure, limit in self.limits.items():
+            side = "at least" if MEASURES[measure].sense < 0 else "at most"
+            of = "" if isinstance(limit, str) else f" {unit(measure, loop.units)}"
+            rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))
+        weights = " + ".join(f"{w:g} {m}" for m, w in self.objective.items())
+        return [*rows, ("objective", weights)]
 
 
-def _level_limits(case):
-    """(n,) upper limits on the levels of a case [cm]: of max_level where it has one, or the rims."""
-    rim = np.asarray(case.loop.plant.rim, dtype=float)
-    limit = case.limits.get("max_level", "rim")
-    return rim if isinstance(limit, str) else np.minimum(rim, np.asarray(limit, dtype=float))
-
-
-def _disturbances(loop, clock):
-    """((n,) largest inflow [cm^3/s], (n,) volume that comes in pulses besides [cm^3])."""
-    none = np.zeros(loop.plant.tanks)
-    if loop.disturbance is None:
-        return none, none
-    if isinstance(loop.disturbance, Pours):
-        volume = none.copy()
-        for added, (_, _, tank) in zip(loop.disturbance.volume, loop.disturbance.events):
-            volume[tank] += max(float(added), 0.0)
-        return none, volume
-    flows = loop.disturbance.sample(clock)[0]
-    return np.array([max(float(np.max(flow)), 0.0) for flow in flows]), none
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -21,7 +21,7 @@ FAST = {
     "02": {"dt": "0.1"},
     "03": {"starts, screening": "1, 8", "size": "15", "heights": "[30.0, 33.0, 36.0]", "bound_heights": "[33.0]", "bound_iterations": "20"},
     "04": {"dt": "0.05", "rates": "np.array([0.3, 3.0, 10.0])", "starts, screening": "1, 8"},
-    "05": {"size": "6", "kinds": '("hybrid",)', "screening": "2", "iterations": "2"},
+    "05": {"grid_points": "6", "kinds": '("hybrid",)', "screening": "2", "iterations": "2"},
     "06": {"horizons": "np.geomspace(1.5, 60.0, 9)", "tps": "np.geomspace(0.1, 5.0, 7)", "poles": "np.linspace(0.0, 0.95, 5)", "orders": "(1, 4)"},
     "07": {"rigs": "64", "sobol_samples": "16"},
     "08": {"starts, plants, fresh": "1, 8, 64"},

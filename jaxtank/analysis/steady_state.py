@@ -3,6 +3,8 @@
 Imports core; may be imported by every folder above.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -85,7 +87,7 @@ def _from_known_speeds(plant, known, xp=jnp):
     return speeds, solution[len(free) :]
 
 
-def steady_along(plant, r):
+def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Return the steady state of every sample of a reference, as state feedback prepares it.
 
     Speeds and inputs are linear in the roots of r, so the balance is solved once per output and not

@@ -16,7 +16,7 @@ class Controller(abc.ABC):
     """
 
     @pointwise
-    def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
+    def prepare(self, r: tuple[Any, ...], dr: tuple[Any, ...], ddr: tuple[Any, ...]) -> Any:
         """What the law can compute of the reference before the loop starts: any tree of arrays
         (samples,), given back at each sample
         as `tick.plan`. r, dr, ddr: tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2].
@@ -31,14 +31,14 @@ class Controller(abc.ABC):
         """
         return ()
 
-    def init(self, x0: tuple, u0: tuple) -> Any:
+    def init(self, x0: tuple[Any, ...], u0: tuple[Any, ...]) -> Any:
         """State before the first sample, for levels x0 (n) [cm] and pumps that ran at u0 (m) [V]
         until t = 0.
         """
         return ()
 
     @abc.abstractmethod
-    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
         """((m) commanded voltages [V], new state) at `tick` for `estimate`; the command is not
         limited here.
 
@@ -46,13 +46,13 @@ class Controller(abc.ABC):
         depend on state or estimate is moved in front of the loop.
         """
 
-    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+    def track(self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]) -> Any:
         """State after the pumps' limits have made `applied` (m) [V] of `command` (m) [V]:
         anti-windup of laws with memory.
         """
         return state
 
-    def input_metric(self, estimate: Estimate) -> tuple | None:
+    def input_metric(self, estimate: Estimate) -> tuple[Any, ...] | None:
         """(g11, g12, g22): how the law's cost weighs a change of its two inputs, for allocation by
         box QP; None if it has none.
         """

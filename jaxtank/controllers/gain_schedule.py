@@ -23,7 +23,7 @@ VARIABLE = re.compile(r"[rh][1-9]\d*")
 
 
 def check_gains(law, gains):
-    """Raise InputError unless every one of `gains` names a number among the leaves of `law`, once."""
+    """Raise InputError unless each of `gains` names a number among the leaves of `law`, once."""
     if not gains:
         raise InputError("a schedule needs at least one gain")
     names = [n for n in parameters(law)]

@@ -110,7 +110,7 @@ class LinearPredictive(Controller):
 
     @abc.abstractmethod
     def basis(self) -> jax.Array:
-        """(Np, m, variables): increments of the m pumps over the horizon, one column per variable."""
+        """(Np, m, variables): increments of m pumps over the horizon, one column per variable."""
 
     def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
         """(Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt`
@@ -121,7 +121,7 @@ class LinearPredictive(Controller):
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
-        """K (m, n+q) of the linear law du = -K [dx_m; y - r] [V/cm], at sampling period `dt` [s]."""
+        """K (m, n+q) of the linear controller du = -K [dx_m; y - r] [V/cm], at period `dt` [s]."""
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 

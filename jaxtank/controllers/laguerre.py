@@ -1,4 +1,4 @@
-"""Linear predictive control whose increments are sums of Laguerre functions (khalid, section IV)."""
+"""Linear predictive control with increments as sums of Laguerre functions (khalid, sec. IV)."""
 
 import jax
 import jax.numpy as jnp

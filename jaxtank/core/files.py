@@ -92,6 +92,37 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | byt
         raise
 
 
+def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[Path]:
+    """Write files to a folder, made if need be, all of them or none; return their paths.
+
+    Parameters
+    ----------
+    folder : path
+    files : {name: text or bytes}
+
+    Raises
+    ------
+    InputError for a folder that cannot be written to.
+
+    Examples
+    --------
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in write_folder(folder, {"a.txt": "1"})]
+    ['a.txt']
+    """
+    check_folder(folder)
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_together(folder, files)
+    except OSError as error:
+        raise InputError(
+            f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder"
+            " that can"
+        ) from None
+    return [folder / name for name in files]
+
+
 def sweep(folder: str | os.PathLike[str]) -> None:
     """Remove the incomplete files that a killed run left in a folder.
 

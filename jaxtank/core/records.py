@@ -81,19 +81,3 @@ class Sample(NamedTuple):
     spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
     shortfall: Sequence[Any] = ()
-
-
-class Trajectory(NamedTuple):
-    """A run as arrays with one row per saved sample; row k is at t_k, before the plant moves."""
-
-    t: Any  # (rows,) [s]
-    x: Any  # (rows, tanks) [cm]
-    y: Any  # (rows, tanks) [cm]
-    x_hat: Any  # (rows, tanks) [cm]
-    d_hat: Any  # (rows, tanks) [cm/s]
-    r: Any  # (rows, outputs) [cm]
-    e: Any  # (rows, outputs) [cm]
-    command: Any  # (rows, pumps) [V]
-    applied: Any  # (rows, pumps) [V]
-    u: Any  # (rows, pumps) [V]
-    spilled: Any  # (rows, tanks) overflow since the start [cm^3]

@@ -3,6 +3,10 @@
 Imports nothing of ours; may be imported by every folder.
 """
 
+import html
+from collections.abc import Iterable
+from typing import Any
+
 MOST = 600
 """Characters of a line. A longer one is cut in its middle: it begins with the name of the thing and
 ends with what is wrong.
@@ -55,3 +59,36 @@ def one_line(text: object, most: int = MOST) -> str:
     gap = f" ... ({len(line) - most} characters and more are left out) ... "
     head = (most - len(gap)) * 2 // 3
     return line[:head] + gap + line[len(line) - (most - len(gap) - head) :]
+
+
+def html_table(rows: Iterable[Iterable[Any]], head: Iterable[Any] = (), caption: str = "") -> str:
+    """Return a small HTML table for a notebook, every text of it escaped.
+
+    Parameters
+    ----------
+    rows : sequence of rows
+        Each a sequence of texts or numbers.
+    head : sequence, optional
+        Headings of the columns.
+    caption : str, optional
+        A line above the table.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(html_table([["h1 < 5", 2.0]], ["level", "cm"], "run"))
+    <table><caption>run</caption>
+    <tr><th>level</th><th>cm</th></tr>
+    <tr><td>h1 &lt; 5</td><td>2.0</td></tr>
+    </table>
+    """
+
+    def row(cells: Iterable[Any], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in cells) + "</tr>\n"
+
+    above = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    headings = row(head, "th") if head else ""
+    return f"<table>{above}\n{headings}{''.join(row(cells, 'td') for cells in rows)}</table>"

@@ -40,7 +40,7 @@ class Sensor(abc.ABC):
     noise: Any = 0.0
     """(n,) standard deviation of the noise on each level [cm]; a run with noise needs a key."""
 
-    def init(self, x0: Sequence) -> Any:
+    def init(self, x0: Sequence[Any]) -> Any:
         """Return the state before the first sample.
 
         Parameters
@@ -54,7 +54,9 @@ class Sensor(abc.ABC):
         return ()
 
     @abc.abstractmethod
-    def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
+    def step(
+        self, state: Any, x: Sequence[Any], xi: Sequence[Any] | None, dt: Any
+    ) -> tuple[Sequence[Any], Any]:
         """Return the readings of a sample and the state after it.
 
         Parameters
@@ -71,7 +73,7 @@ class Sensor(abc.ABC):
 
     def draw(
         self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
-    ) -> tuple | None:
+    ) -> tuple[Any, ...] | None:
         """Return standard normal deviates of a run, drawn before the time loop.
 
         Parameters
@@ -179,7 +181,9 @@ class Actuator(abc.ABC):
     def init(self, clock: Clock) -> Any:
         """Return the state before the first sample: a pytree of arrays; () without memory."""
 
-    def limit(self, command: Sequence, metric: tuple | None = None) -> tuple:
+    def limit(
+        self, command: Sequence[Any], metric: tuple[Any, ...] | None = None
+    ) -> tuple[Any, ...]:
         """Return the command held within the limits.
 
         Parameters
@@ -194,7 +198,7 @@ class Actuator(abc.ABC):
         return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
 
     @abc.abstractmethod
-    def step(self, state: Any, applied: tuple, dt: Any) -> tuple[tuple, Any]:
+    def step(self, state: Any, applied: tuple[Any, ...], dt: Any) -> tuple[tuple[Any, ...], Any]:
         """Return what the plant is given over a sample, and the state after it.
 
         Parameters
@@ -208,6 +212,6 @@ class Actuator(abc.ABC):
         (m,) inputs at the plant, held over the sample [V], and the new state
         """
 
-    def driving(self, u: tuple) -> tuple:
+    def driving(self, u: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: all of it."""
         return u

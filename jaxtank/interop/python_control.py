@@ -3,14 +3,14 @@
 Imports analysis and core; imported by users.
 """
 
-from typing import Any
-
 import numpy as np
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
-from jaxtank.core.units import local
+from jaxtank.loop.trajectory import columns
+
+__all__ = ["columns", "to_control"]
 
 
 def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):
@@ -81,57 +81,3 @@ def _operating_point(plant, setpoints, levels, inputs):
         if np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")
     return levels, inputs
-
-
-FIELDS = (
-    ("h", "x", "cm"),
-    ("y", "y", "cm"),
-    ("h_hat", "x_hat", "cm"),
-    ("r", "r", "cm"),
-    ("u", "u", "V"),
-    ("command", "command", "V"),
-    ("spilled", "spilled", "cm^3"),
-    ("d_hat", "d_hat", "cm/s"),
-)
-"""Columns of a run: (name, field of `Trajectory`, unit)."""
-
-
-def columns(run, units=("cm", "V"), dimension=None) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray.
-
-    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and the
-    volume that overflowed each rim.
-
-    Parameters
-    ----------
-    run : Trajectory, as `jaxtank.simulate` returns it.
-    units : (length, pump input) of the rig, `loop.units`.
-    dimension : None, or the name of the one dimension that all columns share in xarray.
-
-    Returns
-    -------
-    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
-    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
-    `xarray.Dataset(columns(run, dimension="t"))`.
-
-    Examples
-    --------
-    >>> import jaxtank
-    >>> from jaxtank import presets
-    >>> case = presets.find("cascaded/pi")
-    >>> run = jaxtank.simulate(case.loop, jaxtank.Clock(dt=4.0, duration=8.0))
-    >>> columns(run, case.loop.units)["t [s]"].tolist()
-    [0.0, 4.0, 8.0]
-    """
-    found = {("t", "s"): np.asarray(run.t)}
-    for name, field, unit in FIELDS:
-        values = np.asarray(getattr(run, field))
-        found |= {
-            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
-        }
-    if dimension is None:
-        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
-    return {
-        dimension if name == "t" else name: (dimension, values, {"units": unit})
-        for (name, unit), values in found.items()
-    }

@@ -1,10 +1,14 @@
-"""One sample of the closed loop, and what it needs: the loop itself, its state, and what is known
-of every sample beforehand.
+"""The closed loop: its components, its state, and what is known of each sample beforehand.
+
+May import the folders below `jaxtank.loop` only; the other modules of `loop` import this one.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
 import dataclasses
 import functools
 import warnings
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +17,49 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
-from jaxtank.core.clock import CHUNK, Chunk
+from jaxtank.core.clock import CHUNK, Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.instruments.base import Actuator, Sensor
-from jaxtank.loop.step import Inputs, State
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.base import Signal
 
+Group = tuple[Any, ...]
+"""Numbers or arrays, one per tank, pump or output."""
+
 
 @component
 class ClosedLoop:
-    """Everything that takes part in a run, and the levels it starts from."""
+    """Everything that takes part in a run, and the levels it starts from.
+
+    Parameters
+    ----------
+    plant : Plant
+        What moves.
+    sensor : Sensor
+    observer : Observer
+    controller : Controller
+        With a model of its own, which may differ from the plant.
+    actuator : Actuator
+    reference : Signal
+        Setpoints, one channel per output [cm].
+    disturbance : Signal, optional
+        Inflows, one channel per tank [cm^3/s].
+    faults : Faults, optional
+        What changes in the plant during the run, unknown to the controller.
+    x0 : (n,) array
+        Levels at t = 0 [cm].
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded/pi").loop
+    >>> type(loop.controller).__name__, loop.x0.shape, loop.units
+    ('PID', (2,), ('V', 'V'))
+    """
 
     plant: Plant
     sensor: Sensor
@@ -38,7 +70,7 @@ class ClosedLoop:
     disturbance: Signal | None = None
     faults: Faults | None = None
     safety_filter: SafetyFilter | None = None
-    x0: np.ndarray = leaf("cm", "(n,) levels at t = 0", low=0.0)
+    x0: np.ndarray[Any, Any] = leaf("cm", "(n,) levels at t = 0", low=0.0)
 
     @property
     def units(self) -> tuple[str, str]:
@@ -46,129 +78,165 @@ class ClosedLoop:
         return self.plant.units
 
 
-def inputs(loop, clock, names, key, piece=None, samples=0):
-    """The samples of references, disturbances, noise and windows; of a long run's `piece`, a
-    number, its `samples` alone.
+class State(NamedTuple):
+    """What one sample hands to the next."""
+
+    k: Any  # index of the sample
+    x: Group  # levels [cm]
+    observer: Any
+    controller: Any
+    actuator: Any
+    sensor: Any = ()
+    excess: Group = ()  # in float32, what rounding has added to each level too much [cm]
+
+
+class Inputs(NamedTuple):
+    """What is known of every sample before the loop starts: arrays (samples,)."""
+
+    r: Group  # setpoints [cm]
+    dr: Group  # their rates [cm/s]
+    ddr: Group  # their second derivatives [cm/s^2]
+    d: Group | None  # inflow disturbances [cm^3/s]
+    xi: Group | None  # draws of the sensor noise [-]
+    context: ms.Context  # what the measures refer to
+    plan: Any  # what the controller has prepared
+    own: Any  # signals of the controller's own
+    fault: Group | None  # 1 while a fault lasts
+
+
+def inputs(
+    loop: ClosedLoop,
+    clock: Clock,
+    names: tuple[str, ...],
+    key: jax.Array | None,
+    batch: Any = None,
+    samples: int = 0,
+) -> Inputs:
+    """Return the samples of references, disturbances and noise, and what the measures `names` refer
+    to; of a long run's `batch`, a number, its `samples` alone.
+
+    Raises InputError for a measure that means nothing for this loop.
     """
-    if piece is not None:
-        clock = Chunk(first=piece * CHUNK, samples=samples, dt=clock.dt)
-    r, dr, ddr = loop.reference.sample(clock)
-    d = None if loop.disturbance is None else loop.disturbance.sample(clock)[0]
-    window = None
-    if ms.wants_windows(names):
-        window = loop.reference.windows(clock)
-        if window is None:
-            raise InputError(
-                "overshoot, rise and settling need a reference that changes (signals.Ramps)"
-            )
-    since = None if loop.disturbance is None else loop.disturbance.since(clock)
-    if since is None and ms.wants_pours(names):
-        raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
-    if since is not None and window is not None:
-        # while a tank recovers from a pour, it is not settling on its setpoint
-        window = tuple(
-            tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window
-        )
+    times: Any = clock
+    if batch is not None:
+        times = Chunk(first=batch * CHUNK, samples=samples, dt=clock.dt)
+    r, dr, ddr = loop.reference.sample(times)
+    d = None if loop.disturbance is None else loop.disturbance.sample(times)[0]
     return Inputs(
         r=r,
         dr=dr,
         ddr=ddr,
         d=d,
-        xi=loop.sensor.draw(key, clock.samples, piece),
-        window=window,
-        since=since,
-        rest=_rests(loop, r) if ms.wants_rests(names) else None,
+        xi=loop.sensor.draw(key, times.samples, batch),
+        context=_context(loop, times, names, r),
         plan=loop.controller.prepare(r, dr, ddr),
-        own=loop.controller.inputs(clock),
-        fault=None if loop.faults is None else loop.faults.sample(clock),
+        own=loop.controller.inputs(times),
+        fault=None if loop.faults is None else loop.faults.sample(times),
     )
 
 
-def _rests(loop, r):
+def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> ms.Context:
+    """What the measures `names` refer to besides the sample, for setpoints `r`."""
+    wanted, window = ms.refers_to(names), None
+    if "window" in wanted:
+        window = loop.reference.windows(times)
+        if window is None:
+            raise InputError(
+                "overshoot, rise and settling need a reference that changes (signals.Ramps)"
+            )
+    since = None if loop.disturbance is None else loop.disturbance.since(times)
+    if since is None and "since" in wanted:
+        raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
+    if since is not None and window is not None:
+        # while a tank recovers from an inflow pulse, it is not settling on its setpoint
+        window = tuple(
+            tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window
+        )
+    steady = _steady_inputs(loop, r) if "steady" in wanted else None
+    return ms.Context(window=window, since=since, steady=steady)
+
+
+def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
     return steady_along(loop.plant, r)[1]
 
 
-def initial(loop, clock):
-    """The state before the first sample."""
+def initial(loop: ClosedLoop, clock: Clock) -> State:
+    """Return the state before the first sample."""
     zero = zero_of(loop)
 
-    def typed(tree):
-        return jax.tree.map(
-            lambda v: v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v, tree
-        )
+    def same_type(v: Any) -> Any:
+        return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
 
     x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks))
     u0 = tuple(loop.actuator.initial[i] + zero for i in range(loop.plant.pumps))
     return State(
         k=jnp.int32(0),
         x=x0,
-        observer=typed(loop.observer.init(x0)),
-        controller=typed(loop.controller.init(x0, u0)),
-        actuator=typed(loop.actuator.init(clock)),
-        sensor=typed(loop.sensor.init(x0)),
+        observer=jax.tree.map(same_type, loop.observer.init(x0)),
+        controller=jax.tree.map(same_type, loop.controller.init(x0, u0)),
+        actuator=jax.tree.map(same_type, loop.actuator.init(clock)),
+        sensor=jax.tree.map(same_type, loop.sensor.init(x0)),
         excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
     )
 
 
-def keyed(loop, key):
-    """`loop`, if its noise can be drawn: without a key its levels are NaN from the start where
-    `sensor.noise` is above 0. A traced noise is not seen by input validation, and a run without it,
-    whose slope by it is 0, would look like an answer.
+def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
+    """Return `loop`, if its noise can be drawn: without a key its levels are NaN from the start
+    where `sensor.noise` is above 0. A traced noise is not seen by input validation, and a run
+    without it, whose derivative by it is 0, would look like an answer.
     """
     if key is not None:
         return loop
     noise = jnp.asarray(loop.sensor.noise)
-    # its slope by the noise is NaN too
+    # the derivative by the noise is NaN too
     missing = jnp.sum(jnp.where(noise > 0, noise, 0.0) * jnp.where(noise > 0, jnp.nan, 0.0))
-    return dataclasses.replace(loop, x0=loop.x0 + missing.astype(zero_of(loop).dtype))
+    start: Any = loop.x0 + missing.astype(zero_of(loop).dtype)
+    return dataclasses.replace(loop, x0=start)
 
 
-def run_of(loop, clock):
-    """Sizes and constants of a run, for its measures."""
+def run_of(loop: ClosedLoop, clock: Clock) -> ms.Run:
+    """Return sizes and constants of a run, for its measures."""
+    plant, actuator = loop.plant, loop.actuator
     return ms.Run(
-        tanks=loop.plant.tanks,
-        outputs=len(loop.plant.outputs),
-        pumps=loop.plant.pumps,
+        tanks=plant.tanks,
+        outputs=len(plant.outputs),
+        pumps=plant.pumps,
         samples=clock.samples,
         dt=clock.dt,
-        low=tuple(loop.actuator.low[i] for i in range(loop.plant.pumps)),
-        high=tuple(loop.actuator.high[i] for i in range(loop.plant.pumps)),
-        rim=tuple(loop.plant.rim[i] for i in range(loop.plant.tanks)),
+        low=tuple(actuator.low[i] for i in range(plant.pumps)),
+        high=tuple(actuator.high[i] for i in range(plant.pumps)),
+        rim=tuple(plant.rim[i] for i in range(plant.tanks)),
         zero=zero_of(loop),
     )
 
 
-def zero_of(loop):
-    """0.0 of the type in which the run is done: that of the most precise of the loop's leaves.
-    float32 is named, and what it costs.
+def zero_of(loop: ClosedLoop) -> jax.Array:
+    """Return 0.0 of the type in which the run is done: that of the most precise of the loop's
+    leaves. Warns of float32, and what it costs.
     """
-    leaves = [
-        leaf
-        for leaf in jax.tree.leaves(loop)
-        if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    ]
-    dtype = jnp.result_type(*leaves) if leaves else jnp.result_type(float)
+    found = [v for v in jax.tree.leaves(loop) if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+    dtype = jnp.result_type(*found) if found else jnp.result_type(float)
     if dtype == jnp.float32:
         _warn_float32()
     return jnp.zeros((), dtype)
 
 
 @functools.cache
-def _warn_float32():
+def _warn_float32() -> None:
     warnings.warn(
-        "this run is in float32. Levels and running sums keep what rounding takes from them, so"
-        " levels are right to about 1e-5 cm (2e-3 cm under gouta2022's laws, which amplify"
+        "this run is in float32. Levels and running sums are compensated for rounding, so levels"
+        " are right to about 1e-5 cm (2e-3 cm under gouta2022's controllers, which amplify"
         " rounding; 0.1 to 3 % of input_travel is rounding). Call"
-        " jax.config.update('jax_enable_x64', True) first for float64, which one run is no"
-        " slower in.",
+        " jax.config.update('jax_enable_x64', True) first for float64, in which one run is no"
+        " slower.",
         stacklevel=6,
     )
 
 
-def is_broken(state):
-    """True if the run left the numbers: a level that is not finite stays so, so the last state
-    tells and the loop need not look.
+def is_broken(state: State) -> Any:
+    """Return True if the run diverged: a level that is not finite stays so, so the last state is
+    enough.
     """
     return ~jnp.isfinite(sum(state.x))

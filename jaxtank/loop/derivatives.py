@@ -1,141 +1,173 @@
-"""Exact derivatives of the measures, carried along with the run."""
+"""Exact derivatives of the measures, carried along with the run (forward mode).
 
-import functools
+May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
+"""
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jax.typing import ArrayLike
 
 from jaxtank import measures as ms
+from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
-from jaxtank.loop.closed_loop import initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
 from jaxtank.xla.reachability import reached
 
 OUTER = 12
 """Number of parameters above which the Gauss-Newton matrix grows by a matrix product: element by
-element the compiler makes each slope anew for each entry (20 parameters, one run: 62 of 80 ms, with
-the product 5 of 23; 8 parameters, 7 lanes: 11 against 53 ms).
+element the compiler computes each derivative again for each entry (20 parameters, one run: 62 of
+80 ms, with the product 5 of 23; 8 parameters, 7 runs side by side: 11 against 53 ms).
 """
 
 
-@functools.partial(
-    jax.jit, static_argnames=("clock", "names", "order", "squares", "lanes")
-)  # a dict would come back with its keys sorted
+class Partition(NamedTuple):
+    """The leaves of a tree in two groups: those that have tangents, and the rest."""
+
+    structure: Any
+    moving: tuple[bool, ...]  # of each leaf, whether it has tangents
+
+    def split(self, tree: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Return (leaves with tangents, the others)."""
+        leaves: list[Any] = jax.tree.leaves(tree)
+        with_tangents = tuple(v for v, m in zip(leaves, self.moving) if m)
+        return with_tangents, tuple(v for v, m in zip(leaves, self.moving) if not m)
+
+    def join(self, moving: Any, still: Any) -> Any:
+        """Return the tree of what `split` returned."""
+        moving, still = iter(moving), iter(still)
+        leaves: list[Any] = [next(moving) if m else next(still) for m in self.moving]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+# the values as a tuple: a dict would come back with its keys sorted
+@compiled("clock", "names", "order", "squares", "batched")
 def sensitivities_compiled(
-    loop, clock, names, order, values, key, squares=(("mean_square_error", 1.0),), lanes=False
-):
-    """What `loop.sensitivities` returns, unchecked. `lanes`: this will be one of several runs side
-    by side.
+    loop: ClosedLoop,
+    clock: Clock,
+    names: tuple[str, ...],
+    order: tuple[str, ...],
+    values: tuple[ArrayLike, ...],
+    key: jax.Array | None,
+    squares: tuple[tuple[str, float], ...] = (("mean_square_error", 1.0),),
+    batched: bool = False,
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
+    """Return what `loop.run.sensitivities` returns, unchecked.
+
+    order, values: names and values of the parameters; batched: whether this will be one of several
+    runs side by side.
     """
     flat, unflatten = ravel_pytree(values)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
+    basis = jnp.eye(flat.size, dtype=flat.dtype)
+    push = _pushed_stored if batched else _pushed
 
-    def at(theta):
+    def at(theta: Any) -> ClosedLoop:
         return with_values(loop, dict(zip(order, unflatten(theta))))
 
-    basis = jnp.eye(flat.size, dtype=flat.dtype)
+    def sampled(theta: Any) -> Any:
+        return inputs(at(theta), clock, kept, key)
 
-    def pushed(f, point, *tangents):
-        """(f(point), tangents of f with the P directions as the last axis)."""
-        return jax.vmap(
-            lambda *t: jax.jvp(f, point, t, has_aux=True), in_axes=-1, out_axes=(None, -1, None)
-        )(*tangents)
+    def start(here: ClosedLoop) -> Any:
+        return initial(here, clock), ms.start(run_of(here, clock), kept)
 
-    def pushed_apart(f, point, *tangents):
-        """`pushed`, where what the tangents are multiplied by is made once and kept. For many
-        lanes: alone, fetching costs more.
-        """
-        value, linear, rest = jax.linearize(f, *point, has_aux=True)
-        linear, slopes = jax.closure_convert(linear, *point)
-        slopes = materialised(slopes)
-        return (
-            value,
-            jax.vmap(lambda *t: linear(*t, *slopes), in_axes=-1, out_axes=-1)(*tangents),
-            rest,
-        )
+    carried = _floats_of(jax.eval_shape(lambda: start(loop)))
+    known = _dependent(sampled, flat)
 
-    carried, structure = jax.tree.flatten(
-        jax.eval_shape(lambda: (initial(loop, clock), ms.start(run_of(loop, clock), kept)))
-    )
-    # only floats have derivatives
-    moves = tuple(jnp.issubdtype(v.dtype, jnp.floating) for v in carried)
+    def begin(theta: Any) -> Any:
+        floats, rest = carried.split(start(keyed(at(theta), key)))
+        moving, fixed = known.split(sampled(theta))
+        return (floats, moving), (rest, fixed)
 
-    def split(tree):
-        leaves = jax.tree.leaves(tree)
-        return tuple(v for v, m in zip(leaves, moves) if m), tuple(
-            v for v, m in zip(leaves, moves) if not m
-        )
+    (floats, moving), (dfloats, dmoving), (rest, fixed) = _pushed(begin, (flat,), basis)
+    weights = ms.residual_weights(run_of(loop, clock), squares)
 
-    def join(floats, rest):
-        floats, rest = iter(floats), iter(rest)
-        return jax.tree.unflatten(structure, [next(floats) if m else next(rest) for m in moves])
+    def body(carry: Any, now: Any) -> Any:
+        floats, dfloats, rest, matrix = carry
+        moving, dmoving, fixed = now
 
-    def known(theta):
-        """The samples of references, plans and noise, as a list of arrays (samples,)."""
-        return jax.tree.leaves(inputs(at(theta), clock, kept, key))
-
-    scanned = jax.tree.structure(
-        jax.eval_shape(lambda theta: inputs(at(theta), clock, kept, key), flat)
-    )
-    # which of them depend on the parameters: only theirs are tangents to be carried
-    feels = reached(known, flat)
-
-    def begin(theta):
-        here = keyed(at(theta), key)
-        floats, rest = split((initial(here, clock), ms.start(run_of(here, clock), kept)))
-        xs = known(theta)
-        return (floats, [x for x, f in zip(xs, feels) if f]), (
-            rest,
-            [x for x, f in zip(xs, feels) if not f],
-        )
-
-    (floats, felt), (dfloats, dfelt), (rest, fixed) = pushed(begin, (flat,), basis)
-
-    def body(carry, sampled):
-        floats, dfloats, rest, gauss_newton = carry
-        felt, dfelt, fixed = sampled
-
-        def advance(floats, theta, felt):
+        def advance(floats: Any, theta: Any, moving: Any) -> Any:
             here = at(theta)
-            mine, others = iter(felt), iter(fixed)
-            now = jax.tree.unflatten(scanned, [next(mine) if f else next(others) for f in feels])
-            state, acc = join(floats, rest)
+            run, now = run_of(here, clock), known.join(moving, fixed)
+            state, acc = carried.join(floats, rest)
             state, sample = step(here, clock, state, now)
-            run = run_of(here, clock)
-            errors = ms.residuals(run, acc, sample, now.window, now.rest, squares)
-            floats, others = split(
-                (state, ms.update(run, acc, sample, now.window, now.since, now.rest))
-            )
+            errors = ms.residuals(run, acc, sample, now.context, squares)
+            floats, others = carried.split((state, ms.update(run, acc, sample, now.context)))
             return (floats, errors), others
 
-        if lanes:
-            (floats, _), (dfloats, derrors), rest = pushed_apart(
-                advance, (floats, flat, felt), dfloats, basis, dfelt
-            )
-        else:
-            (floats, _), (dfloats, derrors), rest = pushed(
-                advance, (floats, flat, felt), dfloats, basis, dfelt
-            )
-        if flat.size > OUTER:
-            rows = jnp.stack(derrors)
-            gauss_newton = gauss_newton + (rows.T * jnp.asarray(weights, rows.dtype)) @ rows
-        else:
-            for slope, weight in zip(derrors, weights):
-                gauss_newton = gauss_newton + weight * slope[:, None] * slope[None, :]
-        return (floats, dfloats, rest, gauss_newton), None
+        (floats, _), (dfloats, derrors), rest = push(
+            advance, (floats, flat, moving), dfloats, basis, dmoving
+        )
+        return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
-    weights = ms.residual_weights(run_of(loop, clock), squares)
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    (floats, dfloats, rest, gauss_newton), _ = scan(
-        body, carry, (felt, dfelt, fixed), length=clock.samples
+    (floats, dfloats, rest, matrix), _ = scan(
+        body, carry, (moving, dmoving, fixed), length=clock.samples
     )
 
-    def finish(floats, theta):
-        _, acc = join(floats, rest)
+    def finish(floats: Any, theta: Any) -> Any:
+        _, acc = carried.join(floats, rest)
         return ms.read(run_of(at(theta), clock), acc, names), None
 
-    results, slopes, _ = pushed(finish, (floats, flat), dfloats, basis)
-    return results, slopes, 2.0 * gauss_newton, is_broken(join(floats, rest)[0])
+    results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
+    return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
+
+
+def _floats_of(tree: Any) -> Partition:
+    """Partition of `tree` by type: only floats have derivatives."""
+    leaves: list[Any] = jax.tree.leaves(tree)
+    structure = cast(Any, jax.tree.structure(tree))
+    return Partition(structure, tuple(bool(jnp.issubdtype(v.dtype, jnp.floating)) for v in leaves))
+
+
+def _dependent(f: Callable[[Any], Any], flat: jax.Array) -> Partition:
+    """Partition of f(flat) by dependence: only what depends on `flat` carries tangents."""
+
+    def leaves(theta: Any) -> list[Any]:
+        return jax.tree.leaves(f(theta))
+
+    depends: list[bool] = reached(leaves, flat)
+    return Partition(jax.tree.structure(jax.eval_shape(f, flat)), tuple(depends))
+
+
+def _pushed(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any) -> Any:
+    """(f(point), tangents of f with the P directions as the last axis, auxiliary output of f)."""
+
+    def push(*t: Any) -> Any:
+        return jax.jvp(f, point, t, has_aux=True)
+
+    return jax.vmap(push, in_axes=-1, out_axes=(None, -1, None))(*tangents)
+
+
+def _pushed_stored(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any) -> Any:
+    """`_pushed`, where what the tangents are multiplied by is computed once and stored. For many
+    runs side by side: of one alone, fetching costs more.
+    """
+    linearize = cast(Any, jax.linearize)
+    value, linear, rest = linearize(f, *point, has_aux=True)
+    converted = cast(Any, jax.closure_convert(linear, *point))
+    function, slopes = converted[0], materialised(converted[1])
+
+    def push(*t: Any) -> Any:
+        return function(*t, *slopes)
+
+    return value, jax.vmap(push, in_axes=-1, out_axes=-1)(*tangents), rest
+
+
+def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
+    """`matrix` (P, P) with sum_k weight_k slope_k slope_k' added, of slopes (P,)."""
+    if len(matrix) > OUTER:
+        rows = jnp.stack(derrors)
+        return matrix + (rows.T * jnp.asarray(weights, rows.dtype)) @ rows
+    for slope, weight in zip(derrors, weights):
+        matrix = matrix + weight * slope[:, None] * slope[None, :]
+    return matrix

@@ -1,14 +1,15 @@
-"""The closed loop: plant, sensor, observer, law and actuator, compiled to one function.
+"""A whole run: a trajectory for people, measures for tuning, and exact derivatives of the measures.
 
-Row k of a run is the world at t_k before it moves: y_k is read, u_k is decided, and u_k is held
-over [t_k, t_k + dt). `simulate` keeps a trajectory for people; `evaluate` keeps running measures
-for tuning and ensembles; `sensitivities` carries exact derivatives of the measures along with the
-run. All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
+Row k of a run is the state at t_k: y_k is measured, u_k is computed, and held over [t_k, t_k + dt).
+All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument. May import the
+other modules of `loop` and the folders below.
 """
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
-import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -19,13 +20,23 @@ from jax.typing import ArrayLike
 from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
-from jaxtank.core.records import Trajectory
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of, zero_of
+from jaxtank.loop.closed_loop import (
+    ClosedLoop,
+    Inputs,
+    initial,
+    inputs,
+    is_broken,
+    keyed,
+    run_of,
+    zero_of,
+)
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.step import step
+from jaxtank.loop.trajectory import COLUMNS, Trajectory
 from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
 
 
 def simulate(
@@ -33,12 +44,39 @@ def simulate(
 ) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
 
-    loop: ClosedLoop; clock: Clock; key: jax random key for the sensor noise, or None; returns a
-    Trajectory. Raises InputError for invalid input and NonFiniteError if a level stops being finite
-    (outside a trace).
+    Parameters
+    ----------
+    loop : ClosedLoop
+    clock : Clock
+    key : jax random key, optional
+        For the sensor noise; needed where `sensor.noise` is above 0.
+    save_every : int
+        Distance of the saved samples [samples].
+
+    Returns
+    -------
+    Trajectory
+        Arrays with one row per saved sample.
+
+    Raises
+    ------
+    InputError
+        For invalid input.
+    NonFiniteError
+        If a level stops being finite (outside a trace).
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded/pi").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0), save_every=5)
+    >>> run.x.shape, [float(t) for t in run.t]
+    ((3, 2), [0.0, 20.0, 40.0])
     """
     check(loop, clock, key)
-    if not isinstance(save_every, int) or save_every < 1:
+    whole: Any = save_every
+    if not isinstance(whole, int) or whole < 1:
         raise InputError(
             f"save_every = {save_every!r}: must be a whole number of at least 1 sample"
         )
@@ -52,10 +90,37 @@ def evaluate(
 ) -> dict[str, jax.Array]:
     """Run the loop and keep only running measures.
 
-    measures: names of `jaxtank.measures.MEASURES`; key: jax random key for the sensor noise, or
-    None; returns {name: scalar, or array with one entry per output, tank or pump}. Raises
-    InputError for invalid input and NonFiniteError if a level stops being finite (outside a trace;
-    inside one, the values of such a run are NaN, and so are those of a run with noise and no key).
+    Parameters
+    ----------
+    loop : ClosedLoop
+    clock : Clock
+    measures : sequence of str
+        Names of `jaxtank.measures.MEASURES`.
+    key : jax random key, optional
+        For the sensor noise.
+
+    Returns
+    -------
+    {name: scalar, or array with one entry per output, tank or pump}
+        In the units of `jaxtank.measures.unit`. Inside a trace, those of a run that diverges are
+        NaN, and so are those of a run with noise and no key.
+
+    Raises
+    ------
+    InputError
+        For invalid input.
+    NonFiniteError
+        If a level stops being finite (outside a trace).
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded/pi").loop
+    >>> clock = jaxtank.Clock(dt=4.0, duration=40.0)
+    >>> values = jaxtank.evaluate(loop, clock, ["max_level", "iae"])
+    >>> values["max_level"].shape, values["iae"].shape
+    ((2,), (1,))
     """
     names = _names(measures)
     check(loop, clock, key)
@@ -64,16 +129,20 @@ def evaluate(
     return values
 
 
-def evaluate_and_flag(loop, clock, measures, key=None):
-    """(`evaluate`'s values, True if the run stopped being finite); checks nothing, raises nothing:
-    for batches and searches.
+def evaluate_and_flag(
+    loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """Return (`evaluate`'s values, True if the run diverged); checks nothing, raises nothing: for
+    batches and searches.
     """
     return evaluate_compiled(loop, clock, _names(measures), key, False)
 
 
-def evaluate_for_reverse(loop, clock, measures, key=None):
-    """`evaluate` with the run cut into about sqrt(samples) pieces that are recomputed on the way
-    back, for reverse mode.
+def evaluate_for_reverse(
+    loop: ClosedLoop, clock: Clock, measures: Sequence[str], key: jax.Array | None = None
+) -> dict[str, jax.Array]:
+    """Return `evaluate`'s values by a run cut into about sqrt(samples) chunks that are recomputed
+    on the way back, for reverse mode.
 
     Same values, but never NonFiniteError; memory of a gradient grows with the root of the
     samples. Best above about ten parameters.
@@ -91,16 +160,49 @@ def sensitivities(
     key: jax.Array | None = None,
     squares: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """Measures, their exact derivatives, and a Gauss-Newton matrix, in one run.
+    """Return measures, their exact derivatives, and a Gauss-Newton matrix, from one run.
 
-    values: {dotted name: number or array} of P numbers in all, the point and the parameters to
-    differentiate by (forward mode: worth it to about ten). squares: {measure: weight} of measures
-    that are sums of squares, sum_k w_k v_k^2: the matrix is 2 sum_k w_k grad(v_k) grad(v_k)', the
-    second derivative of their weighted sum but for the residuals' own curvature; None: the mean
-    square tracking error of all outputs. Returns (measures {name: value}, derivatives {name:
-    value.shape + (P,)}, (P, P) matrix, True if the run stopped being finite), P in the order of
-    `values`. key as in `evaluate`. Raises InputError for invalid input; a run that is not finite is
-    told by the flag.
+    With sums of squares sum_k w_k v_k^2 the matrix is 2 sum_k w_k grad(v_k) grad(v_k)', the second
+    derivative of their weighted sum but for the residuals' own curvature.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    clock : Clock
+    measures : sequence of str
+    values : {dotted name: number or array}
+        P numbers in all: the point, and the parameters to differentiate by (forward mode: worth it
+        to about ten).
+    key : jax random key, optional
+        For the sensor noise.
+    squares : {measure: weight}, optional
+        Measures that are sums of squares; the mean square tracking error of all outputs where left
+        out.
+
+    Returns
+    -------
+    measures : {name: value}
+    derivatives : {name: value.shape + (P,) array}
+        In the order of `values`.
+    matrix : (P, P) array
+    broken : bool array
+        True if the run diverged.
+
+    Raises
+    ------
+    InputError
+        For invalid input; a run that is not finite is reported by `broken`.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> case = presets.load("cascaded/pi")
+    >>> clock = jaxtank.Clock(dt=4.0, duration=20.0)
+    >>> point = {"controller.Kc": case.loop.controller.Kc}
+    >>> found = jaxtank.sensitivities(case.loop, clock, ["rms_error_total"], point)
+    >>> found[1]["rms_error_total"].shape, found[2].shape
+    ((1,), (1, 1))
     """
     if not values:
         raise InputError("sensitivities needs at least one parameter: values is empty")
@@ -109,7 +211,7 @@ def sensitivities(
     for name in _names(squares):
         if not ms.MEASURES[name].residual:
             raise InputError(
-                f"squares: {name} is not a sum of squares; those are {', '.join(ms.SQUARES)}"
+                f"squares: {name} is not a sum of squares; those are {', '.join(ms.squares())}"
             )
     chosen = tuple((m, float(w)) for m, w in squares.items())
     return sensitivities_compiled(
@@ -117,89 +219,114 @@ def sensitivities(
     )
 
 
-def _names(measures):
+def _names(measures: str | Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:
     names = (measures,) if isinstance(measures, str) else tuple(measures)
     ms.check_names(names)
     return names
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "checkpoint"))
-def evaluate_compiled(loop, clock, names, key, checkpoint):
+@compiled("clock", "names", "checkpoint")
+def evaluate_compiled(
+    loop: ClosedLoop, clock: Clock, names: tuple[str, ...], key: jax.Array | None, checkpoint: bool
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """Return (measures, True if the run diverged), unchecked; checkpoint: for reverse mode."""
     loop = keyed(loop, key)
     run = run_of(loop, clock)
 
-    def body(carry, now):
+    def body(carry: Any, now: Inputs) -> Any:
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), None
+        return (state, ms.update(run, acc, sample, now.context)), None
 
-    carry = (initial(loop, clock), ms.start(run, names))
+    def batch(carry: Any, number: Any, samples: int = CHUNK) -> Any:
+        return scan(body, carry, inputs(loop, clock, names, key, number, samples), samples)[0], None
+
+    carry: Any = (initial(loop, clock), ms.start(run, names))
     if checkpoint:
-        state, acc = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
+        carry = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
     elif clock.samples > CHUNK and is_pointwise(loop):
-        whole, rest = divmod(clock.samples, CHUNK)
-        piece = lambda c, number, samples=CHUNK: (
-            scan(body, c, inputs(loop, clock, names, key, number, samples), samples)[0],
-            None,
-        )
-        carry = jax.lax.scan(piece, carry, jnp.arange(whole))[0]
-        state, acc = piece(carry, whole, rest)[0] if rest else carry
+        whole, left = divmod(clock.samples, CHUNK)
+        carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
+        carry = batch(carry, whole, left)[0] if left else carry
     else:
-        state, acc = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
+        carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
+    state, acc = carry
     return ms.read(run, acc, names), is_broken(state)
 
 
-def checkpointed_scan(body, carry, xs, length):
-    """A scan over about sqrt(length) pieces, each recomputed in the reverse pass."""
+def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+    """Return the carry of a scan over about sqrt(length) chunks, each recomputed in the reverse
+    pass.
+    """
+
+    def chunk(carry: Any, now: Any) -> Any:
+        return scan(body, carry, now, length=inner)[0], None
+
+    def first(a: Any) -> Any:
+        return a[: outer * inner].reshape(outer, inner)
+
+    def last(a: Any) -> Any:
+        return a[outer * inner :]
+
     inner = math.isqrt(length)
     outer = length // inner
-    head = jax.tree.map(lambda a: a[: outer * inner].reshape(outer, inner), xs)
-    tail = jax.tree.map(lambda a: a[outer * inner :], xs)
-    piece = jax.checkpoint(lambda c, now: (scan(body, c, now, length=inner)[0], None))
-    carry = scan(piece, carry, head, length=outer)[0]
-    return scan(body, carry, tail, length=length - outer * inner)[0]
+    checkpoint = cast(Any, jax.checkpoint)
+    carry = scan(checkpoint(chunk), carry, jax.tree.map(first, xs), length=outer)[0]
+    return scan(body, carry, jax.tree.map(last, xs), length=length - outer * inner)[0]
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "save_every"))
-def simulate_compiled(loop, clock, key, save_every):
+@compiled("clock", "save_every")
+def simulate_compiled(
+    loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int
+) -> tuple[Trajectory, jax.Array]:
+    """Return (Trajectory, True if the run diverged), unchecked."""
     loop = keyed(loop, key)
     rows = (clock.samples - 1) // save_every + 1
-    xs = inputs(loop, clock, (), key)
     spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
-    xs = jax.tree.map(
-        lambda a: jnp.pad(a, (0, max(spare, 0)), mode="edge")[: rows * save_every].reshape(
-            rows, save_every
-        ),
-        xs,
-    )
 
-    def one(carry, now):
+    def in_rows(a: Any) -> Any:
+        padded = jnp.pad(a, (0, max(spare, 0)), mode="edge")
+        return padded[: rows * save_every].reshape(rows, save_every)
+
+    def one(carry: Any, now: Any) -> Any:
         state, spilled = carry
         state, sample = step(loop, clock, state, now)
         return (state, tuple(a + b for a, b in zip(spilled, sample.spilled))), sample
 
-    def row(carry, now):
+    def unsaved(carry: Any, now: Any) -> Any:
+        return one(carry, now)[0], None
+
+    def row(carry: Any, now: Any) -> Any:
         spilled = carry[1]
-        carry, sample = one(carry, jax.tree.map(lambda a: a[0], now))
+        carry, sample = one(carry, jax.tree.map(_first, now))
         if save_every > 1:
-            rest = jax.tree.map(lambda a: a[1:], now)
-            carry = scan(lambda c, n: (one(c, n)[0], None), carry, rest, length=save_every - 1)[0]
+            others = jax.tree.map(_but_first, now)
+            carry = scan(unsaved, carry, others, length=save_every - 1)[0]
         return carry, sample._replace(spilled=spilled)
 
     zero = zero_of(loop)
-    (state, _), saved = scan(
-        row, (initial(loop, clock), (zero,) * loop.plant.tanks), xs, length=rows
-    )
-    columns = {
-        name: jnp.stack(value, axis=-1) if isinstance(value, tuple) else value
-        for name, value in saved._asdict().items()
-        if name in Trajectory._fields
-    }
-    return Trajectory(**columns), is_broken(state)
+    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key))
+    start = (initial(loop, clock), (zero,) * loop.plant.tanks)
+    (state, _), saved = scan(row, start, xs, length=rows)
+    columns: dict[str, Any] = {}
+    for name in COLUMNS:
+        value: Any = getattr(saved, name)
+        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
+    return Trajectory(**columns, units=loop.units), is_broken(state)
 
 
-def _report_broken(broken, loop, clock, key):
-    """Raise NonFiniteError for a run that left the numbers, with time, tank and what was set.
+def _first(a: Any) -> Any:
+    return a[0]
+
+
+def _but_first(a: Any) -> Any:
+    return a[1:]
+
+
+def _report_broken(
+    broken: jax.Array, loop: ClosedLoop, clock: Clock, key: jax.Array | None
+) -> None:
+    """Raise NonFiniteError for a run that diverged, with time, tank and the controller's values.
     Nothing inside a trace.
     """
     if isinstance(broken, Tracer) or np.ndim(broken) or not broken:
@@ -210,15 +337,14 @@ def _report_broken(broken, loop, clock, key):
     if not bad.any():  # only the step after the last sample
         return
     first = int(np.argmax(bad.any(axis=1)))
-    if first == 0 and key is None:  # `keyed` saw to it
+    if first == 0 and key is None:  # the NaN of `keyed`
         raise InputError("sensor.noise is above 0: give a key, or set it to 0")
     tanks = ", ".join(str(i + 1) for i in np.flatnonzero(bad[first]))
-    shown = {
-        n: v
-        for n, v in parameters(loop).items()
-        if n.startswith("controller.") and not n.startswith("controller.model.")
-    }
-    text = ", ".join(f"{n} = {np.asarray(v)}" for n, v in shown.items())
+    text = ", ".join(
+        f"{name} = {np.asarray(value)}"
+        for name, value in parameters(loop).items()
+        if name.startswith("controller.") and not name.startswith("controller.model.")
+    )
     raise NonFiniteError(
         f"the level of tank {tanks} stopped being finite at t = {first * clock.dt:g} s with {text}"
     )
@@ -227,6 +353,7 @@ def _report_broken(broken, loop, clock, key):
 __all__ = [
     "Clock",
     "ClosedLoop",
+    "Trajectory",
     "check",
     "evaluate",
     "evaluate_for_reverse",

@@ -1,58 +1,38 @@
-"""One sample of the closed loop: what it needs, and what it hands to the next."""
+"""One sample of the closed loop: the order of its parts, written once.
+
+Simulation, derivatives, export and Gymnasium call it. May import `loop.closed_loop` and the folders
+below `jaxtank.loop`.
+"""
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Sample, Tick
+from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.tree import is_real
+from jaxtank.loop.closed_loop import ClosedLoop, Group, Inputs, State
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.xla.barrier import materialised
-
-
-class State(NamedTuple):
-    """What one sample hands to the next."""
-
-    k: Any  # index of the sample
-    x: tuple  # levels [cm]
-    observer: Any
-    controller: Any
-    actuator: Any
-    sensor: Any = ()
-    excess: tuple = ()  # in float32, what rounding has added to each level too much [cm]
 
 
 class Decision(NamedTuple):
     """What observer and controller make of one sample."""
 
-    estimate: Any  # Estimate of the levels [cm] and inflows [cm^3/s]
-    command: Sequence  # (m) inputs before their limits [V]
-    applied: tuple  # (m) inputs within them [V]
+    estimate: Estimate
+    command: Sequence[Any]  # (m) inputs before their limits [V]
+    applied: Group  # (m) inputs within them [V]
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample
 
 
-class Inputs(NamedTuple):
-    """What is known of every sample before the loop starts: arrays (samples,)."""
-
-    r: tuple
-    dr: tuple
-    ddr: tuple
-    d: tuple | None
-    xi: tuple | None
-    window: tuple | None
-    since: Any  # time since the last pour [s], or None
-    rest: tuple | None  # inputs that hold the setpoint [V]
-    plan: Any  # what the law has prepared
-    own: Any  # signals of the law's own
-    fault: tuple | None  # 1 while a fault lasts
-
-
-def step(loop, clock, state, now):
-    """One sample: (state after it, Sample of it). `now`: this sample's slice of Inputs."""
+def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[State, Sample]:
+    """Return (state after a sample, Sample of it). now: this sample's slice of Inputs."""
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
     y, sensor = loop.sensor.step(state.sensor, state.x, now.xi, clock.dt)
@@ -78,7 +58,9 @@ def step(loop, clock, state, now):
     return moved, sample
 
 
-def decide(loop, observer, controller, tick, y):
+def decide(
+    loop: ClosedLoop, observer: Any, controller: Any, tick: Tick, y: Sequence[Any]
+) -> Decision:
     """Return what observer and controller make of one sample: the order of a sample, written once.
 
     The observer corrects its estimate by the readings, the controller commands, the actuator limits
@@ -86,10 +68,13 @@ def decide(loop, observer, controller, tick, y):
 
     Parameters
     ----------
-    loop : Loop
-    observer, controller : states before the sample
-    tick : Tick, what is known at its time
-    y : (n) readings [cm]
+    loop : ClosedLoop
+    observer, controller : tree
+        Their states before the sample.
+    tick : Tick
+        What is known at its time.
+    y : (n) sequence
+        Readings [cm].
 
     Returns
     -------
@@ -109,7 +94,9 @@ def decide(loop, observer, controller, tick, y):
     return Decision(estimate, command, applied, observer, controller)
 
 
-def move(loop, clock, state, applied, now):
+def move(
+    loop: ClosedLoop, clock: Clock, state: State, applied: Group, now: Inputs
+) -> tuple[State, Group, Group, Group]:
     """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim
     [cm^3], (n) volume that a negative inflow could not take [cm^3]) for inputs `applied` (m) [V]
     within the limits: pumps, faults and plant. Observer and controller of the state stay as they
@@ -117,7 +104,9 @@ def move(loop, clock, state, applied, now):
     """
     t = time_of(state, clock)
     u, actuator = loop.actuator.step(state.actuator, applied, clock.dt)
-    plant = loop.plant if now.fault is None else loop.faults.apply(loop.plant, now.fault)
+    plant = loop.plant
+    if loop.faults is not None and now.fault is not None:
+        plant = loop.faults.apply(plant, now.fault)
     driving = materialised(loop.actuator.driving(u))
     found = advance(
         plant,
@@ -134,38 +123,40 @@ def move(loop, clock, state, applied, now):
     return moved, u, found.spilled, found.shortfall
 
 
-def time_of(state, clock):
-    """t [s] of a state."""
+def time_of(state: State, clock: Clock) -> Any:
+    """Return t [s] of a state."""
     return state.k.astype(state.x[0].dtype) * clock.dt
 
 
-def commanded(loop, state, tick, estimate):
+def commanded(
+    loop: ClosedLoop, state: Any, tick: Tick, estimate: Estimate
+) -> tuple[Sequence[Any], Any]:
     """Return the controller's ((m,) inputs before their limits, new state).
 
     Raises InputError, while the loop is traced, for a number of inputs that is not that of the
     pumps, and for an input that is no single real number.
     """
     command, state = loop.controller.step(state, tick, estimate)
-    pumps = loop.plant.pumps
-    count = (len(command),) if isinstance(command, tuple | list) else np.shape(command)[:1]
+    _check_command(command, loop.plant.pumps, type(loop.controller).__name__)
+    return command, state
+
+
+def _check_command(command: Any, pumps: int, name: str) -> None:
+    """Raise InputError unless `command`, of the controller `name`, is one real number per pump."""
+    several = isinstance(command, tuple | list)
+    entries: list[Any] = list(cast(Any, command)) if several else []
+    count = (len(entries),) if several else np.shape(command)[:1]
     if count != (pumps,):
-        law = type(loop.controller).__name__
         found = f"{count[0]} input{'' if count[0] == 1 else 's'}" if count else "one number"
         raise InputError(
-            f"controller {law}: its step returns {found} for {pumps}"
+            f"controller {name}: its step returns {found} for {pumps}"
             f" pump{'' if pumps == 1 else 's'}: must return (inputs, state), a tuple with one input"
             " for each pump"
         )
-    parts = (
-        [(np.shape(v), v) for v in command]
-        if isinstance(command, tuple | list)
-        else [(np.shape(command)[1:], command)]
-    )
+    parts = [(np.shape(v), v) for v in entries] if several else [(np.shape(command)[1:], command)]
     switch = np.dtype(bool)  # on or off: 1 or 0
     if any(shape or not (is_real(v) or getattr(v, "dtype", None) == switch) for shape, v in parts):
         raise InputError(
-            f"controller {type(loop.controller).__name__}: its step returns an input that is no"
-            " single real number: must return (inputs, state), a tuple with one number for each"
-            " pump"
+            f"controller {name}: its step returns an input that is no single real number: must"
+            " return (inputs, state), a tuple with one number for each pump"
         )
-    return command, state

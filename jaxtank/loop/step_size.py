@@ -1,39 +1,58 @@
-"""Integration steps too long for a tank that runs empty: there a level chatters, or water appears
-from nowhere.
+"""Integration steps too long for a tank that runs empty: there the explicit step is unstable.
+
+May import the folders below `jaxtank.loop`.
 
 Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the rate
 
-    lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(knee))    [1/s]
+    lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(threshold))    [1/s]
 
-of the film of `numerics.smooth_sqrt`, and a Runge-Kutta step h follows it while lambda h is below 2.785
-(rk4) or 2 (midpoint), the ends of their stability regions on the negative axis (Hairer & Wanner
-1996, sec. IV.2). Beyond, a level that should rest at 0 is thrown up again and again. How high
-depends on lambda h alone, counted in knees, and is found here by doing it: 9 knees at 6.6, 160 at
-15, 120,000 at 100.
+of laminar flow below the threshold `plant.knee` (core.numerics), and a Runge-Kutta step h is
+stable while lambda h is below 2.785 (rk4) or 2 (midpoint), the ends of their stability regions on
+the negative axis (Hairer & Wanner 1996, sec. IV.2). Beyond, a level that should stay at 0 rises
+again and again. How high depends on lambda h alone, counted in thresholds, and is found here by
+doing it: 9 thresholds at 6.6, 160 at 15, 120,000 at 100.
 
 In a rig with `bottom` a tank gives no more in one step than it holds (`TankNetwork.limited`):
-nothing is thrown up and no volume appears, but a level below (h sqrt(2 g) (sum a_j + sum p_k) /
-A)^2 stands too high, by at most that. Beyond lambda h = 2.785 of the pipes alone, levels that a
-pipe has made equal still oscillate.
+no volume appears, but a level below (h sqrt(2 g) (sum a_j + sum p_k) / A)^2 stands too high, by at
+most that. Beyond lambda h = 2.785 of the pipes alone, levels that a pipe has made equal still
+oscillate.
 """
 
 import functools
 import math
 import warnings
-from typing import Any, cast
+from collections.abc import Iterator
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index, walk
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.trajectory import Trajectory
 
 LIMITS = {"rk4": 2.785, "midpoint": 2.0}
-SEEN = 0.01  # share of the levels that a run is about up to which one may be thrown without a word
+"""Largest stable lambda h of each integrator [-]."""
+SEEN = 0.01
+"""Share of the levels of a run up to which a level may be wrong without a warning [-]."""
 
 
-def film_rates(plant, orifices=1.5, pipes=2.0) -> Any:
-    """Return (n,) lambda of each tank [1/s], with these slopes of the film of its orifices and
-    pipes; None of a plant of another kind, or one whose leaves are traced.
+class StepWarning(UserWarning):
+    """Steps too long for a tank that runs empty. The command prints a note of its own."""
+
+
+class Unstable(NamedTuple):
+    """A tank whose steps are too long near empty."""
+
+    tank: int  # counted from 0
+    height: float  # how far off its level may be [length of the rig]
+    remedy: str  # what is short enough
+
+
+def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any:
+    """Return (n,) lambda of each tank [1/s], with these slopes of the laminar flow of its orifices
+    and pipes; None of a plant of another kind, or one whose leaves are traced.
     """
     try:
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
@@ -51,125 +70,135 @@ def film_rates(plant, orifices=1.5, pipes=2.0) -> Any:
 
 
 @functools.lru_cache(maxsize=256)
-def thrown(product, integrator):
-    """How high above an empty tank, in knees, a level is thrown in the long run, at lambda h =
-    `product` of any start.
+def unstable_height(product: float, integrator: str) -> float:
+    """Return how high above an empty tank, in thresholds, a level rises in the long run, at
+    lambda h = `product` of any start.
     """
 
-    def rate(x):
-        return (
-            -product
-            / 1.5
-            * np.where(x >= 1.0, np.sqrt(np.maximum(x, 1.0)), x * (1.5 - 0.5 * np.maximum(x, 0.0)))
-        )
+    def rate(x: Any) -> Any:
+        laminar = x * (1.5 - 0.5 * np.maximum(x, 0.0))
+        flow = cast(Any, np.where(x >= 1.0, np.sqrt(np.maximum(x, 1.0)), laminar))
+        return -product / 1.5 * flow
+
+    def stepped(x: Any) -> Any:
+        a = rate(x)
+        b = rate(x + 0.5 * a)
+        if integrator == "midpoint":
+            return x + b
+        c = rate(x + 0.5 * b)
+        return x + (a + 2.0 * b + 2.0 * c + rate(x + c)) / 6.0
 
     if product > 1e6:
         return math.inf
-    x, highest = np.geomspace(1e-3, 4.0 * product**2 + 1.0, 200), 0.0
+    x: Any = np.geomspace(1e-3, 4.0 * product**2 + 1.0, 200)
+    highest = 0.0
     with np.errstate(all="ignore"):
         for k in range(400):
-            a = rate(x)
-            b = rate(x + 0.5 * a)
-            if integrator == "midpoint":
-                x = x + b
-            else:
-                c = rate(x + 0.5 * b)
-                x = x + (a + 2.0 * b + 2.0 * c + rate(x + c)) / 6.0
+            x = stepped(x)
             highest = max(highest, float(np.max(np.abs(x)))) if k >= 200 else 0.0
     return highest if math.isfinite(highest) else math.inf
 
 
-class StepWarning(UserWarning):
-    """Steps too long for a tank that runs empty. The command says so in a note of its own."""
-
-
-def check_step(loop, clock):
+def check_step(loop: ClosedLoop, clock: Clock) -> None:
     """Raise InputError where a step would empty a full tank, and warn (StepWarning) where levels
     near a bottom are wrong.
     """
     plant, step = loop.plant, clock.dt / clock.substeps
-    for tank, _, remedy in _thrown(loop, clock):
-        # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of the film in place
-        # of its factors
-        empty = 3.0 * math.sqrt(plant.rim[tank] / plant.knee) / film_rates(plant)[tank]
+    for found in unstable_tanks(loop, clock):
+        # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of laminar flow in
+        # place of its factors
+        full = math.sqrt(plant.rim[found.tank] / _threshold(loop))
+        empty = 3.0 * full / emptying_rates(plant)[found.tank]
         if empty < step:
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: tank {tank + 1} runs empty in {empty:.2g} s, within"
-                f" one step: {remedy}"
+                f"clock.dt = {clock.dt:g} s: tank {found.tank + 1} runs empty in {empty:.2g} s,"
+                f" within one step: {found.remedy}"
             )
-    for line in doubts(loop, clock):
+    for line in step_warnings(loop, clock):
         warnings.warn(line, StepWarning, stacklevel=4)
 
 
-def doubts(loop, clock):
-    """A sentence on the tanks that would be thrown so high that it shows, or none; the worst is
-    named.
+def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
+    """Return a sentence on the tanks whose levels would be wrong near empty by so much that it
+    shows, or none; the worst is named.
     """
-    length, shown = loop.plant.units[0], _seen(loop, clock)
+    length, shown = loop.units[0], _visible(loop, clock)
     if not shown:
         return []
-    tank, height, remedy = max(shown, key=lambda one: one[1] / loop.plant.rim[one[0]])
+    tank, height, remedy = max(shown, key=lambda one: one.height / loop.plant.rim[one.tank])
     others = f" (and so do {len(shown) - 1} more)" if len(shown) > 1 else ""
-    up = f"thrown up by {height:.2g} {length}" if math.isfinite(height) else "thrown up without end"
-    if loop.plant.bottom:
-        up = f"up to {height:.2g} {length} too high" if math.isfinite(height) else "wrong"
+    amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
+    wrong = f"the explicit step is unstable and its level rises to {amount}"
+    if getattr(loop.plant, "bottom", False):
+        wrong = "its level is wrong"
+        if math.isfinite(height):
+            wrong = f"its level is up to {amount} too high"
     return [
-        f"tank {tank + 1} runs empty faster than the steps follow{others}: once it is, its level is"
-        f" {up} ({remedy})"
+        f"tank {tank + 1} runs empty faster than the steps follow{others}: once it is, {wrong}"
+        f" ({remedy})"
     ]
 
 
-def check_run(loop, clock, run):
-    """Raise InputError if in `run`, the whole Trajectory of a loop that has `doubts`, a tank was
-    thrown up: the volume in a rig cannot rise by more than what is pumped and poured into it.
+def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
+    """Raise InputError if the explicit step was unstable near empty in `run`, the whole Trajectory
+    of a loop that has `step_warnings`: the volume in a rig cannot rise by more than its inflow.
     """
-    shown = _seen(loop, clock)
-    if not shown:
-        return
-    least = _least_seen(loop, np.asarray(run.x))
-    area, gain, dt = (
-        np.asarray(loop.plant.area),
-        np.array(loop.plant.pump_gain, dtype=float),
-        clock.dt,
-    )
-    for k, (name, _, _) in enumerate(cast(Any, loop.faults.windows if loop.faults else ())):
-        field, (entry,) = split_index(name)
-        if field == "pump_gain":
-            gain[entry] = max(
-                gain[entry], gain[entry] * loop.faults.factor[k] + loop.faults.extra[k]
-            )
-        if field == "area":
-            return  # what is stored changes with it
-    x, u = np.asarray(run.x), np.asarray(run.u)
-    inflow = np.maximum(u, 0.0) @ gain
-    if loop.disturbance is not None:
-        inflow = inflow + sum(
-            np.maximum(np.asarray(d), 0.0) for d in loop.disturbance.sample(clock)[0]
-        )
-    gained = np.diff(x @ area) - dt * inflow[:-1]  # from nowhere
+    shown = _visible(loop, clock)
+    if not shown or any(name.startswith("area") for name, _, _ in _fault_windows(loop)):
+        return  # a fault of an area changes what is stored
+    plant: Any = loop.plant  # a network of tanks
+    x, least = np.asarray(run.x), _visible_heights(loop, np.asarray(run.x))
+    area, inflow = np.asarray(plant.area), _largest_inflow(loop, clock, np.asarray(run.u))
+    gained = np.diff(x @ area) - clock.dt * inflow[:-1]  # volume from nowhere
     for tank, _, remedy in shown:
         bad = (gained > area[tank] * least[tank]) & (np.diff(x[:, tank]) > least[tank])
         if bad.any():
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: steps too long to follow tank {tank + 1}, which runs"
-                f" empty, threw its level up after t = {np.argmax(bad) * dt:g} s: {remedy}"
+                " empty: near empty the explicit step is unstable and its level rises by itself"
+                f" after t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
             )
 
 
-def _seen(loop, clock):
-    """Those of `_thrown` whose height shows; none where the levels that tell are traced."""
-    found = list(_thrown(loop, clock))
-    least = _least_seen(loop) if found else None
-    return [] if least is None else [one for one in found if one[1] > least[one[0]]]
+def _fault_windows(loop: ClosedLoop) -> tuple[tuple[str, float, float], ...]:
+    return () if loop.faults is None else loop.faults.windows
 
 
-def _least_seen(loop, x: Any = 0.0) -> Any:
-    """(n,) heights from which a throw shows: a share of the rim, or of the highest level of start,
+def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
+    """(samples,) inflow of all tanks [cm^3/s] for inputs `u` of all samples, at most."""
+    plant: Any = loop.plant  # a network of tanks
+    gain: Any = np.array(plant.pump_gain, dtype=float)
+    faults: Any = loop.faults
+    for k, (name, _, _) in enumerate(_fault_windows(loop)):
+        field, index = split_index(name)
+        if field == "pump_gain":
+            entry = index[0]
+            faulty = gain[entry] * faults.factor[k] + faults.extra[k]
+            gain[entry] = max(gain[entry], faulty)
+    inflow = np.maximum(u, 0.0) @ gain
+    if loop.disturbance is not None:
+        disturbance: Any = loop.disturbance
+        inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in disturbance.sample(clock)[0])
+    return inflow
+
+
+def _visible(loop: ClosedLoop, clock: Clock) -> list[Unstable]:
+    """Those of `unstable_tanks` whose height shows; none where the levels needed are traced."""
+    found = list(unstable_tanks(loop, clock))
+    least = _visible_heights(loop) if found else None
+    return [] if least is None else [one for one in found if one.height > least[one.tank]]
+
+
+def _visible_heights(loop: ClosedLoop, x: Any = 0.0) -> Any:
+    """(n,) heights from which an error shows: a share of the rim, or of the highest level of start,
     setpoint and the run's levels `x` where that is lower, for a rim may be a limit far above all
     that happens. Of a run from empty tanks to nowhere, of the rim. None of traced levels.
     """
     plant = loop.plant
-    highest = lambda v: float(np.max(v, initial=0.0, where=np.isfinite(v)))
+
+    def highest(v: Any) -> float:
+        return float(np.max(v, initial=0.0, where=np.isfinite(v)))
+
     try:
         levels = [
             v
@@ -180,35 +209,42 @@ def _least_seen(loop, x: Any = 0.0) -> Any:
             highest(np.abs(np.asarray(v, dtype=float))) for v in (loop.x0, *levels) if v is not None
         )
         rim = np.asarray(plant.rim, dtype=float)
-        return SEEN * (rim if about <= plant.knee else np.minimum(rim, max(about, highest(x))))
+        small = about <= _threshold(loop)
+        return SEEN * (rim if small else np.minimum(rim, max(about, highest(x))))
     except TypeError:  # what jax raises for a traced number
         return None
 
 
-def _thrown(loop, clock):
-    """(tank, height [length of the rig], what helps) of every tank whose film is too fast."""
-    rates = film_rates(loop.plant)
+def _threshold(loop: ClosedLoop) -> Any:
+    """Level difference below which flow is laminar, of a network of tanks [cm]."""
+    network: Any = loop.plant
+    return network.knee
+
+
+def unstable_tanks(loop: ClosedLoop, clock: Clock) -> Iterator[Unstable]:
+    """Yield every tank that empties faster than the steps are stable."""
+    rates = emptying_rates(loop.plant)
     if rates is None:
         return
     step, limit = clock.dt / clock.substeps, LIMITS[clock.integrator]
     for tank, product in enumerate(rates * step):
         if product > limit:
-            height = _height(loop.plant, tank, step, product, clock.integrator) * loop.plant.knee
+            height = _height(loop.plant, tank, step, product, clock.integrator) * _threshold(loop)
             substeps = math.ceil(clock.substeps * product / limit)
             remedy = (
                 f"clock.substeps = {substeps}"
                 if substeps <= 10
                 else f"clock.dt of at most {step * limit / product:.2g} s"
             )
-            yield tank, height, f"{remedy} is short enough"
+            yield Unstable(tank, height, f"{remedy} is short enough")
 
 
-def _height(plant, tank, step, product, integrator):
-    """How far off the level of a tank may be once it is empty, in knees."""
+def _height(plant: Any, tank: int, step: float, product: float, integrator: str) -> float:
+    """How far off the level of a tank may be once it is empty, in thresholds."""
     if not plant.bottom:
-        return thrown(float(f"{product:.3g}"), integrator)
-    held = (step * film_rates(plant, 1.0, 1.0)[tank]) ** 2
-    pipes = step * film_rates(plant, 0.0, 2.0)[tank]
-    return max(
-        held, thrown(float(f"{pipes:.3g}"), integrator) if pipes > LIMITS[integrator] else 0.0
-    )
+        return unstable_height(float(f"{product:.3g}"), integrator)
+    held = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)
+    pipes = step * emptying_rates(plant, 0.0, 2.0)[tank]
+    if pipes <= LIMITS[integrator]:
+        return held
+    return max(held, unstable_height(float(f"{pipes:.3g}"), integrator))

@@ -1,10 +1,14 @@
-"""Input validation of a loop and a clock: what cannot be run is refused before anything is
-compiled.
+"""Input validation of a loop and a clock, before anything is compiled.
+
+May import `loop.closed_loop`, `loop.step_size` and the folders below `jaxtank.loop`.
 """
+# jax leaves the types of its trees partly open.
+# pyright: reportUnknownMemberType=false
 
 import dataclasses
 import re
-from typing import Any, cast
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,41 +19,153 @@ from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
 from jaxtank.core.tree import is_component
+from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
 
-_SAID = re.compile(r"\(([a-z0-9, +]+)\) ")
+_DOCUMENTED = re.compile(r"\(([a-z0-9, +]+)\) ")
+"""The shape with which the documentation of a leaf begins."""
 
 
-def check_shapes(loop):
-    """Raise InputError for a leaf of `loop` that has not the shape its documentation begins with.
-    Leaves of a batch may have the axes in front that x0 has; sizes that a component knows alone
-    (changes, pours, knots) are its own to check.
+def check(
+    loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None = None
+) -> None:
+    """Raise InputError for a loop or clock that cannot be run: values out of range, wrong shapes, a
+    reference that the controller cannot serve.
+
+    Only concrete leaves are looked at, so that it costs nothing inside a trace.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    clock : Clock
+    key : jax random key, optional
+        As it will be given to the run.
+
+    Raises
+    ------
+    InputError
+        With a message of one line that names the leaf, its value, its unit and what is allowed.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> case = presets.load("cascaded/pi")
+    >>> jaxtank.check(case.loop, case.clock)
+    >>> jaxtank.check(case.loop, jaxtank.Clock(dt=-1.0))
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: clock.dt = -1.0 s: must be a finite number above 0 s
     """
-    _check(loop, "", {}, np.shape(loop.x0)[:-1])
+    if not hasattr(loop, "plant"):
+        raise InputError(
+            f"loop is a {type(loop).__name__}: must be a ClosedLoop, as case.loop (first the loop,"
+            " then the clock)"
+        )
+    check_clock(clock)
+    check_key(key)
+    _check_sizes(loop)
+    _check_saturation(loop)
+    _check_delay(loop.actuator, clock)
+    check_shapes(loop)
+    gains: tuple[str, ...] = getattr(loop.controller, "gains", ())
+    check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
+    for name, own in _plants(loop):
+        check_caught(own, name)
+    if not _traced(loop.plant):
+        check_step(loop, clock)
+    loop.actuator.check()
+    if not _traced(loop.controller, loop.reference):
+        loop.controller.check(loop.reference)
+        if not _traced(loop.actuator):
+            loop.controller.check_pumps(loop.actuator)
+    loop.observer.check(loop.plant)
+    if key is None:
+        _check_noise(loop)
 
 
-def _check(tree, prefix, sizes, batch):
-    if hasattr(tree, "plant") and isinstance(tree.plant, Plant):
-        sizes = _sizes(tree.plant)
-    if isinstance(tree, Plant):
-        sizes = _sizes(tree)
-    for field in dataclasses.fields(cast(Any, tree)):
+def _check_sizes(loop: ClosedLoop) -> None:
+    """Raise InputError unless the components have as many tanks, pumps and outputs as the plant."""
+    plant = loop.plant
+    if np.shape(loop.x0)[-1:] != (plant.tanks,):
+        raise InputError(
+            f"x0 has shape {np.shape(loop.x0)}: must be ({plant.tanks},), one level per tank"
+        )
+    if loop.reference.channels != len(plant.outputs):
+        raise InputError(
+            f"the reference has {loop.reference.channels} channels for {len(plant.outputs)} outputs"
+        )
+    if loop.actuator.pumps != plant.pumps:
+        raise InputError(f"the actuator has {loop.actuator.pumps} pumps, the plant {plant.pumps}")
+    if loop.disturbance is not None and loop.disturbance.channels != plant.tanks:
+        raise InputError(
+            f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks:"
+            " give one inflow per tank"
+        )
+
+
+def _check_saturation(loop: ClosedLoop) -> None:
+    if loop.actuator.allocates and (loop.plant.pumps != 2 or not loop.controller.allocates):
+        raise InputError(
+            "actuator.saturation = 'boxqp': needs two pumps and a controller with a cost to"
+            " allocate by (its input_metric)"
+        )
+
+
+def _check_delay(actuator: Actuator, clock: Clock) -> None:
+    samples = actuator.delay / clock.dt
+    if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
+        raise InputError(
+            f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of"
+            f" {clock.dt:g} s, at most {clock.duration:g} s"
+        )
+
+
+def _check_noise(loop: ClosedLoop) -> None:
+    noise = loop.sensor.noise
+    if not _traced(noise) and np.any(np.asarray(noise) > 0):
+        raise InputError(
+            f"sensor.noise = {np.asarray(noise)} {loop.units[0]}: give a key (or --seed), or set it"
+            " to 0"
+        )
+
+
+def check_shapes(loop: ClosedLoop) -> None:
+    """Raise InputError for a leaf of `loop` that has not the shape its documentation begins with.
+
+    Leaves of a batch may have the axes in front that x0 has; sizes that a component knows alone
+    (changes, inflow pulses, knots) are its own to check.
+    """
+    _check_shapes(loop, "", {}, np.shape(loop.x0)[:-1])
+
+
+def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple[int, ...]) -> None:
+    """`check_shapes` of the component `tree`, for the `sizes` of the plant that it belongs to."""
+    plant = getattr(tree, "plant", tree)
+    if isinstance(plant, Plant):
+        sizes = _sizes(plant)
+    for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
-            _check(value, f"{name}.", sizes, batch)
+            _check_shapes(value, f"{name}.", sizes, batch)
         elif field.metadata.get("kind") == "leaf" and value is not None:
-            said = _SAID.match(field.metadata.get("doc") or "")
-            wanted = said and _shape(said.group(1), sizes)
-            if said and wanted is not None and np.shape(value) not in (wanted, batch + wanted):
-                raise InputError(
-                    f"{name} has shape {np.shape(value)}: must be {wanted}, ({said.group(1)})"
-                )
+            documented = _DOCUMENTED.match(field.metadata.get("doc") or "")
+            wanted = documented and _shape(documented.group(1), sizes)
+            if documented and wanted is not None:
+                _check_shape(name, np.shape(value), wanted, batch, documented.group(1))
 
 
-def _sizes(plant):
+def _check_shape(
+    name: str, shape: tuple[int, ...], wanted: tuple[int, ...], batch: tuple[int, ...], words: str
+) -> None:
+    if shape not in (wanted, batch + wanted):
+        raise InputError(f"{name} has shape {shape}: must be {wanted}, ({words})")
+
+
+def _sizes(plant: Plant) -> dict[str, int]:
+    """{word in the documentation of leaves: number} of a plant."""
     more = {name: len(getattr(plant, name, ())) for name in ("links", "pipes", "spills")}
     return {
         "n": plant.tanks,
@@ -61,93 +177,32 @@ def _sizes(plant):
     }
 
 
-def _shape(said, sizes):
+def _shape(words: str, sizes: Mapping[str, int]) -> tuple[int, ...] | None:
     """(4,) of "n,"; None where a size is not of the plant."""
-    found = []
-    for axis in filter(None, (a.strip() for a in said.split(","))):
-        terms = [sizes.get(t, int(t) if t.isdigit() else None) for t in axis.split(" + ")]
-        if None in terms:
-            return None
-        found.append(sum(terms))
+    found: list[int] = []
+    for axis in filter(None, (a.strip() for a in words.split(","))):
+        total = 0
+        for term in axis.split(" + "):
+            size = sizes.get(term, int(term) if term.isdigit() else None)
+            if size is None:
+                return None
+            total += size
+        found.append(total)
     return tuple(found)
 
 
-def check(
-    loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None = None
-) -> None:
-    """Raise InputError for a loop or clock that cannot be run: values out of range, wrong shapes, a
-    reference the law cannot serve.
-
-    Only concrete leaves are looked at, so that it costs nothing inside a trace.
+def _plants(tree: Any, prefix: str = "") -> Iterator[tuple[str, Plant]]:
+    """(dotted name, plant) of every plant below `tree`: that of the loop, and the models of
+    controller and observer.
     """
-    if not hasattr(loop, "plant"):
-        raise InputError(
-            f"loop is a {type(loop).__name__}: must be a ClosedLoop, as case.loop (first the loop,"
-            " then the clock)"
-        )
-    check_clock(clock)
-    check_key(key)
-    plant, actuator = loop.plant, loop.actuator
-    if np.shape(loop.x0)[-1:] != (plant.tanks,):
-        raise InputError(
-            f"x0 has shape {np.shape(loop.x0)}: must be ({plant.tanks},), one level per tank"
-        )
-    if loop.reference.channels != len(plant.outputs):
-        raise InputError(
-            f"the reference has {loop.reference.channels} channels for {len(plant.outputs)} outputs"
-        )
-    if actuator.pumps != plant.pumps:
-        raise InputError(f"the actuator has {actuator.pumps} pumps, the plant {plant.pumps}")
-    if loop.disturbance is not None and loop.disturbance.channels != plant.tanks:
-        raise InputError(
-            f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks:"
-            " give one inflow per tank"
-        )
-    if actuator.allocates and (plant.pumps != 2 or not loop.controller.allocates):
-        raise InputError(
-            "actuator.saturation = 'boxqp': needs two pumps and a law with a cost to allocate by"
-            " (its input_metric)"
-        )
-    samples = actuator.delay / clock.dt
-    if actuator.delay > clock.duration or abs(samples - round(samples)) > 1e-6 * max(1.0, samples):
-        raise InputError(
-            f"actuator.delay = {actuator.delay:g} s: must be a whole number of samples of"
-            f" {clock.dt:g} s, at most {clock.duration:g} s"
-        )
-    check_shapes(loop)
-    check_leaves(
-        loop, vacant=[f"controller.law.{gain}" for gain in getattr(loop.controller, "gains", ())]
-    )
-    for name, own in _plants(loop):
-        check_caught(own, name)
-    if not _traced(plant):
-        check_step(loop, clock)
-    actuator.check()
-    if not _traced(loop.controller, loop.reference):
-        loop.controller.check(loop.reference)
-        if not _traced(actuator):
-            loop.controller.check_pumps(actuator)
-    loop.observer.check(plant)
-    if key is None and not _traced(loop.sensor.noise) and np.any(np.asarray(loop.sensor.noise) > 0):
-        raise InputError(
-            f"sensor.noise = {np.asarray(loop.sensor.noise)} {plant.units[0]}: give a key (or"
-            " --seed), or set it to 0"
-        )
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{prefix}{field.name}"
+        if isinstance(value, Plant):
+            yield name, value
+        elif is_component(value):
+            yield from _plants(value, f"{name}.")
 
 
-def _plants(tree, prefix=""):
-    """(dotted name, plant) of every plant below `tree`: that of the loop, and the models of law and
-    observer.
-    """
-    for field in dataclasses.fields(cast(Any, tree)):
-        value = getattr(tree, field.name)
-        if is_component(value):
-            yield from (
-                [(f"{prefix}{field.name}", value)]
-                if isinstance(value, Plant)
-                else _plants(value, f"{prefix}{field.name}.")
-            )
-
-
-def _traced(*trees):
-    return any(isinstance(v, Tracer) for v in jax.tree.leaves(trees))
+def _traced(*trees: Any) -> bool:
+    leaves: list[Any] = jax.tree.leaves(trees)
+    return any(isinstance(v, Tracer) for v in leaves)

@@ -1,50 +1,48 @@
-"""Numbers that describe a run, accumulated in the time loop: memory does not grow with its length."""
+"""Numbers that describe a run, accumulated in the time loop: memory does not grow with its length.
 
-from jaxtank.measures.accumulators import Accumulator, Run
-from jaxtank.measures.catalogue import (
-    MEASURES,
-    SQUARES,
-    TIMES,
-    Measure,
+`catalogue` holds the measures, `accumulators` what the loop carries for them, `registry` what is
+known of them by name, `running` what the loop calls. May import `jaxtank.core` only.
+"""
+
+from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run
+from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.registry import (
     check_names,
     entries,
-    needs,
+    of_loop,
     placed,
-    read,
+    refers_to,
     register,
     reported,
-    residual_weights,
-    residuals,
     serves,
-    start,
+    squares,
+    times,
     unit,
-    update,
-    wants_pours,
-    wants_rests,
-    wants_windows,
 )
+from jaxtank.measures.running import needs, read, residual_weights, residuals, start, update
 
 __all__ = [
+    "ACCUMULATORS",
     "MEASURES",
-    "SQUARES",
-    "TIMES",
     "Accumulator",
+    "Context",
     "Measure",
     "Run",
     "check_names",
     "entries",
     "needs",
+    "of_loop",
     "placed",
     "read",
+    "refers_to",
     "register",
     "reported",
     "residual_weights",
     "residuals",
     "serves",
+    "squares",
     "start",
+    "times",
     "unit",
     "update",
-    "wants_pours",
-    "wants_rests",
-    "wants_windows",
 ]

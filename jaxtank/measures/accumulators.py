@@ -1,4 +1,7 @@
-"""What the time loop carries for each measure: running sums, extremes and times."""
+"""What the time loop carries for each measure: running sums, extremes and times.
+
+`measures.catalogue` names what it reads of them. May import `jaxtank.core` only.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -6,7 +9,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import nothing, plus
-from jaxtank.core.numerics import lower_clip, magnitude, root_of_mean
+from jaxtank.core.numerics import lower_clip, magnitude
+from jaxtank.core.records import Sample
 
 BAND = 0.05
 """Half width of the recovery band, as a share of the setpoint [-]."""
@@ -20,54 +24,95 @@ class Run(NamedTuple):
     pumps: int
     samples: int
     dt: float  # [s]
-    low: tuple  # lower limit of each pump [V]
-    high: tuple  # upper limit of each pump [V]
-    rim: tuple  # rim of each tank [cm]
+    low: tuple[Any, ...]  # lower limit of each pump [V]
+    high: tuple[Any, ...]  # upper limit of each pump [V]
+    rim: tuple[Any, ...]  # rim of each tank [cm]
     zero: Any  # 0.0 of the run's type
 
 
+class Context(NamedTuple):
+    """What an accumulator may refer to besides the sample; None where no measure of a run does."""
+
+    # of the last setpoint change of each output: (target [cm], step [cm], time since its end [s],
+    # half width of its band [cm]); step 0 before the first
+    window: Any = None
+    since: Any = None  # time since the last inflow pulse began [s], negative before the first
+    steady: Any = None  # (m) inputs that hold the setpoint [V]
+
+
 class Accumulator(NamedTuple):
-    """start(run) -> state; update(run, state, sample, window) -> state, at every sample; window: of
-    the setpoint's changes, or, for `recovery`, the time since the last pour.
+    """A running quantity: start(run) gives its state before the first sample, update(run, state,
+    sample, context) its state after each.
+
+    refers_to: the field of `Context` that it reads, "" for none; residual(run, state, sample,
+    context): of a sum of squares, the numbers whose squares it adds at this sample, which is what
+    the Gauss-Newton matrix is made of.
+
+    Examples
+    --------
+    The largest rate of change of the first input, which `jaxtank.measures.register` takes:
+
+    >>> import jax.numpy as jnp
+    >>> from jaxtank.measures import Accumulator
+    >>> def update(run, state, sample, context):
+    ...     before, largest = state
+    ...     rate = jnp.abs(sample.u[0] - before) / run.dt
+    ...     return sample.u[0], jnp.maximum(largest, rate)
+    >>> fastest = Accumulator(lambda run: (run.zero, run.zero), update)
     """
 
-    start: Callable
-    update: Callable
+    start: Callable[[Run], Any]
+    update: Callable[[Run, Any, Sample, Context], Any]
+    refers_to: str = ""
+    residual: Callable[[Run, Any, Sample, Context], tuple[Any, ...]] | None = None
 
 
-def _filled(run, count, value):
-    return (run.zero + value,) * count
-
-
-def _sums(run, count):
-    return (nothing(run.zero),) * count
+def _sums(run, size):
+    """Empty sums, one per output, tank or pump."""
+    return (nothing(run.zero),) * getattr(run, size)
 
 
 def _sum(size, term):
-    """Accumulator of sums over the run: `term(run, sample)` gives one number per output, tank or
-    pump.
+    """Accumulator of sums over the run: `term(run, sample)` gives one number for each of `size`,
+    "outputs", "tanks" or "pumps".
     """
 
-    def update(run, state, sample, window):
+    def update(run, state, sample, context):
         return tuple(plus(s, v) for s, v in zip(state, term(run, sample)))
 
-    return Accumulator(lambda run: _sums(run, size(run)), update)
+    return Accumulator(lambda run: _sums(run, size), update)
 
 
-def _extreme(size, pick, better, worst):
-    """Accumulator of (extreme, time it was reached), one pair per output, tank or pump; the first
-    sample wins a tie.
+def _sum_of_squares(size, term, refers_to=""):
+    """Accumulator of sums of the squares of the numbers that `term(run, sample, context)` gives."""
+
+    def update(run, state, sample, context):
+        return tuple(plus(s, v * v) for s, v in zip(state, term(run, sample, context)))
+
+    return Accumulator(
+        lambda run: _sums(run, size),
+        update,
+        refers_to,
+        lambda run, state, sample, context: tuple(term(run, sample, context)),
+    )
+
+
+def _extreme(size, pick, better, worst, refers_to=""):
+    """Accumulator of (extreme, time it was reached), one pair for each of `size`; the first sample
+    wins a tie.
     """
 
-    def update(run, state, sample, window):
+    def update(run, state, sample, context):
         new = []
-        for (value, time), v in zip(state, pick(run, sample, window)):
+        for (value, time), v in zip(state, pick(sample, context)):
             take = better(v, value)
             new.append((jnp.where(take, v, value), jnp.where(take, sample.t, time)))
         return tuple(new)
 
     return Accumulator(
-        lambda run: tuple((run.zero + worst, run.zero) for _ in range(size(run))), update
+        lambda run: tuple((run.zero + worst, run.zero) for _ in range(getattr(run, size))),
+        update,
+        refers_to,
     )
 
 
@@ -80,8 +125,8 @@ def _excess(run, command):
 
 
 def _saturation_excess(run, sample):
-    # x/(1+x) of x = excess / span: gouta2015 notes S10; bounded, so that one wild sample does not
-    # rule a cost
+    # x/(1+x) of x = excess / span: gouta2015 notes S10; bounded, so that one outlier does not
+    # dominate a cost
     span = tuple(high - low for low, high in zip(run.low, run.high))
     return tuple(x / (s + x) for x, s in zip(_excess(run, sample.command), span))
 
@@ -93,13 +138,13 @@ def _outside(run, sample):
     )
 
 
-def _overshoot(run, sample, window):
+def _overshoot(sample, context):
     """Level past the target in the direction of the step, as a share of the step [-]; -1 where
     there is no step yet.
     """
     return tuple(
         jnp.where(step == 0.0, -1.0, (r + e - target) / jnp.where(step == 0.0, 1.0, step))
-        for (target, step, _, _), r, e in zip(window, sample.r, sample.e)
+        for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
     )
 
 
@@ -107,13 +152,13 @@ def _start_settling(run):
     return tuple((run.zero, run.zero - 1e9, run.zero, run.zero - 1e9) for _ in range(run.outputs))
 
 
-def _update_settling(run, state, sample, window):
+def _update_settling(run, state, sample, context):
     """Per output (target now, time since its change ended at the last sample outside the band [s],
     1 if still outside, worst so far).
     """
     new = []
     for (old, last, outside, worst), (target, step, since, band), r, e in zip(
-        state, window, sample.r, sample.e
+        state, context.window, sample.r, sample.e
     ):
         worst = jnp.where(
             (target != old) & (settled(last, outside) > worst), settled(last, outside), worst
@@ -133,11 +178,11 @@ def _start_rise(run):
     return tuple((run.zero, run.zero - 1.0, run.zero - 1.0, run.zero) for _ in range(run.outputs))
 
 
-def _update_rise(run, state, sample, window):
-    """Per output (target now, time of the first 10 %, time of the first 90 %, longest rise so far)."""
+def _update_rise(run, state, sample, context):
+    """Per output (target now, time of the first 10 %, that of the first 90 %, longest rise)."""
     new = []
     for (old, t10, t90, longest), (target, step, _, _), r, e in zip(
-        state, window, sample.r, sample.e
+        state, context.window, sample.r, sample.e
     ):
         fresh = target != old
         t10, t90 = jnp.where(fresh, -1.0, t10), jnp.where(fresh, -1.0, t90)
@@ -152,11 +197,11 @@ def _update_rise(run, state, sample, window):
     return tuple(new)
 
 
-def _update_recovery(run, state, sample, since):
-    """Per output (time since the pour at the last sample outside the band [s], 1 if that was the
-    last one watched, worst so far).
+def _update_recovery(run, state, sample, context):
+    """Per output (time since the inflow pulse at the last sample outside the band [s], 1 if that
+    was the last one watched, worst so far).
     """
-    new = []
+    new, since = [], context.since
     for (last, outside, worst), r, e in zip(state, sample.r, sample.e):
         fresh = since < last
         done = settled(last, outside)
@@ -167,17 +212,12 @@ def _update_recovery(run, state, sample, since):
     return tuple(new)
 
 
-def recovery(run, acc):
-    return as_list(
-        [jnp.maximum(worst, settled(last, outside)) for last, outside, worst in acc["recovery"]]
-    )
+def _deviation(run, sample, context):
+    """Distance of each input from the one that holds the setpoint [V]."""
+    return tuple(u - held for u, held in zip(sample.u, context.steady))
 
 
-def _deviation(run, sample, rest):
-    return tuple(u - held for u, held in zip(sample.u, rest))
-
-
-def _past(sample, window):
+def _past(run, sample, context):
     """Level past the target in the direction of the step [cm], one per output; 0 before the first
     step.
     """
@@ -185,21 +225,17 @@ def _past(sample, window):
         lower_clip(
             jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0
         )
-        for (target, step, _, _), r, e in zip(window, sample.r, sample.e)
+        for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
     )
 
 
-def _update_past(run, state, sample, window):
-    return tuple(plus(s, v * v) for s, v in zip(state, _past(sample, window)))
-
-
-def _update_deviation(run, state, sample, rest):
-    return tuple(plus(s, d * d) for s, d in zip(state, _deviation(run, sample, rest)))
-
-
-def _over_rim(run, sample):
+def _over_rim(run, sample, context):
     """Rise past the rim [cm], one per tank."""
     return tuple(lower_clip(x - h, 0.0) for x, h in zip(sample.x, run.rim))
+
+
+def _estimation_error(run, sample):
+    return tuple((a - b) * (a - b) for a, b in zip(sample.x_hat, sample.x))
 
 
 def _changes(state, sample):
@@ -208,7 +244,7 @@ def _changes(state, sample):
     return tuple(jnp.where(first, 0.0, v - p) for v, p in zip(sample.u, previous))
 
 
-def _update_changes(run, state, sample, window):
+def _update_changes(run, state, sample, context):
     return (
         sample.u,
         tuple(plus(s, d * d) for s, d in zip(state[1], _changes(state, sample))),
@@ -217,10 +253,10 @@ def _update_changes(run, state, sample, window):
 
 
 def _start_travel(run):
-    return _filled(run, run.pumps, 0.0), _sums(run, run.pumps), run.zero == 0.0
+    return (run.zero + 0.0,) * run.pumps, _sums(run, "pumps"), run.zero == 0.0
 
 
-def _update_travel(run, state, sample, window):
+def _update_travel(run, state, sample, context):
     previous, total, first = state
     step = tuple(magnitude(v - p) for v, p in zip(sample.u, previous))
     return (
@@ -230,64 +266,34 @@ def _update_travel(run, state, sample, window):
     )
 
 
-ACCUMULATORS = {
-    "e2": _sum(lambda run: run.outputs, lambda run, s: tuple(e * e for e in s.e)),
-    "abs_e": _sum(lambda run: run.outputs, lambda run, s: tuple(magnitude(e) for e in s.e)),
-    "u2": _sum(lambda run: run.pumps, lambda run, s: tuple(u * u for u in s.u)),
-    "estimate2": _sum(
-        lambda run: run.tanks, lambda run, s: tuple((a - b) * (a - b) for a, b in zip(s.x_hat, s.x))
-    ),
-    "outside": _sum(lambda run: run.pumps, _outside),
-    "saturation_excess": _sum(lambda run: run.pumps, _saturation_excess),
-    "over_rim2": _sum(
-        lambda run: run.tanks, lambda run, s: tuple(v * v for v in _over_rim(run, s))
-    ),
-    "spilled": _sum(lambda run: run.tanks, lambda run, s: s.spilled),
-    "shortfall": _sum(lambda run: run.tanks, lambda run, s: s.shortfall),
-    "max_level": _extreme(
-        lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a > b, -jnp.inf
-    ),
-    "min_level": _extreme(
-        lambda run: run.tanks, lambda run, s, w: s.x, lambda a, b: a < b, jnp.inf
-    ),
+ACCUMULATORS: dict[str, Accumulator] = {
+    "e2": _sum_of_squares("outputs", lambda run, s, context: s.e),
+    "abs_e": _sum("outputs", lambda run, s: tuple(magnitude(e) for e in s.e)),
+    "u2": _sum("pumps", lambda run, s: tuple(u * u for u in s.u)),
+    "estimate2": _sum("tanks", _estimation_error),
+    "outside": _sum("pumps", _outside),
+    "saturation_excess": _sum("pumps", _saturation_excess),
+    "over_rim2": _sum_of_squares("tanks", _over_rim),
+    "spilled": _sum("tanks", lambda run, s: s.spilled),
+    "shortfall": _sum("tanks", lambda run, s: s.shortfall),
+    "max_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a > b, -jnp.inf),
+    "min_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a < b, jnp.inf),
     "max_error": _extreme(
-        lambda run: run.outputs,
-        lambda run, s, w: tuple(magnitude(e) for e in s.e),
-        lambda a, b: a > b,
-        -jnp.inf,
+        "outputs", lambda s, context: tuple(magnitude(e) for e in s.e), lambda a, b: a > b, -jnp.inf
     ),
-    "overshoot": _extreme(lambda run: run.outputs, _overshoot, lambda a, b: a > b, -1.0),
-    "settling": Accumulator(_start_settling, _update_settling),
-    "rise": Accumulator(_start_rise, _update_rise),
+    "overshoot": _extreme("outputs", _overshoot, lambda a, b: a > b, -1.0, "window"),
+    "settling": Accumulator(_start_settling, _update_settling, "window"),
+    "rise": Accumulator(_start_rise, _update_rise, "window"),
     "recovery": Accumulator(
-        lambda run: tuple((run.zero, run.zero, run.zero) for _ in range(run.outputs)),
-        _update_recovery,
+        lambda run: ((run.zero, run.zero, run.zero),) * run.outputs, _update_recovery, "since"
     ),
-    "past2": Accumulator(lambda run: _sums(run, run.outputs), _update_past),
-    "deviation2": Accumulator(lambda run: _sums(run, run.pumps), _update_deviation),
+    "past2": _sum_of_squares("outputs", _past, "window"),
+    "deviation2": _sum_of_squares("pumps", _deviation, "steady"),
     "travel": Accumulator(_start_travel, _update_travel),
-    "changes2": Accumulator(_start_travel, _update_changes),
+    "changes2": Accumulator(
+        _start_travel,
+        _update_changes,
+        residual=lambda run, state, sample, context: _changes(state, sample),
+    ),
 }
-
-RESIDUALS = {
-    "e2": lambda run, state, sample, window, rest: sample.e,
-    "past2": lambda run, state, sample, window, rest: _past(sample, window),
-    "deviation2": lambda run, state, sample, window, rest: _deviation(run, sample, rest),
-    "changes2": lambda run, state, sample, window, rest: _changes(state, sample),
-    "over_rim2": lambda run, state, sample, window, rest: _over_rim(run, sample),
-}
-"""{accumulator: (run, its state, sample, window, rest) -> the numbers whose squares it sums at this
-sample}: what Gauss-Newton works on.
-"""
-
-
-def mean(run, values):
-    return tuple(v / run.samples for v in values)
-
-
-def as_list(values):
-    return jnp.stack([jnp.asarray(v) for v in values])
-
-
-def root_mean(name):
-    return lambda run, acc: root_of_mean(as_list(mean(run, acc[name])))
+"""{name: Accumulator}; `jaxtank.measures.register` adds those of a user's own."""

@@ -1,9 +1,7 @@
-"""What is said of a run in numbers, folded into the time loop: memory does not grow with the number
-of samples.
+"""The measures: numbers that describe a run, each with all that is known of it.
 
-A measure reads accumulators at the end of a run. An accumulator starts from a state, is updated at
-every sample, and holds tuples of scalars. Only the accumulators that the requested measures need
-are carried.
+A measure reads accumulators at the end of a run. May import `jaxtank.core` and
+`measures.accumulators` only.
 """
 
 from collections.abc import Callable
@@ -11,34 +9,31 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.kahan import totals
 from jaxtank.core.numerics import lower_clip, root_of_mean
-from jaxtank.core.units import DEFAULT, local
-from jaxtank.measures.accumulators import (
-    ACCUMULATORS,
-    RESIDUALS,
-    as_list,
-    mean,
-    recovery,
-    root_mean,
-    settled,
-)
+from jaxtank.measures.accumulators import Run, settled
+
+NO_CHANGES = "the reference has no changes that end"
 
 
 class Measure(NamedTuple):
-    """A named number or list: read(run, {accumulator: state}) -> scalar or array."""
+    """A named number or list, and all that reports, limits and searches need to know of it.
 
-    unit: str  # with "cm" standing for the rig's length unit
+    `jaxtank.measures.register` adds one of a user's own.
+
+    Examples
+    --------
+    >>> from jaxtank.measures import MEASURES
+    >>> MEASURES["max_level"].unit, MEASURES["max_level"].per, MEASURES["min_level"].sense
+    ('cm', 'tank', -1.0)
+    """
+
+    unit: str  # with "cm" standing for the rig's length unit and "V" for that of its inputs
     per: str  # "run", "output", "tank" or "pump"
-    needs: tuple  # names of accumulators
-    read: Callable
+    needs: tuple[str, ...]  # names of accumulators
+    read: Callable[[Run, dict[str, Any]], Any]  # (run, {accumulator: state}) -> scalar or array
     doc: str
-    windows: bool = False  # needs Ramps.windows: the target and step each sample refers to
-    pours: bool = False  # needs Pours.since: the time since the last pour
-    rests: bool = False  # needs the inputs that hold the setpoint of each sample
-    residual: str = ""  # the residual of RESIDUALS whose squares it sums, if it is such a sum
-    scale: Callable | None = None  # run -> factor of that sum
+    residual: str = ""  # the accumulator of squares that it is a multiple of, if it is one
+    scale: Callable[[Run], Any] | None = None  # run -> factor of that sum
     low: float | None = 0.0  # least and largest value that it can have, None where there is none
     high: float | None = None
     sense: float = 1.0  # +1 where a larger value is worse (limits are upper ones), -1 a smaller
@@ -52,36 +47,78 @@ class Measure(NamedTuple):
     nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
 
 
+def _stacked(values):
+    return jnp.stack([jnp.asarray(v) for v in values])
+
+
+def _means(run, values):
+    return tuple(v / run.samples for v in values)
+
+
+def _root_mean(name):
+    return lambda run, acc: root_of_mean(_stacked(_means(run, acc[name])))
+
+
+def _mean(run):
+    """Factor that makes a mean over the samples of a sum."""
+    return 1.0 / run.samples
+
+
+def _integral(run):
+    """Factor that makes an integral over time of a sum."""
+    return run.dt
+
+
+def _scaled(name, scale):
+    return lambda run, acc: _stacked([s * scale(run) for s in acc[name]])
+
+
+def _sum_of_squares(unit, per, name, scale, doc, read=None):
+    """Measure of the accumulator of squares `name`, times scale(run)."""
+    return Measure(
+        unit,
+        per,
+        (name,),
+        read or _scaled(name, scale),
+        doc,
+        residual=name,
+        scale=scale,
+        by_input=True,
+    )
+
+
 def _extremes(name, index=0):
-    return lambda run, acc: as_list([pair[index] for pair in acc[name]])
-
-
-def _per_run(name, scale):
-    return lambda run, acc: as_list([s * scale(run) for s in acc[name]])
+    return lambda run, acc: _stacked([pair[index] for pair in acc[name]])
 
 
 def _settling(run, acc):
-    worst = as_list(
+    worst = _stacked(
         [jnp.maximum(worst, settled(last, outside)) for _, last, outside, worst in acc["settling"]]
     )
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
 def _rise(run, acc):
-    longest = as_list([state[3] for state in acc["rise"]])
+    longest = _stacked([state[3] for state in acc["rise"]])
     return jnp.where(longest > 0, longest, jnp.nan)
+
+
+def _recovery(run, acc):
+    return _stacked(
+        [jnp.maximum(worst, settled(last, outside)) for last, outside, worst in acc["recovery"]]
+    )
 
 
 def _overshoot_percent(run, acc):
     return 100.0 * lower_clip(_extremes("overshoot")(run, acc), 0.0)
 
 
-MEASURES = {
+MEASURES: dict[str, Measure] = {
     "rms_error": Measure(
         "cm",
         "output",
         ("e2",),
-        root_mean("e2"),
+        _root_mean("e2"),
         "root mean square tracking error",
         by_input=True,
         shown=10,
@@ -91,37 +128,21 @@ MEASURES = {
         "cm",
         "run",
         ("e2",),
-        lambda run, acc: root_of_mean(sum(mean(run, acc["e2"]))),
+        lambda run, acc: root_of_mean(sum(_means(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
         by_input=True,
         shown=20,
         summary=20,
     ),
-    "mean_square_error": Measure(
-        "cm^2",
-        "output",
-        ("e2",),
-        _per_run("e2", lambda run: 1.0 / run.samples),
-        "mean square tracking error",
-        residual="e2",
-        scale=lambda run: 1.0 / run.samples,
-        by_input=True,
+    "mean_square_error": _sum_of_squares(
+        "cm^2", "output", "e2", _mean, "mean square tracking error"
     ),
-    "ise": Measure(
-        "cm^2 s",
-        "output",
-        ("e2",),
-        _per_run("e2", lambda run: run.dt),
-        "integral of the squared error",
-        residual="e2",
-        scale=lambda run: run.dt,
-        by_input=True,
-    ),
+    "ise": _sum_of_squares("cm^2 s", "output", "e2", _integral, "integral of the squared error"),
     "iae": Measure(
         "cm s",
         "output",
         ("abs_e",),
-        _per_run("abs_e", lambda run: run.dt),
+        _scaled("abs_e", _integral),
         "integral of the absolute error",
         by_input=True,
     ),
@@ -134,22 +155,18 @@ MEASURES = {
         shown=30,
         summary=30,
     ),
-    "mean_square_overshoot": Measure(
+    "mean_square_overshoot": _sum_of_squares(
         "cm^2",
         "output",
-        ("past2",),
-        _per_run("past2", lambda run: 1.0 / run.samples),
+        "past2",
+        _mean,
         "mean square of the level past the target of a change, in its direction",
-        windows=True,
-        residual="past2",
-        scale=lambda run: 1.0 / run.samples,
-        by_input=True,
     ),
     "rms_input": Measure(
         "V",
         "pump",
         ("u2",),
-        root_mean("u2"),
+        _root_mean("u2"),
         "root mean square input",
         by_input=True,
         shown=80,
@@ -159,38 +176,32 @@ MEASURES = {
         "V",
         "pump",
         ("travel",),
-        lambda run, acc: as_list(acc["travel"][1]),
+        lambda run, acc: _stacked(acc["travel"][1]),
         "sum of the absolute changes of the input",
         by_input=True,
         shown=90,
         summary=100,
     ),
-    "mean_square_travel": Measure(
+    "mean_square_travel": _sum_of_squares(
         "V^2",
         "pump",
-        ("changes2",),
-        lambda run, acc: as_list(acc["changes2"][1]) / run.samples,
+        "changes2",
+        _mean,
         "mean of the squared changes of the input from sample to sample",
-        residual="changes2",
-        scale=lambda run: 1.0 / run.samples,
-        by_input=True,
+        read=lambda run, acc: _stacked(acc["changes2"][1]) / run.samples,
     ),
-    "input_deviation": Measure(
+    "input_deviation": _sum_of_squares(
         "V^2 s",
         "pump",
-        ("deviation2",),
-        _per_run("deviation2", lambda run: run.dt),
+        "deviation2",
+        _integral,
         "integral of the squared distance of the input from the one that holds the setpoint",
-        rests=True,
-        residual="deviation2",
-        scale=lambda run: run.dt,
-        by_input=True,
     ),
     "saturated_fraction": Measure(
         "-",
         "pump",
         ("outside",),
-        _per_run("outside", lambda run: 1.0 / run.samples),
+        _scaled("outside", _mean),
         "share of samples commanded outside the limits",
         high=1.0,
         counts=True,
@@ -231,25 +242,18 @@ MEASURES = {
         "cm",
         "run",
         ("over_rim2",),
-        lambda run, acc: root_of_mean(sum(mean(run, acc["over_rim2"]))),
+        lambda run, acc: root_of_mean(sum(_means(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
         by_input=True,
     ),
-    "mean_square_over_rim": Measure(
-        "cm^2",
-        "tank",
-        ("over_rim2",),
-        _per_run("over_rim2", lambda run: 1.0 / run.samples),
-        "mean square of the rise past the rim",
-        residual="over_rim2",
-        scale=lambda run: 1.0 / run.samples,
-        by_input=True,
+    "mean_square_over_rim": _sum_of_squares(
+        "cm^2", "tank", "over_rim2", _mean, "mean square of the rise past the rim"
     ),
     "overflow_volume": Measure(
         "cm^3",
         "tank",
         ("spilled",),
-        lambda run, acc: as_list(acc["spilled"]),
+        lambda run, acc: _stacked(acc["spilled"]),
         "volume lost over the rim",
         by_input=True,
         summary=80,
@@ -258,7 +262,7 @@ MEASURES = {
         "cm^3",
         "tank",
         ("shortfall",),
-        lambda run, acc: as_list(acc["shortfall"]),
+        lambda run, acc: _stacked(acc["shortfall"]),
         "volume that a negative inflow could not take from an empty tank",
         by_input=True,
     ),
@@ -268,11 +272,10 @@ MEASURES = {
         ("overshoot",),
         _overshoot_percent,
         "worst overshoot of a change, in percent of it",
-        windows=True,
         shown=60,
         summary=40,
         undefined="the reference does not change",
-        unserved="the reference has no changes that end",
+        unserved=NO_CHANGES,
     ),
     "rise_time": Measure(
         "s",
@@ -280,10 +283,9 @@ MEASURES = {
         ("rise",),
         _rise,
         "longest time from 10 % to 90 % of a change, of those followed so far",
-        windows=True,
         counts=True,
         undefined="no change of the setpoint was followed to 90 % of its height",
-        unserved="the reference has no changes that end",
+        unserved=NO_CHANGES,
     ),
     "settling_time": Measure(
         "s",
@@ -292,23 +294,21 @@ MEASURES = {
         _settling,
         "longest time from the end of a change to its last sample outside its band (+-5 % of it); "
         "negative: inside before the change ended; none: never settled",
-        windows=True,
         low=None,
         counts=True,
         shown=70,
         summary=50,
         undefined="the output was outside its band as the setpoint changed again or the run ended",
-        unserved="the reference has no changes that end",
+        unserved=NO_CHANGES,
         nan_holds="no change of its setpoint took the output out of its band",
     ),
     "recovery_time": Measure(
         "s",
         "output",
         ("recovery",),
-        recovery,
-        "longest time from the start of a pour to the last sample outside +-5 % of the setpoint;"
-        " none: never recovered",
-        pours=True,
+        _recovery,
+        "longest time from the start of an inflow pulse to the last sample outside +-5 % of the"
+        " setpoint; none: never recovered",
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",
@@ -317,7 +317,7 @@ MEASURES = {
         "cm",
         "tank",
         ("estimate2",),
-        root_mean("estimate2"),
+        _root_mean("estimate2"),
         "root mean square error of the level estimate",
     ),
     "time_of_max_level": Measure(
@@ -337,141 +337,4 @@ MEASURES = {
         counts=True,
     ),
 }
-
-TIMES = {m: spec.reached for m, spec in MEASURES.items() if spec.reached}
-"""Measures that say when another one was reached: not reported by themselves."""
-
-SQUARES = tuple(m for m, spec in MEASURES.items() if spec.residual)
-"""Measures that are sums of squares over the run."""
-
-
-def register(name, measure, accumulators=None):
-    """Add a measure of one's own, known by `name` wherever measures are named from then on.
-
-    Parameters
-    ----------
-    name : a name that no other measure has
-    measure : Measure
-    accumulators : {name: Accumulator}, what it needs besides ACCUMULATORS
-
-    Raises
-    ------
-    InputError
-        For a name that another measure or accumulator has.
-    """
-    for known, added in ((MEASURES, {name: measure}), (ACCUMULATORS, accumulators or {})):
-        for key, value in added.items():
-            if known.get(key, value) is not value:
-                raise InputError(f"{key!r} is taken: choose another name")
-        known.update(added)
-    return measure
-
-
-def check_names(names):
-    """Raise InputError for a name that is no measure."""
-    for name in names:
-        if name not in MEASURES:
-            raise unknown("measure", name, MEASURES)
-
-
-def reported():
-    """Return the names of the measures in a result: all but the times of others."""
-    return tuple(m for m in MEASURES if m not in TIMES.values())
-
-
-def placed(field):
-    """Return the names of the measures with a place in `field`, "shown" or "summary", in order."""
-    found = {m: getattr(spec, field) for m, spec in MEASURES.items()}
-    return tuple(sorted((m for m in found if found[m]), key=lambda m: found[m]))
-
-
-def unit(name, units=DEFAULT):
-    """Unit of measure `name` on a rig with these (length, pump input) units."""
-    return local(MEASURES[name].unit, units)
-
-
-def entries(name, plant):
-    """Number of entries of measure `name` for a plant: 1, or one per output, tank or pump."""
-    return {"run": 1, "output": len(plant.outputs), "tank": plant.tanks, "pump": plant.pumps}[
-        MEASURES[name].per
-    ]
-
-
-def needs(names):
-    """The accumulators that `names` need, in a fixed order."""
-    wanted = {a for name in names for a in MEASURES[name].needs}
-    return tuple(a for a in ACCUMULATORS if a in wanted)
-
-
-def wants_windows(names):
-    """True if a measure in `names` refers to the reference's changes."""
-    return any(MEASURES[name].windows for name in names)
-
-
-def wants_pours(names):
-    """True if a measure in `names` refers to pours."""
-    return any(MEASURES[name].pours for name in names)
-
-
-def wants_rests(names):
-    """True if a measure in `names` refers to the inputs that hold the setpoint."""
-    return any(MEASURES[name].rests for name in names)
-
-
-def serves(name, loop):
-    """True if the measure `name` means something for this loop: its reference changes, its tanks
-    are poured into, its steady inputs are known in closed form, its levels have a lower clip.
-    """
-    spec = MEASURES[name]
-    if spec.rests and (
-        getattr(loop.plant, "pipes", None) != () or loop.plant.pumps != len(loop.plant.outputs)
-    ):
-        return False
-    if "shortfall" in spec.needs and not loop.plant.bottom:
-        return False
-    onset = None if loop.disturbance is None else loop.disturbance.onset
-    return (not spec.windows or loop.reference.changes is not None) and (
-        not spec.pours or onset is not None
-    )
-
-
-def start(run, names):
-    """{accumulator: state} before the first sample."""
-    return {a: ACCUMULATORS[a].start(run) for a in needs(names)}
-
-
-def update(run, states, sample, window, since=None, rest=None):
-    """{accumulator: state} after `sample`."""
-    known = {"recovery": since, "deviation2": rest}
-    return {
-        a: ACCUMULATORS[a].update(run, state, sample, known.get(a, window))
-        for a, state in states.items()
-    }
-
-
-def residuals(run, states, sample, window, rest, squares):
-    """The residuals of one sample, a flat tuple. squares: ((measure, weight), ...), each a sum of
-    squares (`Measure.residual`).
-    """
-    return tuple(
-        v
-        for m, _ in squares
-        for a in [MEASURES[m].residual]
-        for v in RESIDUALS[a](run, states[a], sample, window, rest)
-    )
-
-
-def _scale(measure) -> Any:
-    return MEASURES[measure].scale  # of a measure that is a sum of squares: never None
-
-
-def residual_weights(run, squares):
-    """What the square of each of `residuals` counts in the weighted sum of the measures."""
-    counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
-    return tuple(w * _scale(m)(run) for m, w in squares for _ in range(counts[MEASURES[m].per]))
-
-
-def read(run, states, names):
-    """{measure: value} at the end of a run."""
-    states = totals(states)
-    return {name: MEASURES[name].read(run, states) for name in names}
+"""{name: Measure}; `register` adds those of a user's own."""

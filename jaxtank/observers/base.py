@@ -14,15 +14,17 @@ class Observer(abc.ABC):
     applied. State is handed in and out.
     """
 
-    def init(self, x0: tuple) -> Any:
+    def init(self, x0: tuple[Any, ...]) -> Any:
         """State before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()
 
     @abc.abstractmethod
-    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
+    def step(self, state: Any, tick: Tick, y: Sequence[Any]) -> tuple[Estimate, Any]:
         """(Estimate, new state) for measured levels y (n) [cm] at `tick`."""
 
-    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+    def predict(
+        self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]
+    ) -> Any:
         """State at the next sample, for the law's command (m) and what the pumps were told after
         their limits, `applied` (m) [V].
 
@@ -38,5 +40,5 @@ class Observer(abc.ABC):
 class Direct(Observer):
     """All levels are measured and taken as they are: x_hat = y (gouta2015, Fig. 3 and 4)."""
 
-    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
+    def step(self, state: Any, tick: Tick, y: Sequence[Any]) -> tuple[Estimate, Any]:
         return Estimate(x=y), state

@@ -100,6 +100,6 @@ class Plant(abc.ABC):
         """
         return x, (0.0,) * len(x)
 
-    def output(self, x: Sequence) -> tuple:
+    def output(self, x: Sequence[Any]) -> tuple[Any, ...]:
         """Return the levels that are controlled: those of the tanks in `outputs`, in that order."""
         return tuple(x[i] for i in self.outputs)

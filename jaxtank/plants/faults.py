@@ -36,12 +36,12 @@ class Faults:
         "-", "(faults,) what each entry is multiplied by while its fault lasts", low=0.0
     )
     extra: np.ndarray = leaf("-", "(faults,) what is added to it, in its own unit")
-    windows: tuple = static(
+    windows: tuple[Any, ...] = static(
         doc='(("drain[1]", start [s], end [s]), ...) entry of the plant and when, one per fault'
     )
 
     @pointwise
-    def sample(self, clock: Clock) -> tuple:
+    def sample(self, clock: Clock) -> tuple[Any, ...]:
         """Return an array (samples,) per fault: 1 from its start until before its end, else 0."""
         t = sample_times(clock)
         half = 1e-7 * clock.dt

@@ -3,25 +3,40 @@
 Imports core and xla only.
 """
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import added
+from jaxtank.plants.base import Plant
 from jaxtank.xla.barrier import materialised
 
 
 class Advanced(NamedTuple):
     """Levels after a sample, and the volumes that overflowed or were missing; (n,) each."""
 
-    x: tuple  # levels [cm]
-    excess: tuple  # what rounding has added to each level too much [cm]; () where not compensated
-    spilled: tuple  # overflow over each rim [cm^3]
-    shortfall: tuple  # volume that a negative inflow could not take [cm^3]
+    x: Sequence[Any]  # levels [cm]
+    # what rounding has added to each level too much [cm]; () where not compensated
+    excess: tuple[Any, ...]
+    spilled: tuple[Any, ...]  # overflow over each rim [cm^3]
+    shortfall: tuple[Any, ...]  # volume that a negative inflow could not take [cm^3]
 
 
-def advance(plant, integrator, t, x, u, d, dt, substeps, *, excess=(), rolled=False):
+def advance(
+    plant: Plant,
+    integrator: str,
+    t: Any,
+    x: Sequence[Any],
+    u: Sequence[Any],
+    d: Sequence[Any] | None,
+    dt: Any,
+    substeps: Any,
+    *,
+    excess: tuple[Any, ...] = (),
+    rolled: bool = False,
+) -> Advanced:
     """Return the plant's levels a sample later, with overflow after each of its substeps.
 
     Parameters

@@ -226,7 +226,7 @@ class TankNetwork(Plant):
             self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks)
         )
 
-    def shortfall(self, x: Sequence) -> tuple:
+    def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
         if not self.bottom:
             return super().shortfall(x)
         return tuple(self.area[i] * (lower_clip(h, 0.0) - h) for i, h in enumerate(x))

@@ -66,11 +66,12 @@ SHOWN = 16
 
 def _example() -> Any:
     """A run of one tank and one pump, for the examples."""
-    from jaxtank.core.records import Trajectory
+    from jaxtank.loop.trajectory import COLUMNS, Trajectory
 
     t = np.linspace(0.0, 10.0, 11)
     column = (t / 10.0)[:, None]
-    return Trajectory(*([t] + [column] * (len(Trajectory._fields) - 1)))
+    arrays: dict[str, Any] = dict.fromkeys(COLUMNS, column) | {"t": t}
+    return Trajectory(**arrays)
 
 
 def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):

@@ -14,7 +14,7 @@ import importlib
 import pkgutil
 from typing import cast
 
-from jaxtank.case import Case, Free, Mirror, Scenario
+from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.presets.paper import Claim, Preset, Published
 
@@ -162,10 +162,10 @@ __all__ = [
     "Claim",
     "Free",
     "InputError",
-    "Mirror",
     "Preset",
     "Published",
     "Scenario",
+    "Symmetry",
     "find",
     "load",
     "names",

@@ -8,7 +8,7 @@ import functools
 
 import numpy as np
 
-from jaxtank.case import Case, Free, Mirror, Scenario
+from jaxtank.case import Case, Free, Scenario, Symmetry
 from jaxtank.controllers import OpenLoop
 from jaxtank.controllers.two_tank_backstepping import TwoTankBackstepping
 from jaxtank.core.clock import Clock
@@ -258,7 +258,7 @@ def preset():
                 "mean_square_travel": 1e5,
             },
             scenarios=(Scenario("noise", {"sensor.noise": "0.001 if zero"}, seed=1),),
-            mirror=Mirror(
+            symmetry=Symmetry(
                 "K_phi and K_y exchange roles",
                 lambda v: {KS[0]: v[KS[1]], KS[1]: v[KS[0]]} if set(KS) <= set(v) else {},
             ),

@@ -11,9 +11,9 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.clock import Clock
 from jaxtank.presets.loops.gouta2022 import (
     CONTROLLERS,
-    MIRROR,
     PAPER_LIKE,
     PRINTED_GAIN,
+    SYMMETRY,
     TUNABLE,
     build,
 )
@@ -313,7 +313,7 @@ def preset():
                 # gains (notes S10): 0.1 V from sample to sample counts as 0.02 cm
                 objective={"mean_square_error": 1.0, "mean_square_travel": 0.04},
                 scenarios=(Scenario("noise", {"sensor.noise": "0.02 if zero"}, seed=1),),
-                mirror=MIRROR if "chadpc" in name else None,
+                symmetry=SYMMETRY if "chadpc" in name else None,
                 reachable=not name.endswith("-trapezoid"),
             )
             for name, (title, free) in CONTROLLERS.items()

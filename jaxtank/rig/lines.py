@@ -94,6 +94,10 @@ def toml(value: Any) -> str:
     ----------
     value : number, text, truth value, array, list, tuple or dict of such
 
+    Returns
+    -------
+    Text of one line.
+
     Examples
     --------
     >>> toml([0.1, True, "a b"])

@@ -69,6 +69,10 @@ def open_case(name: str) -> Case:
     ----------
     name : "paper/case" as `jaxtank list` prints it, or a path
 
+    Returns
+    -------
+    Case, checked.
+
     Raises
     ------
     InputError for a case that does not exist, and as `load`.
@@ -88,6 +92,10 @@ def load(path: str | Path) -> Case:
     Parameters
     ----------
     path : of a TOML file, UTF-8, of at most 4 MiB
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------
@@ -113,6 +121,10 @@ def loads(text: str, words: str = "rig file") -> Case:
     ----------
     text : TOML
     words : what errors call it
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------
@@ -159,6 +171,10 @@ def from_table(table: Mapping[str, Any]) -> Case:
     Parameters
     ----------
     table : {key or section: value, table, or list of tables}
+
+    Returns
+    -------
+    Case, checked.
 
     Raises
     ------
@@ -290,7 +306,7 @@ def _with_parts(case, table):
         start = [float(levels[i]) for i in loop.plant.outputs]
         changed["controller"] = components.controller_of(table["law"], loop.plant, start, initial)
         if type(changed["controller"]) is not type(loop.controller):
-            case = case.replace(mirror=None)
+            case = case.replace(symmetry=None)
     if "observer" in table:
         changed["observer"] = components.observer_of(table["observer"], loop.plant, levels, initial)
     if not changed:

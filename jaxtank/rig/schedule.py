@@ -39,6 +39,10 @@ def schedule(case, gains, knots):
         variable, a setpoint ("r1") or a level estimate ("h2"), counted from 1, is one for all
     knots : (K,) increasing positions of the variable, in the rig's unit of length
 
+    Returns
+    -------
+    Case.
+
     Raises
     ------
     InputError for an unknown gain (with the nearest), a static one, one that the controller uses

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
-from jaxtank.measures.catalogue import MEASURES, TIMES
-from jaxtank.measures.catalogue import unit as measure_unit
-from jaxtank.plants.network import TankNetwork
+from jaxtank.measures import MEASURES, of_loop
+from jaxtank.measures import unit as measure_unit
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components
 from jaxtank.rig import schedule as scheduling
 from jaxtank.rig.lines import Block, Line, suggestion, toml
@@ -61,16 +61,10 @@ def of_uncertain(case, name):
 
 def _measures(case, but):
     """Suggested lines of the measures that a run of the case has, without those in `but`."""
-    disturbance = case.loop.disturbance
-    disturbed = disturbance is not None and disturbance.onset is not None
-    stepped = case.loop.reference.changes is not None
     return [
         Line(name, WEIGHT.default, of_measure(case, name), False)
-        for name, spec in MEASURES.items()
+        for name in of_loop(case.loop)
         if name not in but
-        and name not in TIMES.values()
-        and (disturbed or not spec.pours)
-        and (stepped or not spec.windows)
     ]
 
 

@@ -18,8 +18,8 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.measures.catalogue import check_names, entries
-from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.measures import check_names, entries
+from jaxtank.measures import unit as measure_unit
 from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
 from jaxtank.rig.schema import SECTIONS
@@ -34,6 +34,10 @@ def check(case: Case) -> Case:
     Parameters
     ----------
     case : Case
+
+    Returns
+    -------
+    The case itself.
 
     Raises
     ------
@@ -60,6 +64,10 @@ def unreachable(case: Case) -> str | None:
     Parameters
     ----------
     case : Case
+
+    Returns
+    -------
+    A sentence, or None.
 
     Examples
     --------

@@ -62,6 +62,10 @@ def set_values(case: Case, values: Mapping[str, Any]) -> Case:
     case : Case
     values : {name: number, list, text or truth value}, numbers in the parameter's unit
 
+    Returns
+    -------
+    Case.
+
     Raises
     ------
     InputError for an unknown name (with the nearest), a value of the wrong kind or shape, and a

@@ -23,6 +23,10 @@ def case_warnings(case: Case) -> list[str]:
     ----------
     case : Case
 
+    Returns
+    -------
+    Sentences, in the order of the list above.
+
     Examples
     --------
     >>> from jaxtank import presets, rig
@@ -47,6 +51,10 @@ def clock_warnings(clock: Clock) -> list[str]:
     Parameters
     ----------
     clock : Clock
+
+    Returns
+    -------
+    At most one sentence.
 
     Examples
     --------
@@ -149,6 +157,10 @@ def model_warnings(case: Case) -> list[str]:
     Parameters
     ----------
     case : Case
+
+    Returns
+    -------
+    A sentence for each parameter.
 
     Examples
     --------

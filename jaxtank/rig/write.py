@@ -27,6 +27,10 @@ def dump(case: Case, tankwise: bool = False) -> str:
     case : Case
     tankwise : whether to describe it tank by tank even where a preset has the same rig
 
+    Returns
+    -------
+    The text, TOML.
+
     Raises
     ------
     InputError for a case that no file can describe.
@@ -76,6 +80,10 @@ def complete(case: Case, tankwise: bool = False) -> str:
     case : Case
     tankwise : whether to describe it tank by tank even where a preset has the same rig
 
+    Returns
+    -------
+    The text, TOML.
+
     Raises
     ------
     InputError for a case that no file can describe.
@@ -96,6 +104,10 @@ def short(case: Case) -> str:
     Parameters
     ----------
     case : Case
+
+    Returns
+    -------
+    The text, TOML.
 
     Raises
     ------

@@ -5,5 +5,6 @@ May be imported by the loop and everything above it.
 
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.of_case import design_for
 
-__all__ = ["SafetyFilter", "TankCertificate", "design"]
+__all__ = ["SafetyFilter", "TankCertificate", "design", "design_for"]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.plants.network import TankNetwork
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.filter import FLOOR, SafetyFilter
 from jaxtank.safety.worst_case import Rates, rates_of
 
@@ -184,7 +184,7 @@ def design(
     inflow : (n,) largest inflow disturbance [cm^3/s]
     volume : (n,) volume that may enter besides, at any time and rate, in all [cm^3]; limits are
         lowered by it
-    offset : (m,) least input that moves liquid [V]; the pumps' offset dead zone where it is left out
+    offset : (m,) least input that moves liquid [V]; the pumps' offset dead zone where left out
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
     rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
     substeps : integration steps of a hold

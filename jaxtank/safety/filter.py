@@ -14,7 +14,7 @@ from jaxtank.core.numerics import clip, lower_clip, smooth_sqrt
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.instruments.actuators import allocate
 from jaxtank.instruments.base import Actuator
-from jaxtank.plants.network import TankNetwork
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.worst_case import rates_of, rise
 
 FLOOR = 0.05
@@ -56,7 +56,7 @@ class SafetyFilter:
         low=0.0,
         default=lambda own: np.zeros(np.shape(own["limit"])),
     )
-    age: np.ndarray = leaf(
+    age: np.ndarray | float = leaf(
         "s", "age of a reading when the input computed from it begins to act", low=0.0, default=0.0
     )
     offset: np.ndarray = leaf(
@@ -72,8 +72,13 @@ class SafetyFilter:
     )
 
     def apply(
-        self, actuator: Actuator, command: Sequence, metric: tuple | None, y: Sequence, hold: Any
-    ) -> tuple:
+        self,
+        actuator: Actuator,
+        command: Sequence[Any],
+        metric: tuple[Any, ...] | None,
+        y: Sequence[Any],
+        hold: Any,
+    ) -> tuple[Any, ...]:
         """Return the (m) inputs within the pumps' limits and the caps [V] for a command (m) [V].
 
         Parameters

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
-from jaxtank.plants.network import TankNetwork
+from jaxtank.plants.tank_network import TankNetwork
 
 
 class Rates(NamedTuple):

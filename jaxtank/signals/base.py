@@ -35,7 +35,7 @@ class Signal(abc.ABC):
         """Number of channels [-]."""
 
     @abc.abstractmethod
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         """Return the samples of a run, evaluated before the time loop.
 
         A method whose every sample follows from `sample_times(clock)` alone may be marked
@@ -51,7 +51,7 @@ class Signal(abc.ABC):
         """
 
     @pointwise
-    def windows(self, clock: Clock) -> tuple | None:
+    def windows(self, clock: Clock) -> tuple[Any, ...] | None:
         """Return what overshoot and settling refer to, or None without `changes`.
 
         Returns
@@ -93,7 +93,7 @@ class Constant(Signal):
         return np.shape(self.level)[0]
 
     @pointwise
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
         return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
@@ -123,7 +123,7 @@ class Table(Signal):
     def channels(self) -> int:
         return np.shape(self.values)[0]
 
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         last = np.shape(self.values)[1] - 1
         # which sample, and how far past it, is known to the host; the tolerance makes 3 * 0.1 s
         # sample 3
@@ -161,7 +161,7 @@ class Sum(Signal):
         return self.first.changes
 
     @pointwise
-    def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
+    def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
         value, rate, second = (
             tuple(a + b for a, b in zip(one, two))
             for one, two in zip(self.first.sample(clock), self.second.sample(clock))
@@ -169,7 +169,7 @@ class Sum(Signal):
         return value, rate, second
 
     @pointwise
-    def windows(self, clock: Clock) -> tuple | None:
+    def windows(self, clock: Clock) -> tuple[Any, ...] | None:
         """Return those of the first signal (`Ramps`); a channel that the second (`Sine`) moves has
         no step from its start on.
         """

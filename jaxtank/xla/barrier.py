@@ -10,11 +10,15 @@ fusion repeats most of the chain: for a batch of 256 runs of the four-tank 1028 
 costs nothing, for its result shares the memory of its operand.
 """
 
+from typing import TypeVar
+
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 
+T = TypeVar("T")
 
-def materialised(tree):
+
+def materialised(tree: T) -> T:
     """Return a pytree of the same values, each computed once.
 
     Transparent to jit, vmap and both modes of differentiation. No effect off the CPU.

@@ -6,12 +6,15 @@ run of the four-tank. Here the body is traced once, and what depends on constant
 once; equal coefficients (each Runge-Kutta stage makes its own) become one. Imports jax only.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jax.extend.core import Literal
 
 
-def scan(body, carry, xs, length):
+def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
     """Return jax.lax.scan(body, carry, xs, length) with loop-invariant work done before the loop.
 
     Values and derivatives are the same.

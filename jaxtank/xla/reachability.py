@@ -4,7 +4,8 @@ Nothing is computed. Imports jax only; may be imported by every folder.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 from jax.extend.core import Literal
@@ -46,7 +47,7 @@ def use_of(function, watched, *others):
     return _follow(jaxpr, set(jaxpr.invars[: len(jax.tree.leaves(watched))]))[0]
 
 
-def reached(function, watched):
+def reached(function: Callable[[Any], Any], watched: Any) -> list[bool]:
     """Return, for each leaf of function(watched), whether it depends on `watched`.
 
     Examples

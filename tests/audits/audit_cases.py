@@ -190,7 +190,7 @@ def carried(name, lanes):
 
     def forwards(theta):
         slopes = sensitivities_compiled(
-            loop, clock, MEASURES, order, unravel(theta), None, lanes=lanes
+            loop, clock, MEASURES, order, unravel(theta), None, batched=lanes
         )[1]
         return jnp.concatenate([slopes[m].reshape(-1, theta.size) for m in MEASURES])
 

@@ -325,7 +325,9 @@ def _(rng):
                 command=pair["command"],
                 applied=pair["u"], u=pair["u"], spilled=pair["spilled"],
             )  # fmt: skip
-            return measures.update(run, acc, sample, window, now["poured"], pair["rest"]), None
+            return measures.update(
+                run, acc, sample, measures.Context(window, now["poured"], pair["rest"])
+            ), None
 
         acc = jax.lax.scan(update, measures.start(run, names), {**still, **moving})[0]
         return measures.read(run, acc, names)

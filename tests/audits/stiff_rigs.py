@@ -131,7 +131,7 @@ def reference(loops, inputs, dt):
         for k in ("pump_gain", "split", "rim", "caught")
     )
     x, d, knee = stack(lambda loop: loop.x0), stack(lambda loop: loop.disturbance.level), plant.knee
-    fastest = max(step_size.film_rates(loop.plant).max() for loop in loops)
+    fastest = max(step_size.emptying_rates(loop.plant).max() for loop in loops)
     parts = int(np.ceil(dt * fastest / FINE))
     path = []
     for k in range(inputs.shape[1]):
@@ -179,7 +179,7 @@ def tried(kind, seeds):
                 continue
             loops.append(loop)
             runs.append(run)
-            reported.append(bool(step_size.doubts(loop, clock)))
+            reported.append(bool(step_size.step_warnings(loop, clock)))
     levels, inputs = (
         np.stack([np.asarray(getattr(run, name)) for run in runs]) for name in ("x", "u")
     )

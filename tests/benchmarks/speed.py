@@ -243,7 +243,7 @@ def gauss_newton(rounds):
         "run": compiled(lambda o: loop.evaluate_and_flag(at(o), case.clock, COST)),
         "pass": compiled(
             lambda o: sensitivities_compiled(
-                at(o), case.clock, COST, names, point, None, lanes=True
+                at(o), case.clock, COST, names, point, None, batched=True
             )
         ),
     }

@@ -69,7 +69,7 @@ def held_out(row, result):
     )
     costs, margins = problem.screen(points)
     return {
-        "runs": len(problem.lanes),
+        "runs": len(problem.runs),
         "before": float(costs[0]),
         "after": float(costs[1]),
         "limits_held": {

@@ -39,7 +39,7 @@ def run(name, values=None, loop=None, **clock):
     found = jaxtank.simulate(
         loop(case.loop), dataclasses.replace(case.clock, **clock), key=jax.random.key(1)
     )
-    return type(found)(*(np.asarray(a) for a in found))
+    return jax.tree.map(np.asarray, found)
 
 
 def constant_inflow(loop):
@@ -573,7 +573,7 @@ def test_the_rig_that_was_fitted_to_the_paper():
     """
     case = rig.set_values(CASES["enmpc"], loops.PAPER_LIKE)
     found = [
-        paper.figures(type(t)(*(np.asarray(v) for v in t)))
+        paper.figures(jax.tree.map(np.asarray, t))
         for t in (
             jaxtank.simulate(case.loop, case.clock, jax.random.key(seed)) for seed in range(9)
         )

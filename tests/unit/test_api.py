@@ -376,7 +376,7 @@ def test_a_limit_is_a_typed_row_with_the_values_before_and_after(own, tuned):
     problem = tuning.Problem(own, limits=limits)
     before, after = (
         {"max_level": np.array(levels), "input_travel": np.array([travel])}
-        | dict.fromkeys(ms.TIMES.values(), np.array([12.5, 20.0]))
+        | dict.fromkeys(ms.times(), np.array([12.5, 20.0]))
         for levels, travel in (([9.25, 8.0], 70.0), ([8.5, 9.499], 80.0))
     )
     rows = constraint_rows(problem, [after], [before], {"max_level of tank 1": 0.25})
@@ -448,6 +448,80 @@ def test_an_ensemble_keeps_its_batches_in_the_checkpoint(own, tmp_path):
     tuning.ensemble(own, spread, 4, checkpoint=tmp_path, shard=(1, 2), **options)
     with pytest.raises(InputError, match="1 of 2 batches are missing"):
         tuning.ensemble(own, spread, 4, checkpoint=tmp_path, resume=True, merge=True, **options)
+
+
+@pytest.fixture(scope="module")
+def run(own):
+    return jaxtank.simulate(own.loop, own.clock, save_every=100)
+
+
+def test_a_trajectory_has_the_ways_out_of_a_result(run, own, tmp_path):
+    found = run.to_json()
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    np.testing.assert_array_equal(found["x"], run.x)
+    assert found["units"] == dict.fromkeys(
+        ("x", "y", "x_hat", "r", "e", "command", "applied", "u"), "V"
+    ) | {"t": "s", "d_hat": "V/s", "spilled": "V^3"}
+    lines = str(run).splitlines()
+    assert lines[0] == "run from 0 to 450 s: 10 rows, 2 tanks, 1 pump"
+    assert lines[1].startswith("  level of tank 1 [V]: from ") and len(lines) == 5
+    paths = run.save(tmp_path / "run")
+    assert [path.name for path in paths] == ["trajectory.csv", "run.png"]
+    header, *rows = paths[0].read_text().splitlines()
+    assert header.startswith("t [s],h1 [V],h2 [V]") and len(rows) == len(run.t)
+    assert run.plot().keys() == {"run"}
+
+
+def test_a_trajectory_is_data_to_jax_and_keeps_its_units(run):
+    doubled = jax.jit(lambda r: jax.tree.map(lambda v: 2.0 * v, r))(run)
+    assert type(doubled) is jaxtank.Trajectory and doubled.units == ("V", "V")
+    np.testing.assert_array_equal(doubled.x, 2.0 * np.asarray(run.x))
+    several = jax.vmap(lambda a: jax.tree.map(lambda v: a * v, run))(jnp.arange(3.0))
+    assert str(several).startswith("Trajectory of several runs") and "<table>" in (
+        several._repr_html_()
+    )
+    assert run.replace(units=("m", "V")).to_json()["units"]["x"] == "m"
+    broken = run.replace(x=np.asarray(run.x) * np.nan)
+    assert broken.to_json()["x"][0] == [None, None]
+
+
+def test_a_case_has_the_ways_out_of_a_result(own, tmp_path):
+    found = own.to_json()
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["parameters"]["controller.Kc"] == {"value": 2.0, "unit": "V/V"}
+    assert found["parameters"]["clock.dt"] == {"value": 0.5, "unit": "s"}
+    assert found["free"] == {"controller.Kc": [0.1, 10.0, "log"]}
+    text = str(own.replace(limits={"max_level": "rim", "min_level": 1.0}))
+    assert text.startswith("own: ") and "controller Proportional, observer Offset" in text
+    assert "tunable: controller.Kc = 2.0 V/V, from 0.1 to 10 V/V" in text
+    assert "limit: max_level at most rim" in text and "min_level at least 1.0 V" in text
+    paths = own.save(tmp_path / "case")
+    assert [path.name for path in paths] == ["case.json", "rig.toml", "rig.png"]
+    assert rig.load(paths[1]).loop.controller.Kc == 2.0
+    assert own.plot().keys() == {"rig"}
+
+
+def test_a_case_that_no_rig_file_can_describe_is_saved_without_one(own, tmp_path):
+    @jaxtank.component
+    class Still(Controller):
+        model: Plant
+
+        def step(self, state, tick, estimate):
+            return (0.0,) * self.model.pumps, state
+
+    controller = Still(model=own.loop.plant)
+    case = own.replace(loop=dataclasses.replace(own.loop, controller=controller), free={})
+    with pytest.warns(UserWarning, match=r"rig.toml is not written \(.*Still has no name"):
+        paths = case.save(tmp_path)
+    assert [path.name for path in paths] == ["case.json", "rig.png"]
+
+
+def test_tables_for_a_notebook_escape_what_a_user_wrote(own, run):
+    page = own.replace(title="<script>alert(1)</script> & more")._repr_html_()
+    assert "<script>" not in page and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
+    page = run.replace(units=("<b>", "V"))._repr_html_()
+    assert "<b>" not in page and "level of tank 1 [&lt;b&gt;]" in page
+    assert page.count("<tr>") == 5  # headings, two levels, an error, an input
 
 
 class Page(HTMLParser):

@@ -23,33 +23,14 @@ RESULTS = {
 }
 LACKING = {
     "jaxtank.Case",
-    "jaxtank.Clock",
     "jaxtank.ClosedLoop",
     "jaxtank.check",
     "jaxtank.evaluate",
     "jaxtank.presets.find",
     "jaxtank.presets.load",
     "jaxtank.presets.names",
-    "jaxtank.rig.dump",
-    "jaxtank.rig.load",
-    "jaxtank.rig.set_values",
     "jaxtank.sensitivities",
     "jaxtank.simulate",
-    "tuning.Adam",
-    "tuning.Correlated",
-    "tuning.Discrete",
-    "tuning.LBFGS",
-    "tuning.LogUniform",
-    "tuning.Normal",
-    "tuning.Problem",
-    "tuning.SQP",
-    "tuning.TRF",
-    "tuning.Uniform",
-    "tuning.ensemble",
-    "tuning.sensitivity",
-    "tuning.tradeoff",
-    "tuning.tune",
-    "tuning.tune_robust",
 }
 
 

@@ -12,7 +12,13 @@ import tuning
 
 # A result displays itself as HTML (and opens the module of its report by name); `python -m jaxtank`
 # is the command.
-LAZY = {("tuning.problem.result", "tuning.report.html"), ("jaxtank.__main__", "tuning.cli.main")}
+LAZY = {
+    ("tuning.problem.result", "tuning.report.html"),
+    ("jaxtank.__main__", "tuning.cli.main"),
+    ("jaxtank.case", "jaxtank.plots.run"),
+    ("jaxtank.case", "jaxtank.rig.write"),
+    ("jaxtank.loop.trajectory", "jaxtank.plots.run"),
+}
 DRAWING = {"jaxtank.plots", "tuning.report", "tuning.cli"}  # folders that may import matplotlib
 
 

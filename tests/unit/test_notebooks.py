@@ -39,6 +39,20 @@ def test_each_quick_parameter_is_assigned_once_in_the_tagged_cell(path):
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_no_later_cell_assigns_a_parameter(path):
+    _, *later = code(path)
+    trees = [ast.parse(re.sub("^[%!].*$", "", "".join(c["source"]), flags=re.M)) for c in later]
+    stored = {
+        n.id
+        for tree in trees
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+    }
+    names = {n.strip() for key in quick_parameters()[path.name[:2]] for n in key.split(",")}
+    assert names & stored == set()
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_no_notebook_asks_how_it_is_run(path):
     source = "".join("".join(c["source"]) for c in code(path))
     assert "FAST" not in source and "environ" not in source

@@ -143,7 +143,7 @@ def gather():
     from jaxtank import presets
     from jaxtank.core.clock import CLOCK
     from jaxtank.core.tree import walk
-    from jaxtank.measures.catalogue import MEASURES
+    from jaxtank.measures import MEASURES
 
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():

@@ -25,7 +25,7 @@ def limits_of(args, case):
             limits = {}
             continue
         measure, value = pair("--limit", text)
-        from jaxtank.measures.catalogue import check_names
+        from jaxtank.measures import check_names
 
         check_names([measure])
         if value == "none":
@@ -95,7 +95,7 @@ def tradeoff_of(args):
             f"--tradeoff {args.tradeoff!r}: must be MEASURE=LOW:HIGH or MEASURE=LOW:HIGH:N, LOW"
             " below HIGH, N from 2 to 50"
         )
-    from jaxtank.measures.catalogue import check_names
+    from jaxtank.measures import check_names
 
     check_names([measure])
     return measure, [low + (high - low) * i / (count - 1) for i in range(count)]

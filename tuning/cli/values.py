@@ -62,7 +62,7 @@ def _warnings(args, opened, case, replaced):
     found += rig.model_warnings(case)
     if case.clock != opened.clock:
         found += rig.clock_warnings(case.clock)
-    return found + step_size.doubts(case.loop, case.clock)
+    return found + step_size.step_warnings(case.loop, case.clock)
 
 
 def settings(args):

@@ -82,7 +82,7 @@ def with_pi(case, inputs):
     found = case.replace(
         loop=dataclasses.replace(loop, controller=controller),
         free=free,
-        mirror=None,
+        symmetry=None,
         objective=case.objective or {"rms_error_total": 1.0},
         scenarios=tuple(
             s for s in case.scenarios if not any(n.startswith("controller.") for n in s.values)

@@ -57,13 +57,6 @@ class Identification(Result):
         Of the starts.
     law : str or None
         Kind of controller that is proposed for the identified rig.
-
-    Examples
-    --------
-    >>> result = tuning.identify(case, data)  # doctest: +SKIP
-    >>> result.status, result.parameters["plant.pump_gain[0]"]["interval95"]  # doctest: +SKIP
-    (<Status.CONVERGED: 'converged'>, [26.9, 27.9])
-    >>> result.save("identified")  # doctest: +SKIP
     """
 
     REPORT = "tuning.report.identification"

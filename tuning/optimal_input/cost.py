@@ -105,7 +105,7 @@ def evaluate(loop, clock, terms, u, lagrangian):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.window, now.since, now.rest)), tuple(
+        return (state, ms.update(run, acc, sample, now.context)), tuple(
             _pointwise_excess(terms, lagrangian, sample)
         )
 
@@ -130,7 +130,7 @@ def _search_cost(u, loop, clock, terms, lagrangian):
         state, acc, (before, variation, absolute), penalty = carry
         now, multipliers = xs
         state, sample = step(loop, clock, state, now)
-        acc = ms.update(run, acc, sample, now.window, now.since, now.rest)
+        acc = ms.update(run, acc, sample, now.context)
         if "input_travel" in smoothed:
             change = sum(
                 _smooth_absolute(a - b, lagrangian.smoothing[0]) for a, b in zip(sample.u, before)

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import NonFiniteError
-from jaxtank.core.records import Trajectory
 from jaxtank.loop import run as lp
+from jaxtank.loop.trajectory import Trajectory
 from tuning.optimal_input.cost import open_loop
 from tuning.optimal_input.problem import InputProblem
 from tuning.optimal_input.search import InputSearch
@@ -214,8 +214,6 @@ def _measures(case, found):
     """Return {name: value} of the measures that are defined for the run with the inputs found."""
     loop = open_loop(case.loop, found["u"].T, found["interval"])
     names = tuple(
-        m
-        for m in ms.MEASURES
-        if ms.serves(m, loop) and m not in ("estimation_rms", *ms.TIMES.values())
+        m for m in ms.MEASURES if ms.serves(m, loop) and m not in ("estimation_rms", *ms.times())
     )
     return {m: np.asarray(v) for m, v in lp.evaluate(loop, case.clock, names).items()}

@@ -79,7 +79,7 @@ class InputProblem:
         """
         loop = self.case.loop
         rim = np.asarray(loop.plant.rim)
-        limits = [_at_the_rim(v, rim) if v.index in dry else v[:3] for v in self.limits]
+        limits = [_limit_of(v, rim, dry) for v in self.limits]
         pointwise = [limit for limit in limits if limit[0] in POINTWISE]
         integral = [limit for limit in limits if limit[0] not in POINTWISE]
         self.terms = Terms(
@@ -212,11 +212,11 @@ def _without_overflow(limits, plant):
     return dry
 
 
-def _at_the_rim(limit, rim):
-    """Return (measure, entry, value): a limit on overflow as one on the level."""
-    if limit.measure != "overflow_volume":
-        return limit[:3]
-    return "max_level", limit.index, rim[limit.index] * (1 - TOLERANCE)
+def _limit_of(limit, rim, dry):
+    """Return (measure, entry, value) of a Limit: no overflow as a limit on the level."""
+    if limit.measure == "overflow_volume" and limit.index in dry:
+        return "max_level", limit.index, rim[limit.index] * (1 - TOLERANCE)
+    return limit.measure, limit.index, limit.value
 
 
 def _interval(clock, interval):

@@ -185,13 +185,13 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     >>> undefined("ise", presets.find("cascaded/pi"))
     ('', [False])
     """
-    spec, clock, loop = ms.MEASURES[measure], case.clock, case.loop
+    wanted, clock, loop = ms.refers_to([measure]), case.clock, case.loop
     onset = None if loop.disturbance is None else loop.disturbance.since(clock)
     since = np.full(1, -1.0) if onset is None else np.asarray(onset)
-    if spec.pours and onset is not None:
+    if "since" in wanted and onset is not None:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    windows = cast(Any, loop.reference).windows(clock) if spec.windows else None
+    windows = cast(Any, loop.reference).windows(clock) if "window" in wanted else None
     if windows is not None:
         steps = [np.asarray(window[1]) for window in windows]
         why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"

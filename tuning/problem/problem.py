@@ -132,7 +132,7 @@ class Problem:
             return None
         if set(self.objective) == {ROOT} and len(self.runs) == 1:
             return "square"
-        return "cost" if any(m == ROOT or m in ms.SQUARES for m in self.objective) else None
+        return "cost" if any(m == ROOT or m in ms.squares() for m in self.objective) else None
 
     def start(self) -> Floats:
         """Return (P,) z of the case's own values. Raises InputError if one is outside its range."""
@@ -294,7 +294,7 @@ class Problem:
 
     def _squares(self) -> tuple[tuple[str, float], ...]:
         """Return ((measure, weight), ...) of the squares of the Gauss-Newton matrix."""
-        own = tuple((m, w) for m, w in self.objective.items() if m in ms.SQUARES)
+        own = tuple((m, w) for m, w in self.objective.items() if m in ms.squares())
         return (("mean_square_error", 1.0),) if ROOT in self.objective or not own else own
 
     def _curvature(self, matrix: Floats, measures: Row, slopes: Row) -> Floats:

@@ -41,4 +41,4 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
 
 def _names(loop: ClosedLoop) -> tuple[str, ...]:
     """Return the measures that are reported of a loop, and when levels were reached."""
-    return (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.TIMES.values())
+    return (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.times())

@@ -1,33 +1,18 @@
 """Files of a result: trajectories, pictures, and a folder that takes all of them or none."""
 
-import io
 import tempfile
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.files import check_folder, write_together
-from jaxtank.core.units import DEFAULT
-from jaxtank.interop.python_control import columns
+from jaxtank.core.files import check_folder, write_folder
 from jaxtank.loop import run as lp
+from jaxtank.loop.trajectory import csv
 from tuning.report.figures import failed
 from tuning.report.tables import dumps
-
-
-def trajectory_csv(run, rig_units=DEFAULT):
-    """Return a trajectory as CSV with units; disturbance estimates where there are any."""
-    known = bool(np.asarray(run.d_hat).any())
-    kept = {
-        n: v
-        for n, v in columns(run, rig_units).items()
-        if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
-    }
-    out = io.StringIO()
-    out.write(",".join(kept) + "\n")
-    np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
-    return out.getvalue()
 
 
 def rig_text(case):
@@ -56,22 +41,15 @@ def run_for_people(case, key=None, rows=3000):
     # is constant; one that ends at the end, if any
     every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
     run = lp.simulate(case.loop, case.clock, key, save_every=every)
-    return type(run)(*(np.asarray(v) for v in run))
-
-
-def png(figure):
-    import matplotlib.pyplot as plt
-
-    out = io.BytesIO()
-    figure.savefig(out, format="png", metadata={"Software": None})
-    plt.close(figure)
-    return out.getvalue()
+    return jax.tree.map(np.asarray, run)
 
 
 def pngs(drawn):
     """{file name: bytes} of {name: figure}; the figures are closed. One that cannot be drawn is
     left out, with a note on stderr.
     """
+    from jaxtank.plots.run import png
+
     found = {}
     for name, figure in drawn.items():
         try:
@@ -99,7 +77,7 @@ def write_result(folder, files, draw, page=None, stale=()):
         with a note on stderr.
     """
     folder = Path(folder)
-    written = write_files(folder, files)
+    written = write_folder(folder, files)
     for path in stale:
         path.unlink(missing_ok=True)
     import matplotlib.pyplot as plt
@@ -117,7 +95,7 @@ def write_result(folder, files, draw, page=None, stale=()):
         more = {} if page is None else {"report.html": page(drawn)}
     except Exception as error:
         failed("report.html", error)
-    return written + write_files(folder, more | pngs(drawn))
+    return written + write_folder(folder, more | pngs(drawn))
 
 
 def save_run(case, run, payload, folder, gif=False):
@@ -127,10 +105,7 @@ def save_run(case, run, payload, folder, gif=False):
     from jaxtank.plots import responses
 
     check_folder(folder)
-    files = {
-        "result.json": dumps(payload) + "\n",
-        "trajectory.csv": trajectory_csv(run, case.loop.units),
-    }
+    files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
     stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
@@ -149,20 +124,5 @@ def save_run(case, run, payload, folder, gif=False):
         except Exception as error:
             failed("run.gif", error)
         else:
-            written += write_files(Path(folder), {"run.gif": film})
+            written += write_folder(Path(folder), {"run.gif": film})
     return written
-
-
-def write_files(folder, files):
-    """Write {name: text or bytes} to `folder`, made if need be, all of them or none; returns the
-    paths.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_together(folder, files)
-    except OSError as error:
-        raise InputError(
-            f"--out {str(folder)!r}: cannot be written to ({error.strerror}); give a folder"
-            " that can"
-        ) from None
-    return [folder / name for name in files]

@@ -11,8 +11,8 @@ from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.tree import walk
-from jaxtank.measures.catalogue import MEASURES, TIMES
-from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.measures import MEASURES, of_loop
+from jaxtank.measures import unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from tuning.problem.wording import count
 from tuning.report import safety, tables
@@ -300,15 +300,7 @@ def _every(page):
 
 def _measures(case):
     """The measures that a run of the case has."""
-    poured, stepped = (
-        case.loop.disturbance is not None and case.loop.disturbance.onset is not None,
-        case.loop.reference.changes is not None,
-    )
-    known = {
-        m: s
-        for m, s in MEASURES.items()
-        if m not in TIMES.values() and (poured or not s.pours) and (stepped or not s.windows)
-    }
+    known = {m: MEASURES[m] for m in of_loop(case.loop)}
     return [
         [m, measure_unit(m, case.loop.units), "" if s.per == "run" else s.per, s.doc]
         for m, s in known.items()

@@ -28,27 +28,9 @@ def rig(loop, run=None, title=""):
 
     {} for a plant that is no network of tanks.
     """
-    import matplotlib.pyplot as plt
+    from jaxtank.plots.run import rig
 
-    from jaxtank.plots import responses
-    from jaxtank.plots.layout import place
-    from jaxtank.plots.schematic import schematic
-
-    if not hasattr(loop.plant, "links"):
-        return {}
-    where = place(loop.plant)
-    wide, high = where.right - where.left, where.top - where.bottom
-    with responses.styled():
-        figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
-        ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
-        levels, setpoints = (
-            (None, None)
-            if run is None or not np.all(np.isfinite(run.x[-1]))
-            else (run.x[-1], run.r[-1])
-        )
-        schematic(ax, loop.plant, levels, setpoints)
-        ax.set_title(responses.plain(title))
-    return {"rig": figure}
+    return rig(loop.plant, run, title)
 
 
 def inner(loop, runs):

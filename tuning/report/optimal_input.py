@@ -5,6 +5,7 @@ Opened by `tuning.bound`'s result.
 
 import io
 
+import jax
 import numpy as np
 
 from jaxtank.core.files import check_folder
@@ -107,7 +108,7 @@ def figures(found):
 
     every = max(1, found.case.clock.samples // 3000)
     run = found.trajectory(save_every=every)
-    run = type(run)(*(np.asarray(v) for v in run))
+    run = jax.tree.map(np.asarray, run)
     title = f"{found.case.name}: perfect-information open-loop optimum"
     return {"responses": responses.responses(found.case.loop, {"optimal inputs": run}, title)}
 

@@ -40,7 +40,7 @@ def runner(paper):
             found = lp.simulate(
                 case.loop, case.clock, jax.random.key(0) if noisy(case) else None, save_every
             )
-            known[key] = case, type(found)(*(np.asarray(a) for a in found))
+            known[key] = case, jax.tree.map(np.asarray, found)
         return known[key]
 
     return run

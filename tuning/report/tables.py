@@ -2,11 +2,11 @@
 
 import json
 import math
-from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.units import DEFAULT
 
 
@@ -36,29 +36,6 @@ def numbers(value, digits=5):
     '1  2.5'
     """
     return "  ".join(number(v, digits) for v in np.ravel(value))
-
-
-def clean(value) -> Any:
-    """Return `value` for JSON: arrays as lists, NaN and infinity as None.
-
-    Examples
-    --------
-    >>> clean({"h": np.array([1.0, np.inf])})
-    {'h': [1.0, None]}
-    """
-    if isinstance(value, dict):
-        return {k: clean(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [clean(v) for v in value]
-    if (
-        isinstance(value, (np.ndarray, np.generic))
-        or hasattr(value, "__jax_array__")
-        or type(value).__module__.startswith("jax")
-    ):
-        return clean(np.asarray(value).tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
 
 
 def reasons(measures):
@@ -95,7 +72,7 @@ def measures_json(measures):
     """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
     return {
         **dict.fromkeys(_unserved()),
-        **clean({m: v for m, v in measures.items() if m not in ms.TIMES.values()}),
+        **clean({m: v for m, v in measures.items() if m not in ms.times()}),
     }
 
 
@@ -156,7 +133,7 @@ def measure_table(values, rig_units=DEFAULT):
     rows = [
         [m, ms.unit(m, rig_units), numbers(values[m]), spec.doc]
         for m, spec in ms.MEASURES.items()
-        if m in values and m not in ms.TIMES.values()
+        if m in values and m not in ms.times()
     ]
     return table(rows, ["measure", "unit", "value", ""])
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxtank.core.files import check_folder
+from jaxtank.loop.trajectory import csv
 from tuning.report import html
-from tuning.report.artifacts import earlier, rig_text, run_for_people, trajectory_csv, write_result
+from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
 from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
 from tuning.report.tuning_figures import CAPTIONS, figures, result_key
 from tuning.report.tuning_tables import parts_of, scenario_rows
@@ -121,8 +122,8 @@ def save(result, folder, command=None):
     files = {
         "result.json": dumps(json_of(result)) + "\n",
         **({"rig.toml": rig} if rig else {}),
-        "trajectory.csv": trajectory_csv(runs["after"], result.tuned.loop.units),
-        "before.csv": trajectory_csv(runs["before"], result.case.loop.units),
+        "trajectory.csv": csv(runs["after"], result.tuned.loop.units),
+        "before.csv": csv(runs["before"], result.case.loop.units),
     }
     stale = earlier(folder, CAPTIONS)
     if not rig and (folder / "result.json").is_file():

@@ -12,7 +12,8 @@ from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.step_size import StepWarning, check_run, doubts
+from jaxtank.loop import step_size
+from jaxtank.loop.step_size import StepWarning, check_run
 from tuning.problem.reported import table_of
 
 CHECKED_RUNS = 16
@@ -39,7 +40,7 @@ def step_warnings(problem, tuned, values, key=None):
         runs.append((f"scenario {run.name}: ", loop, run.case.clock, run.key))
     sentences = []
     for name, loop, clock, own in runs:
-        found = doubts(loop, clock)
+        found = step_size.step_warnings(loop, clock)
         if found and (why := _unstable_step(loop, clock, own)):
             return [f"{name}this answer's run is wrong, and so are its numbers: {why}"]
         sentences += [f"{name}{sentence}" for sentence in found]
@@ -259,9 +260,9 @@ def symmetric(problem, outcomes, values):
     None where the case has none, or outside the ranges. Else {"words", "values" {name: value},
     "objective", "starts": indices of the searches that ended there rather than here}.
     """
-    if problem.case.mirror is None:
+    if problem.case.symmetry is None:
         return None
-    image = problem.case.mirror.image(values)
+    image = problem.case.symmetry.image(values)
     if not image or not all(n in values for n in image):
         return None
     there = {**values, **image}
@@ -280,7 +281,7 @@ def symmetric(problem, outcomes, values):
     ]
     cost = float(problem.screen(z[None])[0][0])
     return {
-        "words": problem.case.mirror.words,
+        "words": problem.case.symmetry.words,
         "values": there,
         "objective": cost,
         "starts": starts,

@@ -43,6 +43,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.problem.point import DIVERGED
 from tuning.problem.status import Status
+from tuning.problem.wording import count
 from tuning.search.diagnostics import direction_words
 from tuning.search.kkt import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
@@ -178,7 +179,10 @@ def _why_not_converged(result: TuningResult) -> str:
             " other ranges (--free)"
         )
     if any(o["exhausted"] for o in result.starts):
-        return "no search converged within its iterations: raise --iterations, or try other starts"
+        return (
+            "no search met the conditions of an optimum before its iterations were used up: raise"
+            " --iterations, or try other starts"
+        )
     return (
         "the searches stopped before their iterations were used up, at a kink or in the noise of"
         " the objective: no line search found a lower point, and the conditions of an optimum do"
@@ -206,7 +210,9 @@ def _start_violates(result: TuningResult) -> Found:
 def _not_applicable(result: TuningResult) -> Found:
     """Entries of a limited measure that are undefined in every run."""
     limits, plant = result.problem.limits, result.problem.loop.plant
-    for measure in dict.fromkeys(x.measure for x in limits if ms.MEASURES[x.measure].windows):
+    for measure in dict.fromkeys(
+        x.measure for x in limits if "window" in ms.refers_to([x.measure])
+    ):
         limited = {limit.index for limit in limits if limit.measure == measure}
         for i in sorted(set(range(ms.entries(measure, plant))) - limited):
             yield Message(
@@ -282,8 +288,9 @@ def _agreement(result: TuningResult) -> Found:
     if not feasible:  # nothing to agree on
         return
     alike = sum(cost <= min(feasible) * AGREE for cost in feasible)
+    searches = count(len(result.starts), "search")
     yield Message(
-        "starts-agree", f"{alike} of {len(result.starts)} searches ended within 0.1 % of the best"
+        "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
     )
     image = result.symmetry
     if not image or image["objective"] is None:
@@ -317,20 +324,20 @@ def _out_of_sample(result: TuningResult) -> Found:
 
 
 def _screened_again(result: TuningResult) -> Found:
-    count = result.evaluations["redone_at_true_step"]
-    if count:
+    redone = result.evaluations["redone_at_true_step"]
+    if redone:
         yield Message(
             "screened-at-true-step",
-            f"{count} screening points are unstable at the coarse step only and were run at the"
-            " true one",
+            f"{count(redone, 'screening point')} diverged at the coarse step of the screening and"
+            " did not at the case's own step, at which they were run again",
         )
 
 
 def _non_finite(result: TuningResult) -> Found:
-    count = result.evaluations["non_finite"]
-    if count:
+    points = result.evaluations["non_finite"]
+    if points:
         yield Message(
-            "non-finite-points", f"{count} trial points gave non-finite numbers and were rejected"
+            "non-finite-points", f"{count(points, 'trial point')} gave non-finite numbers, rejected"
         )
 
 

@@ -228,7 +228,7 @@ def certificate_messages(known: Certificate, risk: str, back_off: float) -> tupl
     >>> for m in certificate_messages(Certificate(16, 0, 0.4, 256, 0, [0.0, 0.0143]), "worst", 0.0):
     ...     print(m.text)
     on 256 new plants a limit was violated 0 times (95 % interval 0 to 0.014)
-    the scenario theory bounds the probability by 0.4 (N 16, support 0, confidence 1 - 1e-6)
+    by scenario theory, the probability is at most 0.4 (confidence 1 - 1e-6, support 0 of 16 plants)
     """
     low, high = known.interval95
     indication = (
@@ -244,8 +244,8 @@ def certificate_messages(known: Certificate, risk: str, back_off: float) -> tupl
         ),
         Message(
             "scenario-bound",
-            f"the scenario theory bounds the probability by {known.bound:.2g} (N"
-            f" {known.scenarios}, support {known.support}, confidence 1 - 1e-6{indication})",
+            f"by scenario theory, the probability is at most {known.bound:.2g} (confidence 1 -"
+            f" 1e-6, support {known.support} of {known.scenarios} plants{indication})",
         ),
     ]
     if back_off:

@@ -11,11 +11,12 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 from jax.flatten_util import ravel_pytree
 
+from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop.closed_loop import initial
-from jaxtank.loop.step import Inputs, step
+from jaxtank.loop.closed_loop import Inputs, initial
+from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
 TRIED = 3
@@ -93,9 +94,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
             ddr=tuple(zero),
             d=d,
             xi=None,
-            window=None,
-            since=None,
-            rest=None,
+            context=ms.Context(),
             plan=jax.tree.map(lambda a: a[0], plan),
             own=jax.tree.map(lambda a: a[0], here.controller.inputs(clock)),
             fault=None if loop.faults is None else (0.0,) * len(loop.faults.windows),

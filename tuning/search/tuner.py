@@ -285,8 +285,8 @@ def _method(method, problem, batch):
         )
     if method in UNCONSTRAINED and not problem.model:
         raise InputError(
-            f"method {method} needs rms_error_total or a mean of squares ({', '.join(ms.SQUARES)})"
-            " in the objective: use slsqp"
+            f"method {method} needs rms_error_total or a mean of squares"
+            f" ({', '.join(ms.squares())}) in the objective: use slsqp"
         )
     return method
 

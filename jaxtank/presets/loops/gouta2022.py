@@ -5,7 +5,7 @@ Imported by `jaxtank.presets.gouta2022`.
 
 import numpy as np
 
-from jaxtank.case import Free, Mirror
+from jaxtank.case import Free, Symmetry
 from jaxtank.controllers import ENMPC, PID
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
@@ -120,7 +120,7 @@ def trapezoids():
     )
 
 
-def _mirrored(values):
+def _exchanged(values):
     # 1.5/Tp is the gain of the error, l that of its integral's observer: the loop knows their sum
     # and product (notes S4.4)
     rates = [v for n, v in values.items() if n.startswith("observer.l")]
@@ -132,7 +132,7 @@ def _mirrored(values):
     }
 
 
-MIRROR = Mirror("the gain k = 1.5/Tp and the observer's l exchange roles", _mirrored)
+SYMMETRY = Symmetry("the gain k = 1.5/Tp and the observer's l exchange roles", _exchanged)
 
 
 def controller_of(name, model):

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from jaxtank.core.units import local
-from jaxtank.measures.catalogue import MEASURES
-from jaxtank.measures.catalogue import unit as measure_unit
+from jaxtank.measures import MEASURES
+from jaxtank.measures import unit as measure_unit
 from tuning.cli import main
 
 FLOW = ("m", "m^3/s")

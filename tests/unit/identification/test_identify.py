@@ -981,7 +981,7 @@ def test_what_is_identified_is_what_is_tuned_for(identified):
         jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[0],
     )
     assert gain[0] != 27.43 and np.array_equal(case.loop.controller.model.pump_gain, gain)
-    lanes = {lane.name: lane.case.loop for lane in tuning.Problem(case).lanes}
+    lanes = {run.name: run.case.loop for run in tuning.Problem(case).runs}
     assert lanes["pump 1 +30 %"].plant.pump_gain.tolist() == [1.3 * gain[0], gain[1]]
     np.testing.assert_array_equal(lanes["pump 1 -20 %"].x0, levels)
     assert all(np.array_equal(loop.sensor.noise, case.loop.sensor.noise) for loop in lanes.values())

@@ -343,7 +343,7 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
                 jnp.float64(0.05 * abs(step[k])),
             ),
         )
-        states = ms.update(run, states, sample, window)
+        states = ms.update(run, states, sample, ms.Context(window))
     return {m: np.asarray(v) for m, v in ms.read(run, states, names).items()}
 
 

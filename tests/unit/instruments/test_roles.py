@@ -104,9 +104,9 @@ LIMITED = RateLimited(low=[0.0], high=[12.0], initial=[2.0], rate=0.4)
 def registry():
     """The registry of rig files is put back after each test."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("LAWS", "OBSERVERS", "SENSORS", "ACTUATORS", "REGISTERED"):
-            known = getattr(components, name)
-            patch.setattr(components, name, type(known)(known))
+        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
+        for name, role in components.ROLES.items():
+            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
         yield
 
 

@@ -36,8 +36,8 @@ def test_the_loop_compiles_to_one_function(gouta, name):
 
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
     """Two calls: the random generator has a loop of its own."""
-    from jaxtank.measures.catalogue import MEASURES as every
-    from jaxtank.measures.catalogue import serves
+    from jaxtank.measures import MEASURES as every
+    from jaxtank.measures import serves
 
     case = gouta(
         "ngpc",

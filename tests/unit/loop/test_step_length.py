@@ -58,15 +58,17 @@ def test_what_is_said_is_what_happens(integrator, share):
     drain = 0.1
     for _ in range(3):  # a rate follows from the drain: the film's is proportional to it
         case, clock, _ = levels(drain, integrator, samples=2)
-        drain *= share * step_size.LIMITS[integrator] / step_size.film_rates(case.loop.plant)[0]
+        drain *= share * step_size.LIMITS[integrator] / step_size.emptying_rates(case.loop.plant)[0]
     case, clock, h = levels(drain, integrator)
     late = np.abs(h[-100:]).max()
     said = (
-        step_size.thrown(float(f"{step_size.film_rates(case.loop.plant)[0]:.3g}"), integrator)
+        step_size.unstable_height(
+            float(f"{step_size.emptying_rates(case.loop.plant)[0]:.3g}"), integrator
+        )
         * 0.01
     )
     if share < 1.0:
-        assert list(step_size._thrown(case.loop, clock)) == [] and late < 1e-6
+        assert list(step_size.unstable_tanks(case.loop, clock)) == [] and late < 1e-6
     else:
         assert 0.3 * said <= late <= 1.1 * said
 
@@ -74,22 +76,22 @@ def test_what_is_said_is_what_happens(integrator, share):
 def test_steps_as_the_papers_have_them_are_short_enough():
     for paper in presets.PAPERS:
         for case in presets.load(paper).cases.values():
-            assert list(step_size._thrown(case.loop, case.clock)) == []
+            assert list(step_size.unstable_tanks(case.loop, case.clock)) == []
 
 
 def test_the_remedy_is_one():
     case, clock, _ = levels(0.4, "rk4", samples=2)
-    ((_, _, remedy),) = step_size._thrown(case.loop, clock)
+    ((_, _, remedy),) = step_size.unstable_tanks(case.loop, clock)
     assert remedy.startswith("clock.substeps = 5 ")
-    assert list(step_size._thrown(case.loop, dataclasses.replace(clock, substeps=5))) == []
-    assert list(step_size._thrown(case.loop, dataclasses.replace(clock, substeps=4))) != []
+    assert list(step_size.unstable_tanks(case.loop, dataclasses.replace(clock, substeps=5))) == []
+    assert list(step_size.unstable_tanks(case.loop, dataclasses.replace(clock, substeps=4))) != []
 
 
 def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, capsys):
     case = rig.loads(ONE.format(drain=0.1))
     fast = jaxtank.with_values(case.loop, {"plant.drain": 2.0})
     with pytest.warns(
-        step_size.StepWarning, match="tank 1 runs empty .* thrown up by 2.9e.02 cm .*0.042 s"
+        step_size.StepWarning, match="tank 1 runs empty .* rises to 2.9e.02 cm .*0.042 s"
     ):
         jaxtank.check(fast, case.clock)
     with pytest.raises(
@@ -121,7 +123,7 @@ def test_it_is_said_and_where_a_full_tank_empties_in_a_step_refused(tmp_path, ca
         said = capsys.readouterr().err
         assert (
             said.count("note: tank 1 runs empty") == 1
-            and "threw its level up after t = 0 s: clock.dt of at most" in said
+            and "rises by itself after t = 0 s: clock.dt of at most" in said
         )
         assert not out.exists()
         assert main.main(["simulate", str(file), "--set", "plant.drain=2", "--dt", "3"]) == 2
@@ -161,13 +163,13 @@ def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
         case = rig.loads(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
         run = jaxtank.simulate(case.loop, case.clock)
         assert np.diff(np.asarray(run.x)[:, 0]).max() > 3.0
-        (sentence,) = step_size.doubts(case.loop, case.clock)
+        (sentence,) = step_size.step_warnings(case.loop, case.clock)
         assert "tank 1 runs empty faster than the steps follow" in sentence
-        with pytest.raises(InputError, match=r"threw its level up after t = 0\.3"):
+        with pytest.raises(InputError, match=r"rises by itself after t = 0\.3"):
             step_size.check_run(case.loop, case.clock, run)
         (tmp_path / "deep.toml").write_text(DEEP.format(rim=rim, dt=dt, setpoint=1.0))
         assert main.main(["simulate", str(tmp_path / "deep.toml")]) == 2
-        assert "threw its level up" in capsys.readouterr().err
+        assert "rises by itself" in capsys.readouterr().err
 
 
 def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
@@ -180,7 +182,7 @@ def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
         empty = dataclasses.replace(low.loop, x0=np.zeros(1))
         nowhere = jaxtank.with_values(empty, {"reference.initial": 0.0})
         assert [
-            bool(step_size.doubts(loop, low.clock))
+            bool(step_size.step_warnings(loop, low.clock))
             for loop in (high.loop, low.loop, empty, nowhere)
         ] == [False, True, True, False]
         error = lambda x0: jaxtank.evaluate(
@@ -214,7 +216,7 @@ def test_a_run_that_is_right_is_not_refused(case, rim):
             loop = dataclasses.replace(loop, disturbance=pours(1, [(3.0, 1.0, 0, 150.0)]))
         clock = Clock(dt=1.0, duration=40.0)
         run = jaxtank.simulate(loop, clock)
-    assert step_size.doubts(loop, clock)
+    assert step_size.step_warnings(loop, clock)
     step_size.check_run(loop, clock, run)
 
 
@@ -335,7 +337,7 @@ def test_the_level_of_an_unresolved_film_is_reported():
         plant = dataclasses.replace(case.loop.plant, bottom=True)
         loop, clock = dataclasses.replace(case.loop, plant=plant), Clock(dt=2.0, duration=200.0)
         level = np.asarray(jaxtank.simulate(loop, clock).x)[-1, 0]
-    (sentence,) = step_size.doubts(loop, clock)
+    (sentence,) = step_size.step_warnings(loop, clock)
     reported = float(sentence.split("up to ")[1].split(" cm")[0])
     exact = (0.5 * 8.0 / 0.4) ** 2 / (2 * 981.0)  # Torricelli
     np.testing.assert_allclose(level, 2.0 * 0.5 * 8.0 / 20.0, rtol=1e-9)

@@ -3,15 +3,19 @@ it there.
 """
 
 import dataclasses
+import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxtank
 import tuning
 from jaxtank import measures as ms
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from jaxtank.measures.catalogue import Measure
+from jaxtank.measures import Accumulator, Measure
+from tuning.cli.main import main
 from tuning.problem.limits import Limit
 from tuning.report.tables import reasons
 from tuning.uncertainty.sensitivity_study import check_measures
@@ -67,7 +71,7 @@ def test_what_a_measure_added_from_outside_states_is_reported_and_enforced(with_
     with pytest.raises(InputError, match="counts whole samples"):
         check_measures(case, with_mine, "local")
     assert check_measures(case, with_mine, "morris") == (with_mine,)
-    with pytest.raises(InputError, match="has no slope in every input"):
+    with pytest.raises(InputError, match="has no derivative by every input"):
         tuning.bound(case, objective={with_mine: 1.0})
 
 
@@ -84,3 +88,123 @@ def test_an_ensemble_takes_the_worse_side_of_a_measure_added_from_outside(with_m
     summary = found.summary()
     np.testing.assert_array_equal(summary[with_mine]["cvar95"], summary["min_level"]["cvar95"])
     assert np.all(summary[with_mine]["cvar95"] <= summary[with_mine]["mean"])
+
+
+def _fastest(run, state, sample, context):
+    before, largest = state
+    rate = jnp.abs(sample.u[0] - before) / run.dt
+    return sample.u[0], jnp.maximum(largest, jnp.where(sample.t > 0.0, rate, 0.0))
+
+
+FASTEST = Accumulator(lambda run: (run.zero, run.zero), _fastest)
+RATE = Measure(
+    "V/s", "run", ("fastest",), lambda run, acc: acc["fastest"][1], "fastest change of the input"
+)
+ERROR = Measure(
+    "cm^2",
+    "output",
+    ("e2",),
+    lambda run, acc: jnp.stack([3.0 * e for e in acc["e2"]]),
+    "three times the sum of the squared errors",
+    residual="e2",
+    scale=lambda run: 3.0,
+)
+RIG = """
+case = "cascaded/pi"
+name = "own"
+[values]
+"clock.dt" = 0.5
+"clock.duration" = 450.0
+[objective]
+triple = 1.0
+[limits]
+input_rate = 40.0
+[uncertain]
+"plant.pump_gain" = 0.05
+"""
+
+
+@pytest.fixture
+def registered():
+    """Two measures of a user's own, "input_rate" and "triple"; afterwards there are none."""
+    ms.register("input_rate", RATE, {"fastest": FASTEST})
+    ms.register("triple", ERROR)
+    yield
+    for table in (ms.MEASURES, ms.ACCUMULATORS):
+        for key in ("input_rate", "triple", "fastest"):
+            table.pop(key, None)
+
+
+def test_a_registered_measure_is_evaluated_with_its_derivative(registered):
+    case = rig.loads(RIG)
+    run = jaxtank.simulate(case.loop, case.clock)
+    values = jaxtank.evaluate(case.loop, case.clock, ["input_rate", "triple"])
+    rate = np.abs(np.diff(np.asarray(run.u)[:, 0])).max() / case.clock.dt
+    np.testing.assert_allclose(values["input_rate"], rate, rtol=1e-12)
+    np.testing.assert_allclose(values["triple"], 3.0 * np.sum(run.e**2, axis=0), rtol=1e-12)
+    point = {"controller.Kc": case.loop.controller.Kc}
+    found = jaxtank.sensitivities(case.loop, case.clock, ["triple"], point, squares={"triple": 1.0})
+    step = {"controller.Kc": case.loop.controller.Kc * (1 + 1e-6)}
+    away = jaxtank.evaluate(jaxtank.with_values(case.loop, step), case.clock, ["triple"])
+    slope = (away["triple"] - found[0]["triple"]) / (1e-6 * point["controller.Kc"])
+    np.testing.assert_allclose(found[1]["triple"][:, 0], slope, rtol=1e-4)
+    assert found[2].shape == (1, 1) and float(found[2][0, 0]) > 0.0
+
+
+def test_a_registered_measure_is_tuned_by_limited_and_drawn(registered):
+    case = rig.loads(RIG)
+    assert rig.loads(rig.dump(case)).objective == {"triple": 1.0}
+    result = tuning.tune(case, tuning.SQP(starts=1, screening=2, iterations=5), validation=0)
+    assert result.objective["after"] <= result.objective["before"]
+    assert result.measures["after"]["triple"] == pytest.approx([result.objective["after"]])
+    assert [row["name"] for row in result.constraints] == ["input_rate"]
+    draws = tuning.ensemble(case, samples=4, measures=["input_rate", "triple"], fan=False)
+    rates = np.asarray(draws.measures["input_rate"])
+    assert rates.shape[0] == 4 and len(np.unique(rates)) == 4
+
+
+def test_the_command_reports_a_registered_measure_of_a_rig_file(registered, tmp_path, capsys):
+    path = tmp_path / "own.toml"
+    path.write_text(RIG)
+    assert main(["simulate", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["measures"]["input_rate"] > 0.0 and found["units"]["input_rate"] == "V/s"
+    words = ["uncertainty", str(path), "--samples", "4", "--limit", "triple=1e9", "--json"]
+    assert main(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in found["violations"]] == ["input_rate", "triple of output 1"]
+    assert main(["show", str(path)]) == 0
+    assert "fastest change of the input" in capsys.readouterr().out
+
+
+def test_a_measure_registered_anew_replaces_the_compiled_one(registered):
+    case = rig.loads(RIG)
+    one = jaxtank.evaluate(case.loop, case.clock, ["input_rate"])["input_rate"]
+    double = RATE._replace(read=lambda run, acc: 2.0 * acc["fastest"][1])
+    assert ms.register("input_rate", double) is double
+    two = jaxtank.evaluate(case.loop, case.clock, ["input_rate"])["input_rate"]
+    np.testing.assert_allclose(two, 2.0 * one, rtol=1e-15)
+
+
+def test_measures_that_no_run_could_compute_are_refused():
+    for name, measure, own, words in (
+        ("max_level", RATE, {}, "measure 'max_level' is built in"),
+        ("two words", RATE, {}, "must be a text of letters"),
+        ("rate", "max_level", {}, "is a str: must be a jaxtank.measures.Measure"),
+        ("rate", RATE, {}, "unknown accumulator 'fastest'"),
+        ("rate", RATE, {"e2": FASTEST}, "accumulator 'e2' is built in"),
+        ("rate", RATE, {"fastest": len}, "must be a jaxtank.measures.Accumulator"),
+        ("rate", RATE._replace(per="pipe"), {"fastest": FASTEST}, "per = 'pipe': must be one of"),
+        ("rate", RATE._replace(reached="never"), {"fastest": FASTEST}, "unknown measure 'never'"),
+        ("rate", ERROR._replace(residual="u2"), {}, "needs an accumulator with a residual"),
+        (
+            "rate",
+            RATE,
+            {"fastest": FASTEST._replace(refers_to="pump")},
+            "refers_to = 'pump': must be one of",
+        ),
+    ):
+        with pytest.raises(InputError, match=words) as refused:
+            ms.register(name, measure, own)
+        assert "\n" not in str(refused.value)
+    assert "rate" not in ms.MEASURES and "fastest" not in ms.ACCUMULATORS

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.records import Trajectory
+from jaxtank.loop.trajectory import Trajectory
 from jaxtank.plots import diagnostics, responses
 
 

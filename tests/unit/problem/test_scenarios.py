@@ -13,7 +13,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.presets import Mirror, Scenario
+from jaxtank.presets import Scenario, Symmetry
 from tuning.problem.limits import Limit
 from tuning.problem.problem import Point, Problem
 from tuning.search import diagnostics, methods
@@ -136,7 +136,7 @@ def test_slopes_by_what_a_law_prepares_beforehand():
 def test_new_measures_against_the_trajectory():
     case = rig.set_values(presets.find("mirakhorli/sfc"), {"clock.duration": 100.0})
     t = jaxtank.simulate(case.loop, case.clock)
-    t = type(t)(*(np.asarray(v) for v in t))
+    t = jax.tree.map(np.asarray, t)
     names = ("mean_square_error", "mean_square_travel", "mean_square_overshoot", "input_deviation")
     found = jaxtank.evaluate(case.loop, case.clock, names)
     rest = jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[1]
@@ -486,8 +486,8 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
         problem, diagnostics.curvature(problem, Search(problem, best, lambda s: None), best)
     )
     said = re.fullmatch(
-        r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes the objective"
-        r" by (\S+) %",
+        r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes"
+        r" the objective by (\S+) %",
         words,
     )
     assert said, words
@@ -544,7 +544,7 @@ def test_mirror_images_are_named_and_counted_once():
         diagnostics.symmetric(result.problem, [], {"controller.K_phi": 0.5, "controller.K_y": 2.0})
         is None
     )
-    other = Problem(case.replace(mirror=Mirror("none", lambda v: {})))
+    other = Problem(case.replace(symmetry=Symmetry("none", lambda v: {})))
     assert diagnostics.symmetric(other, [], result.problem.values(result.problem.start())) is None
 
 

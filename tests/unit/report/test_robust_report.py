@@ -74,7 +74,9 @@ def test_what_was_expected_stands_apart_from_what_was_measured():
         measured.text
         == "on 256 new plants a limit was violated 2 times (95 % interval 0.00095 to 0.028)"
     )
-    assert "bounds the probability by 0.8 (N 16, support 1, confidence 1 - 1e-6)" in bound.text
+    assert (
+        "the probability is at most 0.8 (confidence 1 - 1e-6, support 1 of 16 plants)" in bound.text
+    )
     assert expected.code == "support-scenarios"
     assert expected.text.startswith(
         "1 of 16 plants determine the answer: up to about 5.9 % of new plants were"

@@ -18,7 +18,7 @@ from jaxtank import parameters, presets, rig
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
-from jaxtank.measures.catalogue import MEASURES, TIMES
+from jaxtank.measures import MEASURES, times
 from tuning.cli import main, options
 
 HEAD = 'case = "gouta2015/backstepping"\n'
@@ -60,7 +60,7 @@ def test_the_complete_file_is_the_case(name):
     assert dict(again.uncertain) == dict(case.uncertain) and len(again.scenarios) == len(
         case.scenarios
     )
-    assert again.reachable == case.reachable and (again.mirror is None) == (case.mirror is None)
+    assert again.reachable == case.reachable and (again.symmetry is None) == (case.symmetry is None)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -166,7 +166,7 @@ def test_every_name_stands_in_the_file_with_its_unit_and_range():
                 assert f"{'above' if meta['strict'] else 'at least'} {meta['low']:g}" in shown
     for measure in MEASURES:
         # to limit, and to make small
-        assert measure in TIMES.values() or len(re.findall(rf"(?m)^#?{measure} = ", text)) == 2
+        assert measure in times() or len(re.findall(rf"(?m)^#?{measure} = ", text)) == 2
 
 
 def test_the_short_file_has_what_differs_and_what_is_tuned():

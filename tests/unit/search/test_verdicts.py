@@ -339,7 +339,8 @@ def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
     quiet = quiet.replace(clock=dataclasses.replace(quiet.clock, duration=400.0))
     with pytest.raises(
         jaxtank.InputError,
-        match="recovery_time = 5 s: undefined on this run: no inflow disturbance begins within its 400 s",
+        match="recovery_time = 5 s: undefined on this run: no inflow disturbance begins within its"
+        " 400 s",
     ):
         resolve_limits(quiet, {"recovery_time": 5.0})
 

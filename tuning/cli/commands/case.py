@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.files import write_folder
 from tuning.cli.arguments import option
 from tuning.cli.options import report_written
 from tuning.cli.values import open_case
@@ -100,7 +101,7 @@ def _draw_rig(case, folder):
         for name in ("rig.svg", "rig.png"):
             (folder / name).unlink(missing_ok=True)
         return []
-    return artifacts.write_files(folder, alone | artifacts.pngs(drawn))
+    return write_folder(folder, alone | artifacts.pngs(drawn))
 
 
 def simulate(args):
@@ -118,7 +119,7 @@ def simulate(args):
     from tuning.search import provenance
 
     key = jax.random.key(seed) if noisy(case) else None
-    if step_size.doubts(case.loop, case.clock):
+    if step_size.step_warnings(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = dict(reported.run_measures(case.loop, case.clock, key))
     payload = {
@@ -165,14 +166,14 @@ def export(args):
     case = open_case(args)
     from jaxtank.export import source
     from jaxtank.export.printer import function_name
-    from tuning.report import artifacts, tables
+    from tuning.report import tables
 
     text = source.export(case, args.lang, args.precision, args.name)
     name = args.name or function_name(case)
     if args.json:
         print(tables.dumps({"case": case.name, "lang": args.lang, "name": name, "source": text}))
     if args.out:
-        written = artifacts.write_files(Path(args.out), {f"{name}.{args.lang}": text})
+        written = write_folder(Path(args.out), {f"{name}.{args.lang}": text})
         report_written(written, args)
     elif not args.json:
         sys.stdout.write(text)

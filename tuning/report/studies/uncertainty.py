@@ -63,7 +63,7 @@ def remarks_of(ensemble):
     """Return warnings on the draws: that the steps are too long for the rig before any is drawn."""
     return [
         f"of the rig as it is, and of draws like it: {line}"
-        for line in step_size.doubts(ensemble.case.loop, ensemble.case.clock)
+        for line in step_size.step_warnings(ensemble.case.loop, ensemble.case.clock)
     ]
 
 

@@ -1,0 +1,30 @@
+"""Values as JSON takes them. May import nothing of ours."""
+
+import math
+from typing import Any, cast
+
+import numpy as np
+
+
+def clean(value: Any) -> Any:
+    """Return `value` for JSON: arrays as lists, NaN and infinity as None.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> clean({"h": np.array([1.0, np.nan])})
+    {'h': [1.0, None]}
+    """
+    if isinstance(value, dict):
+        return {k: clean(v) for k, v in cast(dict[Any, Any], value).items()}
+    if isinstance(value, (list, tuple)):
+        return [clean(v) for v in cast(list[Any], value)]
+    if (
+        isinstance(value, (np.ndarray, np.generic))
+        or hasattr(value, "__jax_array__")
+        or type(value).__module__.startswith("jax")
+    ):
+        return clean(np.asarray(cast(Any, value)).tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value

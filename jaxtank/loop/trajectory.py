@@ -1,0 +1,217 @@
+"""A run for people: arrays with one row per saved sample, as text, table, JSON, CSV and pictures.
+
+May import `jaxtank.core`; pictures are drawn by `jaxtank.plots`, opened when they are asked for.
+"""
+
+import dataclasses
+import functools
+import io
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from jaxtank.core.files import write_folder
+from jaxtank.core.jsonable import clean
+from jaxtank.core.text import html_table
+from jaxtank.core.units import DEFAULT, local
+
+FIELDS = (
+    ("h", "x", "cm"),
+    ("y", "y", "cm"),
+    ("h_hat", "x_hat", "cm"),
+    ("r", "r", "cm"),
+    ("u", "u", "V"),
+    ("command", "command", "V"),
+    ("spilled", "spilled", "cm^3"),
+    ("d_hat", "d_hat", "cm/s"),
+)
+"""Columns of a run: (name, field of `Trajectory`, unit)."""
+
+COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied", "u", "spilled"))
+"""The fields of a `Trajectory` that are arrays."""
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=COLUMNS, meta_fields=("units",))
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Trajectory:
+    """A run for people: row k is the state at t_k, before the plant moves on.
+
+    Lengths are in the first of `units`, inputs in the second; "cm" and "V" stand for them here.
+
+    Parameters
+    ----------
+    t : (rows,) array
+        Time [s].
+    x, y, x_hat : (rows, tanks) arrays
+        Levels, measured levels, estimated levels [cm].
+    d_hat : (rows, tanks) array
+        Estimated disturbance of each level's rate [cm/s].
+    r, e : (rows, outputs) arrays
+        Setpoints, and tracking errors x - r [cm].
+    command, applied, u : (rows, pumps) arrays
+        What the controller asked for, that within the limits, and what the pumps run at over
+        [t_k, t_k + dt) [V].
+    spilled : (rows, tanks) array
+        Volume lost over each rim since the start [cm^3].
+    units : (length, pump input)
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded/open-loop").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=8.0))
+    >>> print(str(run).splitlines()[0])
+    run from 0 to 8 s: 3 rows, 2 tanks, 1 pump
+    >>> run.to_json()["t"]
+    [0.0, 4.0, 8.0]
+    """
+
+    t: Any
+    x: Any
+    y: Any
+    x_hat: Any
+    d_hat: Any
+    r: Any
+    e: Any
+    command: Any
+    applied: Any
+    u: Any
+    spilled: Any
+    units: tuple[str, str] = DEFAULT
+
+    def replace(self, **changes: Any) -> "Trajectory":
+        """Return a copy with the named fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON object: each array as lists of rows, its unit in `units`; null for what is
+        not finite.
+        """
+        units = {"t": "s", "e": local("cm", self.units), "applied": local("V", self.units)}
+        units |= {field: local(unit, self.units) for _, field, unit in FIELDS}
+        found: dict[str, Any] = {"units": {name: units[name] for name in COLUMNS}}
+        return found | {name: clean(getattr(self, name)) for name in COLUMNS}
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {name: figure}: levels and setpoints, errors, inputs.
+
+        `jaxtank.plots.responses.responses` draws runs over each other, with rims and limits.
+        """
+        from jaxtank.plots.run import figures
+
+        return figures(self)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write trajectory.csv and the pictures of `plot` to a folder, made if need be; return the
+        paths.
+
+        Raises InputError for a folder that cannot be written to.
+        """
+        from jaxtank.plots.run import figures, pngs
+
+        return write_folder(
+            folder, {"trajectory.csv": csv(self, self.units), **pngs(figures(self))}
+        )
+
+    def __str__(self) -> str:
+        if np.ndim(self.t) != 1 or isinstance(self.t, Tracer):
+            return "Trajectory of several runs, or of a traced one"
+        ends = f"run from {float(self.t[0]):g} to {float(self.t[-1]):g} s"
+        sizes = [_count(len(self.t), "row")]
+        sizes += [_count(np.shape(self.x)[1], "tank"), _count(np.shape(self.u)[1], "pump")]
+        lines = [f"{ends}: {', '.join(sizes)}"]
+        for name, *numbers in self._summary():
+            lines.append(f"  {name}: from {numbers[0]} to {numbers[1]}, at the end {numbers[2]}")
+        return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        caption, *lines = str(self).splitlines()
+        rows = self._summary() if lines else []
+        return html_table(rows, ("", "least", "most", "at the end") if rows else (), caption)
+
+    def _summary(self) -> list[list[str]]:
+        """Rows (what and its unit, least, most, last) of levels, errors and inputs."""
+        length, drive = self.units
+        rows: list[list[str]] = []
+        for words, field, unit in (
+            ("level of tank", "x", length),
+            ("error of output", "e", length),
+            ("input of pump", "u", drive),
+        ):
+            for i, column in enumerate(np.asarray(getattr(self, field)).T):
+                numbers = (column.min(), column.max(), column[-1])
+                rows.append([f"{words} {i + 1} [{unit}]", *(f"{v:.5g}" for v in numbers)])
+        return rows
+
+
+def columns(
+    run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
+) -> dict[str, Any]:
+    """Return the columns of a Trajectory, for pandas or xarray.
+
+    Time, levels h, readings y, estimates, setpoints r, inputs u, commands, and what was lost over
+    the rims.
+
+    Parameters
+    ----------
+    run : Trajectory
+        As `jaxtank.simulate` returns it.
+    units : (length, pump input)
+        Of the rig, `loop.units`.
+    dimension : str, optional
+        Name of the one dimension that all columns share in xarray.
+
+    Returns
+    -------
+    {"h1 [cm]": (rows,) array} without a dimension: `pandas.DataFrame(columns(run))`.
+    {"h1": ("t", (rows,) array, {"units": "cm"})} with dimension="t", time being its coordinate "t":
+    `xarray.Dataset(columns(run, dimension="t"))`.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.load("cascaded/open-loop").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=8.0))
+    >>> list(columns(run, loop.units))[:3]
+    ['t [s]', 'h1 [V]', 'h2 [V]']
+    """
+    found: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
+    for name, field, unit in FIELDS:
+        values = np.asarray(getattr(run, field))
+        found |= {
+            (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])
+        }
+    if dimension is None:
+        return {f"{name} [{unit}]": values for (name, unit), values in found.items()}
+    return {
+        dimension if name == "t" else name: (dimension, values, {"units": unit})
+        for (name, unit), values in found.items()
+    }
+
+
+def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
+    """Return a trajectory as CSV with units in the header; estimates of disturbances where there
+    are any.
+    """
+    known = bool(np.asarray(run.d_hat).any())
+    kept = {
+        n: v
+        for n, v in columns(run, units).items()
+        if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
+    }
+    out = io.StringIO()
+    out.write(",".join(kept) + "\n")
+    np.savetxt(out, np.column_stack(list(kept.values())), delimiter=",", fmt="%.10g")
+    return out.getvalue()
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"

@@ -1,0 +1,229 @@
+"""Which measures there are and what is known of them by name; a user's own are registered here.
+
+May import `jaxtank.core` and the other modules of `measures` only.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import jax
+
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.tree import shortened
+from jaxtank.core.units import DEFAULT, local
+from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
+from jaxtank.measures.catalogue import MEASURES, Measure
+
+BUILT_IN = frozenset(MEASURES)
+_NAME = re.compile(r"[A-Za-z]\w*")
+_SIZES: dict[str, Callable[[Any], int]] = {
+    "run": lambda plant: 1,
+    "output": lambda plant: len(plant.outputs),
+    "tank": lambda plant: plant.tanks,
+    "pump": lambda plant: plant.pumps,
+}
+
+
+def register(
+    name: str, measure: Measure, accumulators: Mapping[str, Accumulator] | None = None
+) -> Measure:
+    """Add a measure of one's own, known by `name` wherever measures are named from then on.
+
+    `evaluate`, objectives, limits, ensembles, rig files, reports and the command (called from the
+    same process) take it like any other.
+
+    Parameters
+    ----------
+    name : str
+        Letters, digits and "_"; a name that no built-in measure has.
+    measure : Measure
+    accumulators : {name: Accumulator}, optional
+        What it needs besides those of `jaxtank.measures.ACCUMULATORS`. What is registered under a
+        name again replaces what was there.
+
+    Returns
+    -------
+    Measure
+        The same.
+
+    Raises
+    ------
+    InputError
+        For a name that is taken, and a measure that no run could compute.
+
+    Examples
+    --------
+    The mean absolute error of all outputs, whose sums the loop keeps already:
+
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> from jaxtank.measures import Measure, register
+    >>> mean = Measure(
+    ...     "cm",
+    ...     "run",
+    ...     ("abs_e",),
+    ...     lambda run, sums: sum(sums["abs_e"]) / (run.samples * run.outputs),
+    ...     "mean absolute tracking error",
+    ... )
+    >>> mean is register("mean_absolute_error", mean)
+    True
+    >>> loop = jaxtank.with_values(presets.load("cascaded/pi").loop, {"x0": 1.0})
+    >>> clock = jaxtank.Clock(dt=4.0, duration=40.0)
+    >>> values = jaxtank.evaluate(loop, clock, ["mean_absolute_error", "iae"])
+    >>> print(round(float(values["iae"][0] / values["mean_absolute_error"]), 3))
+    44.0
+    >>> del jaxtank.measures.MEASURES["mean_absolute_error"]  # as it was before this example
+    """
+    own = dict(accumulators or {})
+    _check_name("measure", name, BUILT_IN)
+    for a, accumulator in own.items():
+        _check_name("accumulator", a, _BUILT_IN_ACCUMULATORS)
+        _check_accumulator(a, accumulator)
+    _check_measure(name, measure, {**ACCUMULATORS, **own})
+    replaced = MEASURES.get(name, measure) is not measure or any(
+        ACCUMULATORS.get(a, accumulator) is not accumulator for a, accumulator in own.items()
+    )
+    if replaced:
+        jax.clear_caches()  # compiled runs know a measure by its name
+    ACCUMULATORS.update(own)
+    MEASURES[name] = measure
+    return measure
+
+
+_BUILT_IN_ACCUMULATORS = frozenset(ACCUMULATORS)
+
+
+def _check_name(kind, name, taken):
+    if not (isinstance(name, str) and _NAME.fullmatch(name)):
+        raise InputError(
+            f"{kind} {shortened(name)}: a name must be a text of letters, digits and _"
+        )
+    if name in taken:
+        raise InputError(f"{kind} {name!r} is built in: choose another name")
+
+
+def _check_accumulator(name, accumulator):
+    if not isinstance(accumulator, Accumulator):
+        raise InputError(
+            f"accumulator {name!r} is a {type(accumulator).__name__}: must be a"
+            " jaxtank.measures.Accumulator"
+        )
+    if accumulator.refers_to not in ("", *Context._fields):
+        raise InputError(
+            f"accumulator {name!r}: refers_to = {accumulator.refers_to!r}: must be one of"
+            f" {', '.join(Context._fields)}, or empty"
+        )
+
+
+def _check_measure(name, measure, accumulators):
+    """Raise InputError unless `measure` fits the accumulators and the places where it is used."""
+    if not isinstance(measure, Measure):
+        raise InputError(
+            f"measure {name!r} is a {type(measure).__name__}: must be a jaxtank.measures.Measure"
+        )
+    if measure.per not in _SIZES:
+        raise InputError(
+            f"measure {name!r}: per = {measure.per!r}: must be one of {', '.join(_SIZES)}"
+        )
+    for a in (*measure.needs, *filter(None, [measure.residual])):
+        if a not in accumulators:
+            raise unknown("accumulator", a, accumulators)
+    if measure.residual and (
+        accumulators[measure.residual].residual is None or measure.scale is None
+    ):
+        raise InputError(
+            f"measure {name!r}: residual = {measure.residual!r}: needs an accumulator with a"
+            " residual, and a scale"
+        )
+    if measure.reached and measure.reached not in MEASURES:
+        raise unknown("measure", measure.reached, MEASURES)
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Raise InputError for a name that is no measure."""
+    for name in names:
+        if name not in MEASURES:
+            raise unknown("measure", name, MEASURES)
+
+
+def squares() -> tuple[str, ...]:
+    """Return the names of the measures that are sums of squares over the run."""
+    return tuple(m for m, spec in MEASURES.items() if spec.residual)
+
+
+def times() -> tuple[str, ...]:
+    """Return the names of the measures that are the time at which another one was reached: they are
+    not reported by themselves.
+    """
+    return tuple(dict.fromkeys(spec.reached for spec in MEASURES.values() if spec.reached))
+
+
+def reported() -> tuple[str, ...]:
+    """Return the names of the measures in a result: all but `times()`."""
+    return tuple(m for m in MEASURES if m not in times())
+
+
+def placed(field: str) -> tuple[str, ...]:
+    """Return the names of the measures with a place in `field`, "shown" or "summary", in order."""
+    found = {m: getattr(spec, field) for m, spec in MEASURES.items()}
+    return tuple(sorted((m for m in found if found[m]), key=lambda m: found[m]))
+
+
+def unit(name: str, units: tuple[str, str] = DEFAULT) -> str:
+    """Return the unit of measure `name` on a rig with these (length, pump input) units.
+
+    Examples
+    --------
+    >>> from jaxtank import measures
+    >>> measures.unit("ise"), measures.unit("ise", ("m", "m^3/s"))
+    ('cm^2 s', 'm^2 s')
+    """
+    return local(MEASURES[name].unit, units)
+
+
+def entries(name: str, plant: Any) -> int:
+    """Return the number of entries of measure `name` for a plant: 1, or one per output, tank or
+    pump.
+    """
+    return _SIZES[MEASURES[name].per](plant)
+
+
+def refers_to(names: Iterable[str]) -> frozenset[str]:
+    """Return the fields of `Context` that measures refer to: "window" (the changes of the
+    setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint).
+    """
+    wanted = {a for name in names for a in MEASURES[name].needs}
+    return frozenset(ACCUMULATORS[a].refers_to for a in wanted) - {""}
+
+
+def of_loop(loop: Any) -> tuple[str, ...]:
+    """Return the names of the reported measures whose setpoint changes and inflow pulses `loop`
+    has: those that a file of it may name. `serves` asks for more.
+    """
+    missing = _missing(loop)
+    return tuple(m for m in reported() if not missing & refers_to([m]))
+
+
+def serves(name: str, loop: Any) -> bool:
+    """Return whether the measure `name` means something for this loop: its reference changes, its
+    tanks have inflow pulses, its steady inputs are known in closed form, its levels have a lower
+    clip.
+    """
+    wanted, plant = refers_to([name]), loop.plant
+    if "steady" in wanted and (
+        getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs)
+    ):
+        return False
+    if "shortfall" in MEASURES[name].needs and not plant.bottom:
+        return False
+    return not wanted & _missing(loop)
+
+
+def _missing(loop: Any) -> frozenset[str]:
+    """Fields of `Context` that a run of `loop` cannot have: setpoint changes, inflow pulses."""
+    has = {
+        "window": loop.reference.changes is not None,
+        "since": loop.disturbance is not None and loop.disturbance.onset is not None,
+    }
+    return frozenset(field for field in has if not has[field])

@@ -1,0 +1,76 @@
+"""Pictures that a `Trajectory` and a `Case` draw of themselves, and figures as PNG bytes.
+
+May import the other modules of `plots` and what they import.
+"""
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jaxtank.plots import responses
+from jaxtank.plots.layout import place
+from jaxtank.plots.schematic import schematic
+
+
+def figures(run: Any) -> dict[str, Any]:
+    """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
+    time.
+    """
+    length, drive = run.units
+    colours = [colour for colour, _ in responses.RUNS]
+    groups = [
+        ("levels", "h", run.x, length),
+        ("setpoints", "r", run.r, length),
+        ("tracking errors", "e", run.e, length),
+        ("inputs", "u", run.u, drive),
+    ]
+    with responses.styled():
+        figure, axes = plt.subplots(
+            len(groups), figsize=(6.4, 7.5), sharex=True, layout="constrained"
+        )
+        for ax, (title, symbol, values, unit) in zip(axes, groups):
+            for i in range(values.shape[1]):
+                colour, style = colours[i % len(colours)], "-" if i < len(colours) else "--"
+                ax.plot(
+                    run.t, values[:, i], color=colour, linestyle=style, label=f"{symbol}{i + 1}"
+                )
+            ax.set(title=title, ylabel=f"[{unit}]")
+            if values.shape[1] <= responses.SHOWN:
+                ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))  # beside the lines
+        axes[-1].set_xlabel("time [s]")
+    return {"run": figure}
+
+
+def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
+    """Return {"rig": figure}, the schematic of a plant, filled as at the end of a Trajectory; {}
+    for one that is no network of tanks.
+    """
+    if not hasattr(plant, "links"):
+        return {}
+    where = place(plant)
+    wide, high = where.right - where.left, where.top - where.bottom
+    with responses.styled():
+        figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
+        ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
+        if run is not None and np.all(np.isfinite(run.x[-1])):
+            schematic(ax, plant, run.x[-1], run.r[-1])
+        else:
+            schematic(ax, plant)
+        ax.set_title(responses.plain(title))
+    return {"rig": figure}
+
+
+def png(figure: Any) -> bytes:
+    """Return a figure as PNG bytes, and close it."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", metadata={"Software": None})
+    plt.close(figure)
+    return out.getvalue()
+
+
+def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return {file name: PNG bytes} of {name: figure}; the figures are closed."""
+    return {f"{name}.png": png(figure) for name, figure in drawn.items()}
