@@ -76,7 +76,11 @@ def load(paper: str) -> Preset:
 
     Parameters
     ----------
-    paper : one of PAPERS
+    paper : one of PAPERS, or "paper/case"
+
+    Returns
+    -------
+    Preset; a Case for "paper/case"
 
     Raises
     ------
@@ -121,6 +125,10 @@ class Cases(dict):
 def names() -> list[str]:
     """Return every case as "paper/case", in the order of the papers.
 
+    Returns
+    -------
+    list of text
+
     Examples
     --------
     >>> "khalid/gpc" in names()
@@ -135,6 +143,10 @@ def find(name: str) -> Case:
     Parameters
     ----------
     name : "paper/case", as `names` lists them
+
+    Returns
+    -------
+    Case
 
     Raises
     ------

@@ -50,9 +50,9 @@ EVERY = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
 
 @functools.cache
-def replayed(name, noise=1e-4, values=()):
+def replayed(name, noise=1e-4, values=(), filtered=False):
     """(Case, Trajectory, setpoints with rates) of a run of 10,000 samples as host arrays; noise: as
-    a share of the highest rim; values: what is set, as pairs.
+    a share of the highest rim; values: what is set, as pairs; filtered: with a safety filter.
     """
     case = presets.find(name)
     noise = noise * float(np.max(np.asarray(case.loop.plant.rim)))
@@ -62,7 +62,7 @@ def replayed(name, noise=1e-4, values=()):
         "actuator.delay": 0.0,
         **dict(values),
     }
-    case = rig.set_values(case, values)
+    case = rig.filtered(rig.set_values(case, values), filtered or None)
     run = jax.tree.map(np.asarray, jaxtank.simulate(case.loop, case.clock, jax.random.key(1)))
     signals = [
         np.stack([np.asarray(v) for v in part], axis=1)
@@ -127,6 +127,16 @@ def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
     reach = max(1.0, float(np.abs(run.applied).max()))
     assert len(told) == SAMPLES and np.ptp(run.applied) > 0
     np.testing.assert_allclose(told, run.applied, atol=1e-9 * reach, rtol=0)
+
+
+@needs_gcc
+def test_c_has_the_safety_filter_of_the_loop(tmp_path):
+    """Within 1e-9 of the pumps' range, of a run in which the filter acts."""
+    case, run, signals = replayed("cascaded/pi", filtered=True)
+    applied = Compiled(case, tmp_path).run(case, run, signals)
+    high = float(case.loop.actuator.high[0])
+    assert np.any((run.command > run.applied + 0.1) & (run.applied < high - 0.1))
+    np.testing.assert_allclose(applied, run.applied, atol=1e-9 * high, rtol=0)
 
 
 @pytest.mark.slow
