@@ -13,7 +13,8 @@ from scipy.special import gammaincinv
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.certificate import TankCertificate, design, widths_of
+from jaxtank.safety.box import widths_of
+from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.inflows import InflowPulses
 

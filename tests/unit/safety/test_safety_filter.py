@@ -15,7 +15,8 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import design
-from jaxtank.safety.certificate import rate_bound, widths_of
+from jaxtank.safety.box import widths_of
+from jaxtank.safety.certificate import rate_bound
 
 NAMES = ("drain", "orifice", "pipe", "pump_gain", "split")
 

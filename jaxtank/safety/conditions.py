@@ -1,0 +1,121 @@
+"""The conditions of the theorems, tank by tank, and what a filter costs.
+
+May be imported by `safety.certificate`.
+"""
+
+import math
+
+import numpy as np
+
+from jaxtank.safety.filter import FLOOR
+from jaxtank.safety.setting import (
+    full_pumps,
+    highest_level,
+    phi,
+    resting_level,
+    sqrt_of,
+    unstoppable,
+)
+
+
+def theorem_of(setting):
+    """The theorem that proves the limit of a tank with a pump."""
+    if setting.lag > 0.0:
+        return "Theorem 4"
+    return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
+
+
+def failed_condition(setting, tank, heights, slopes, idle, kappa, bound, start):
+    """The condition that keeps the limit of one tank from being proved, or ""."""
+    rates = setting.rates
+    if start is not None and np.asarray(start)[tank] > heights[tank] * (1.0 + 1e-12):
+        return f"start at {np.asarray(start)[tank]:.4g} cm, above the limit {heights[tank]:.4g} cm"
+    if idle:
+        return ""
+    if setting.pulse:
+        return "a pulse dead zone pays out more than was commanded"
+    if kappa > bound * (1.0 + 1e-12):
+        return f"kappa {kappa:.3g} above its bound {bound:.3g} 1/s"
+    if slopes[tank] > 0.0:
+        return _too_high_above(setting, tank, heights, slopes, start)
+    if not rates.pumps[tank] or (setting.delay == 0.0 and setting.lag == 0.0):
+        return ""
+    if any(i == tank for i, *_ in rates.pipes):
+        return "a pipe with dead time or lag: not proved"
+    steep = rates.out[tank] / math.sqrt(heights[tank])
+    if kappa < steep:
+        return f"(N) kappa {kappa:.3g} below c_min/sqrt(H) = {steep:.3g} 1/s"
+    if setting.lag > 0.0:
+        brought = full_pumps(setting, tank) + setting.phi(tank, 0.0, heights)
+        filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
+        if filled > 0.75 * heights[tank]:
+            return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
+    return ""
+
+
+def _too_high_above(setting, tank, heights, slopes, start):
+    """Why the levels `start` do not allow a second-order row to begin (g >= 0), or ""."""
+    if start is None:
+        return ""
+    start, rates, knee = np.asarray(start), setting.rates, setting.rates.knee
+    a0 = FLOOR * sqrt_of(heights[tank], knee)
+    g = rates.out[tank] * sqrt_of(start[tank], knee)
+    g += slopes[tank] * (heights[tank] - start[tank])
+    for j, sink, _, most in rates.links:
+        if sink == tank:
+            g -= most * max(sqrt_of(start[j], knee), a0)
+    return "" if g >= 0.0 else "start: the tanks above hold more than can be stopped in time"
+
+
+def settle(setting, heights, slopes, idle, reasons, plant):
+    """(n,) levels that no tank passes [cm]. A tank that relies on one which is not certified loses
+    its certificate (in `reasons`) unless its condition holds for what that one may reach.
+    """
+    rates, n = setting.rates, len(heights)
+    while True:
+        reach = _reach(setting, heights, [not why for why in reasons], plant)
+        before = list(reasons)
+        for i in (i for i in range(n) if not reasons[i]):
+            extra = full_pumps(setting, i) if idle[i] else unstoppable(setting, i)
+            above = [j + 1 for j, sink, *_ in rates.links if sink == i and reasons[j]]
+            fails = setting.phi(i, heights[i], reach) + extra > 1e-9 * max(rates.out[i], 1e-9)
+            if above if slopes[i] > 0.0 else fails:
+                others = above or [j + 1 for j in range(n) if reasons[j]]
+                reasons[i] = f"relies on tank {', '.join(map(str, others))}, not certified"
+        if reasons == before:
+            return reach
+
+
+def _reach(setting, heights, certified, plant):
+    """(n,) levels that no tank passes [cm]: H where certified, else where its inflow can rest."""
+    n, rim = len(heights), np.asarray(plant.rim, dtype=float)
+    reach = np.array(heights)
+    for _ in range(50):
+        before = reach.copy()
+        for i in (i for i in range(n) if not certified[i]):
+            reach[i] = max(reach[i], resting_level(setting, i, reach))
+            if plant.overflow:
+                reach[i] = min(reach[i], max(rim[i], heights[i]))
+        if np.allclose(reach, before, rtol=1e-9, atol=0.0):
+            return reach
+    return np.where(certified, heights, rim if plant.overflow else np.inf)
+
+
+def gap_of(setting, nominal, tank, kappa, limit, reach):
+    """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
+    full, or its limit where that is lower; nan for a tank without a pump.
+    """
+    rates, eps = setting.rates, setting.band[tank]
+    if not rates.pumps[tank]:
+        return math.nan
+    most = sum(b for _, b in rates.pumps[tank].values())
+    full = sum(b * max(setting.high[j], 0.0) for j, (_, b) in nominal.pumps[tank].items())
+    gain = sum(b for _, b in nominal.pumps[tank].values())
+    others = np.minimum(reach + setting.spare, 1e6)
+
+    def filtered(h):
+        cap = max(0.0, kappa * (limit - h - eps) - phi(rates, tank, h - eps, others))
+        return min(full, gain / most * cap) + phi(nominal, tank, h, others)
+
+    free = lambda h: full + phi(nominal, tank, h, others)
+    return float(highest_level(free, limit) - highest_level(filtered, limit))

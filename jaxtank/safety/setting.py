@@ -1,0 +1,80 @@
+"""What the conditions of the theorems are computed from, in plain numbers.
+
+May be imported by the rest of `jaxtank.safety`.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.safety.worst_case import Rates
+
+
+class Setting(NamedTuple):
+    """What the conditions need: coefficients over the box, times [s], pumps' limits [V], bands."""
+
+    rates: Rates
+    hold: float
+    delay: float
+    lag: float
+    low: np.ndarray
+    high: np.ndarray
+    band: np.ndarray
+    top: np.ndarray
+    spare: np.ndarray
+    pulse: bool
+
+    def phi(self, tank, level, others):
+        """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
+        return phi(self.rates, tank, level, np.asarray(others) + self.spare)
+
+
+def phi(rates: Rates, tank: int, level: float, others: Any) -> float:
+    """Phi_max(level) [cm/s] in plain numbers; see `worst_case.rise`."""
+    knee, h = rates.knee, max(level, 0.0)
+    empty = h < rates.empty[tank]
+    rate = rates.inflow[tank] - (0.0 if empty else rates.out[tank] * sqrt_of(h, knee))
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            z = others[j] - h
+            s = math.copysign(math.sqrt(abs(z)), z) if not math.isinf(z) else z
+            s = z / (z * z + knee * knee) ** 0.25 if abs(z) < 1e6 else s
+            rate += most * s if s >= 0.0 else (0.0 if empty else least * s)
+    for source, sink, _, most in rates.links:
+        if sink == tank:
+            rate += most * sqrt_of(max(others[source], 0.0), knee)
+    return rate
+
+
+def sqrt_of(h, knee):
+    """The root of the plant's flows (`numerics.root`) of a level h >= 0 in plain numbers."""
+    return math.sqrt(h) if h >= knee else math.sqrt(knee) * (1.5 * h / knee - 0.5 * (h / knee) ** 2)
+
+
+def unstoppable(setting, tank):
+    """What pumps with a lower limit above 0 V always bring [cm/s]."""
+    return sum(b * max(setting.low[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def full_pumps(setting, tank):
+    """What full pumps bring at most [cm/s]."""
+    return sum(b * max(setting.high[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def resting_level(setting, tank, others):
+    """Level [cm] at which a tank rests with the most that may enter; inf if it never does."""
+    full = full_pumps(setting, tank)
+    level = highest_level(lambda h: full + setting.phi(tank, h, others), 1e6)
+    return math.inf if level == 1e6 else level * (1.0 + 1e-9)
+
+
+def highest_level(rate, top):
+    """The level [cm] up to which rate(level), which falls with it, is above 0; `top` at most."""
+    low, high = 0.0, top
+    if rate(top) > 0.0:
+        return top
+    for _ in range(60):
+        mid = 0.5 * (low + high)
+        low, high = (mid, high) if rate(mid) > 0.0 else (low, mid)
+    return low
