@@ -13,8 +13,12 @@ import jax
 import numpy as np
 import pytest
 
+from jaxtank import presets
 from jaxtank.core.tree import parameters
+from jaxtank.export import source
+from jaxtank.measures import accumulators, catalogue
 from jaxtank.presets import Free
+from jaxtank.rig import components
 from tuning.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -103,3 +107,29 @@ def assert_same_case(a, b):
     assert all(np.array_equal(limit, b.limits[measure]) for measure, limit in a.limits.items())
     assert {n: Free(*s) for n, s in a.free.items()} == {n: Free(*s) for n, s in b.free.items()}
     assert dict(a.objective) == dict(b.objective)
+
+
+REGISTRIES = (
+    *(role.classes for role in components.ROLES.values()),
+    components.REGISTERED,
+    catalogue.MEASURES,
+    accumulators.ACCUMULATORS,
+    presets._ADDED,
+    source.LANGUAGES,
+)
+"""Where classes, measures, papers and languages of a user's own are registered."""
+
+
+@contextlib.contextmanager
+def registries_kept():
+    """Take out afterwards what is registered inside."""
+    papers = list(presets.PAPERS)
+    before = [dict(t) if isinstance(t, dict) else set(t) for t in REGISTRIES]
+    try:
+        yield
+    finally:
+        for table, old in zip(REGISTRIES, before):
+            table.clear()
+            table.update(old)
+        presets.PAPERS[:] = papers
+        presets._load.cache_clear()

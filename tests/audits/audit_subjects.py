@@ -123,7 +123,7 @@ def _(rng):
     return 10 ** rng.uniform(-6, 3), numerics.root_of_mean
 
 
-@subject("numerics.at_least clip portion magnitude", quick=True, points=40)
+@subject("numerics.lower_clip clip portion magnitude", quick=True, points=40)
 def _(rng):
     low, high = np.sort(rng.normal(size=2))
     return (rng.normal(), low, high), lambda p: (

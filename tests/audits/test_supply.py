@@ -74,7 +74,7 @@ READS = {
 MADE = {
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
-    ("tuning.cli.main", "_run", "import_module"): "modules of its own table of commands",
+    ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -83,6 +83,7 @@ READ = {
     ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
     ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
+    ("tuning.report.html", "style", "read_text"): "page.css of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
@@ -326,7 +327,7 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         "jaxtank/README.md",
         "tuning/README.md",
     } <= packed
-    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "md", "txt", "typed"}
+    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "css", "md", "txt", "typed"}
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 

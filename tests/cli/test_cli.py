@@ -821,7 +821,7 @@ BAD = [  # arguments, words that the line must have
     (["simulate", "broken.toml"], "'broken.toml' is not TOML"),
     (
         ["tune", "far.toml"],
-        "'far.toml': reference: outputs (16, 3) cm have no steady state: tank 4",
+        "'far.toml': reference: outputs (16, 3) cm have no steady state: the outflow of tank 4",
     ),
     (["simulate", "zero.toml"], "'zero.toml': reference.targets[0] = 0 cm: must be above 0 cm"),
     (["tune", "limit.toml"], "'limit.toml': unknown measure 'max_levl'; nearest: max_level"),
@@ -878,7 +878,7 @@ BAD = [  # arguments, words that the line must have
     ),
     (
         ["simulate", CASE, *setting("reference.initial[0]=16")],
-        "outputs (16, 3) cm have no steady state: tank 4",
+        "outputs (16, 3) cm have no steady state: the outflow of tank 4",
     ),
     (["simulate", CASE, *setting("reference.ramp=nan")], "reference.ramp = nan"),
     (["simulate", CASE, *setting("reference.ramp=-1")], "reference.ramp = -1 s"),
@@ -1029,7 +1029,7 @@ BAD = [  # arguments, words that the line must have
     (["tune", CASE, "--tradeoff", "max_level=30:20"], "--tradeoff 'max_level=30:20'"),
     (
         ["tune", "still.toml", "--tradeoff", "rise_time=10:20:2"],
-        "no setpoint is stepped within its 200 s",
+        "no setpoint has a step within its 200 s",
     ),
     (
         ["tune", CASE, "--tradeoff", "max_levl=20:30"],

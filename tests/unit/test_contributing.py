@@ -9,34 +9,24 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from helpers import registries_kept
 
 import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.export import export, source
-from jaxtank.measures import accumulators, catalogue
-from jaxtank.rig import components
+from jaxtank.measures import catalogue
 from tuning.cli.main import main
 
 PAGE = next(p for p in Path(__file__).resolve().parents if (p / ".github").is_dir()) / (
     ".github/CONTRIBUTING.md"
-)
-TABLES = (
-    components.ROLES["law"].classes,
-    components.REGISTERED,
-    catalogue.MEASURES,
-    accumulators.ACCUMULATORS,
-    presets._ADDED,
-    source.LANGUAGES,
 )
 
 
 @pytest.fixture
 def added(tmp_path):
     """Save the code below the heading "Add a ..." as a module in a folder, and import it."""
-    papers = list(presets.PAPERS)
-    before = [dict(t) if isinstance(t, dict) else set(t) for t in TABLES]
 
     def add(what):
         section = PAGE.read_text().split(f"## Add {what}\n")[1].split("\n## ")[0]
@@ -48,12 +38,8 @@ def added(tmp_path):
         spec.loader.exec_module(module)
         return module
 
-    yield add
-    for table, old in zip(TABLES, before):
-        table.clear()
-        table.update(old)
-    presets.PAPERS[:] = papers
-    presets._load.cache_clear()
+    with registries_kept():
+        yield add
     jax.clear_caches()
 
 

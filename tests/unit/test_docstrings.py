@@ -8,6 +8,7 @@ from enum import Enum
 from pathlib import Path
 
 import pytest
+from helpers import registries_kept
 
 import jaxtank
 import tuning
@@ -77,5 +78,6 @@ def test_examples_run(name, tmp_path, monkeypatch):
         pytest.importorskip("gymnasium")
     monkeypatch.chdir(tmp_path)
     module = importlib.import_module(name)
-    found = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
+    with registries_kept():
+        found = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
     assert found.failed == 0 and found.attempted > 0
