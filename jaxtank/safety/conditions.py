@@ -71,19 +71,28 @@ def settle(setting, heights, slopes, idle, reasons, plant):
     """(n,) levels that no tank passes [cm]. A tank that relies on one which is not certified loses
     its certificate (in `reasons`) unless its condition holds for what that one may reach.
     """
-    rates, n = setting.rates, len(heights)
     while True:
         reach = _reach(setting, heights, [not why for why in reasons], plant)
         before = list(reasons)
-        for i in (i for i in range(n) if not reasons[i]):
-            extra = full_pumps(setting, i) if idle[i] else unstoppable(setting, i)
-            above = [j + 1 for j, sink, *_ in rates.links if sink == i and reasons[j]]
-            fails = setting.phi(i, heights[i], reach) + extra > 1e-9 * max(rates.out[i], 1e-9)
-            if above if slopes[i] > 0.0 else fails:
-                others = above or [j + 1 for j in range(n) if reasons[j]]
-                reasons[i] = f"relies on tank {', '.join(map(str, others))}, not certified"
+        for i, why in enumerate(before):
+            others = [] if why else _relied_on(setting, i, heights, slopes, idle, reasons, reach)
+            if others:
+                names = ", ".join(str(j + 1) for j in others)
+                reasons[i] = f"relies on tank {names}, not certified"
         if reasons == before:
             return reach
+
+
+def _relied_on(setting, tank, heights, slopes, idle, reasons, reach):
+    """[tanks without a certificate that the proof of `tank` needs], [] where it holds as it is."""
+    rates = setting.rates
+    above = [j for j, sink, *_ in rates.links if sink == tank and reasons[j]]
+    if slopes[tank] > 0.0:
+        return above
+    extra = full_pumps(setting, tank) if idle[tank] else unstoppable(setting, tank)
+    if setting.phi(tank, heights[tank], reach) + extra <= 1e-9 * max(rates.out[tank], 1e-9):
+        return []
+    return above or [j for j, why in enumerate(reasons) if why]
 
 
 def _reach(setting, heights, certified, plant):

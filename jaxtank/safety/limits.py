@@ -75,32 +75,53 @@ def _rim_words(setting, tank, heights):
 
 def _second_order(setting, tank, heights, kappa):
     """(k1 [1/s], "") for a tank that the pumps above it can hold, or (0, the failed condition)."""
-    rates, hold = setting.rates, setting.hold
-    sources = [(j, least, most) for j, sink, least, most in rates.links if sink == tank]
-    above = {j for j, *_ in sources}
+    rates = setting.rates
     if rates.pumps[tank]:
         return 0.0, ""
+    sources = [(j, most) for j, sink, _, most in rates.links if sink == tank]
+    why = _other_topology(setting, tank, {j for j, _ in sources})
+    if not why and kappa * setting.hold > 1.0:
+        why = f"k2 T = {kappa * setting.hold:.3g} above 1"
+    why = why or _empty_above(setting, tank, heights, sources)
+    slope, why = (0.0, why) if why else _slope(setting, tank, heights, sources)
+    return slope, why and f"second order: {why}"
+
+
+def _other_topology(setting, tank, above):
+    """Why the proof does not cover a tank below the tanks `above`, or ""."""
+    rates = setting.rates
     if setting.delay > 0.0 or setting.lag > 0.0:
-        return 0.0, "second order: not proved with dead time or lag"
-    others = {i for pipe in rates.pipes for i in pipe[:2]}
-    if others & (above | {tank}) or any(rates.inflow[i] > 0.0 for i in (tank, *above)):
-        return 0.0, "second order: not proved with pipes or inflow disturbances"
+        return "not proved with dead time or lag"
+    piped = {i for pipe in rates.pipes for i in pipe[:2]}
+    if piped & (above | {tank}):
+        return "not proved with pipes"
+    if any(rates.inflow[i] > 0.0 or setting.spare[i] > 0.0 for i in (tank, *above)):
+        return "not proved with inflow disturbances"
     if any(sink in above for _, sink, *_ in rates.links) or not all(rates.pumps[j] for j in above):
-        return 0.0, "second order: not proved where the tanks above are fed by others"
-    if any(setting.low > 0.0):
-        return 0.0, "second order: not proved for pumps that cannot stop"
-    if kappa * hold > 1.0:
-        return 0.0, f"second order: k2 T = {kappa * hold:.3g} above 1"
-    top, knee = heights[tank], rates.knee
-    full = sum(most * sqrt_of(heights[j], knee) for j, _, most in sources)
-    drained = MARGIN * sum(0.5 * most * rates.out[j] for j, _, most in sources)
-    a0 = FLOOR * sqrt_of(top, knee)
+        return "not proved where the tanks above are fed by others"
+    return "not proved for pumps that cannot stop" if any(setting.low > 0.0) else ""
+
+
+def _empty_above(setting, tank, heights, sources):
+    """Why (C3) fails: at g = 0 every tank above holds more than a0; or ""."""
+    rates, knee = setting.rates, setting.rates.knee
+    a0 = FLOOR * sqrt_of(heights[tank], knee)
     if a0**2 < knee:
-        return 0.0, f"second order: laminar threshold {knee:g} above {a0**2:.3g}"
-    for j, _, most in sources:
-        left = rates.out[tank] * sqrt_of(top, knee) - (full - most * sqrt_of(heights[j], knee))
+        return f"laminar threshold {knee:g} above {a0**2:.3g}"
+    full = sum(most * sqrt_of(heights[j], knee) for j, most in sources)
+    certain = rates.out[tank] * sqrt_of(heights[tank], knee)
+    for j, most in sources:
+        left = certain - (full - most * sqrt_of(heights[j], knee))
         if left <= most * a0:
-            return 0.0, f"second order: (C3) {left:.3g} not above {most * a0:.3g} cm/s"
+            return f"(C3) {left:.3g} not above {most * a0:.3g} cm/s"
+    return ""
+
+
+def _slope(setting, tank, heights, sources):
+    """(the largest k1 [1/s] that meets (C1), (C2) and (C4), "") or (0, why there is none)."""
+    rates, hold, top, knee = setting.rates, setting.hold, heights[tank], setting.rates.knee
+    full = sum(most * sqrt_of(heights[j], knee) for j, most in sources)
+    drained = MARGIN * sum(0.5 * most * rates.out[j] for j, most in sources)
     for k1 in np.geomspace(1.0 / hold, 1e-4, 2000):
         if k1 * top < full:  # (C2)
             break
@@ -110,7 +131,7 @@ def _second_order(setting, tank, heights, kappa):
         steep = rates.out[tank] * 0.5 / math.sqrt(lowest) if lowest > knee else math.inf
         if k1**2 * (top - level) <= drained and k1 > steep:  # (C1), (C4)
             return float(k1), ""
-    return 0.0, f"second order: no k1 with (C1) k1^2 (H - h*) <= {drained:.3g} cm/s^2"
+    return 0.0, f"no k1 with (C1) k1^2 (H - h*) <= {drained:.3g} cm/s^2"
 
 
 def _crossing(out, k1, top, full):

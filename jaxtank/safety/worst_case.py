@@ -43,49 +43,54 @@ def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> R
     """
     n = least.tanks
     slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
-    out, out_most = ([plant.drain[i] for i in range(n)] for plant in (least, most))
-    for k, (source, _) in enumerate(least.links):
-        out[source] = out[source] + least.orifice[k]
-        out_most[source] = out_most[source] + most.orifice[k]
+    out, out_most = _free_outlets(least), _free_outlets(most)
     everything = list(out_most)
     for k, ends in enumerate(least.pipes):
         for i in ends:
             everything[i] = everything[i] + most.pipe[k]
     links = tuple(
-        (
-            source,
-            sink,
-            least.orifice[k] * slow / most.area[sink],
-            most.orifice[k] * fast / least.area[sink],
-        )
-        for k, (source, sink) in enumerate(least.links)
+        (i, j, least.orifice[k] * slow / most.area[j], most.orifice[k] * fast / least.area[j])
+        for k, (i, j) in enumerate(least.links)
     )
     pipes = tuple(
         (i, j, least.pipe[k] * slow / most.area[i], most.pipe[k] * fast / least.area[i])
         for k, ends in enumerate(least.pipes)
         for i, j in (ends, ends[::-1])
     )
-    pumps: tuple[dict, ...] = tuple({} for _ in range(n))
-    for j, (first, second) in enumerate(least.feeds):
-        share = (least.split[j], most.split[j]) if second is not None else (1.0, 1.0)
-        _feed(pumps[first], j, least, most, first, *share)
-        if second is not None:
-            _feed(pumps[second], j, least, most, second, 1.0 - share[1], 1.0 - share[0])
     # with `bottom`, outflow is limited below this level (see TankNetwork.limited)
-    empty = tuple(
+    empty = [
         (step * fast * everything[i] / least.area[i]) ** 2 if least.bottom else 0.0
         for i in range(n)
-    )
+    ]
     return Rates(
         out=tuple(out[i] * slow / most.area[i] for i in range(n)),
         out_most=tuple(out_most[i] * fast / least.area[i] for i in range(n)),
         links=links,
         pipes=pipes,
-        pumps=pumps,
+        pumps=_pumps(least, most),
         inflow=tuple(inflow[i] / least.area[i] for i in range(n)),
         knee=least.knee,
-        empty=empty,
+        empty=tuple(empty),
     )
+
+
+def _free_outlets(plant):
+    """[area of what leaves each tank freely, drain and orifices [cm^2]]."""
+    out = [plant.drain[i] for i in range(plant.tanks)]
+    for k, (source, _) in enumerate(plant.links):
+        out[source] = out[source] + plant.orifice[k]
+    return out
+
+
+def _pumps(least, most):
+    """(n) {pump: (least, largest) gain into the tank [cm/(s V)]}."""
+    pumps: tuple[dict, ...] = tuple({} for _ in range(least.tanks))
+    for j, (first, second) in enumerate(least.feeds):
+        share = (least.split[j], most.split[j]) if second is not None else (1.0, 1.0)
+        _feed(pumps[first], j, least, most, first, *share)
+        if second is not None:
+            _feed(pumps[second], j, least, most, second, 1.0 - share[1], 1.0 - share[0])
+    return pumps
 
 
 def _feed(pumps, pump, least, most, tank, share_least, share_most):
