@@ -1,4 +1,4 @@
-"""What the linear predictive controllers of khalid share: the incremental model, the quadratic cost,
+"""Base of the linear predictive controllers of khalid: the incremental model, the quadratic cost,
 the constraints, and the sampled controller.
 """
 
@@ -23,7 +23,8 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-# laminar threshold of the roots in the linearisation, in the rig's length unit: the paper's roots are exact
+# laminar threshold of the roots in the linearisation, in the rig's length unit: the roots of the
+# paper are exact
 EXACT = 1e-9
 
 
@@ -35,13 +36,13 @@ class Memory(NamedTuple):
 
 
 def incremental_model(model, operating_point, dt):
-    """Return (A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid
-    eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
+    """Return (A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample
+    (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
 
         A = [[Am, 0], [Cm Am, I]],   B = [Bm; Cm Bm],   C = [0, I]
 
-    Am, Bm: the rig linearised at the operating point and sampled. No steady-state input enters: u is
-    absolute, and its increments are optimised.
+    Am, Bm: the rig linearised at the operating point and sampled. No steady-state input enters:
+    u is absolute, and its increments are optimised.
 
     Parameters
     ----------
@@ -57,7 +58,8 @@ def incremental_model(model, operating_point, dt):
     --------
     >>> from jaxtank import presets
     >>> model = presets.find("khalid/gpc").loop.plant
-    >>> [v.shape for v in incremental_model(model, np.array([0.3, 0.06]), 5.0)]
+    >>> point = np.array([0.3, 0.06])
+    >>> [v.shape for v in jax.eval_shape(lambda: incremental_model(model, point, 5.0))]
     [(3, 3), (3, 1), (1, 3)]
     """
     still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
@@ -119,11 +121,11 @@ class LinearPredictive(Controller):
     """A sampled controller u(k) = u(k-1) + du(k) [V] whose du minimises a quadratic cost over a
     horizon, on the incremental model (khalid section III).
 
-    Fields of every such controller: model, operating_point, r_w, q, du_limit, u_low, u_high, Np, mode.
-    `mode`: "unconstrained" is the linear control law du = -K x_e, without limits; "clipped" holds
-    its du within du_limit and then u within [u_low, u_high]; "constrained" solves the quadratic
-    programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes
-    S4.4). u(k-1) is the input after the pumps' limits, which is the only anti-windup.
+    Fields of every such controller: model, operating_point, r_w, q, du_limit, u_low, u_high, Np,
+    mode. `mode`: "unconstrained" is the linear control law du = -K x_e, without limits; "clipped"
+    holds its du within du_limit and then u within [u_low, u_high]; "constrained" solves the
+    quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid
+    notes S4.4). u(k-1) is the input after the pumps' limits, which is the only anti-windup.
 
     Examples
     --------
@@ -149,18 +151,20 @@ class LinearPredictive(Controller):
 
     @abc.abstractmethod
     def basis(self) -> jax.Array:
-        """Return (Np, m, variables): increments of m pumps over the horizon, one column per variable."""
+        """Return (Np, m, variables): increments of the pumps over Np samples, by variable."""
 
     def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Return (Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt`
-        [s]; see `quadratic_cost`.
+        """Return (Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period
+        `dt` [s]; see `quadratic_cost`.
         """
         basis = self.basis()
         A, B, C = incremental_model(self.model, self.operating_point, dt)
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
-        """Return K (m, n+q) of the linear control law du = -K [dx_m; y - r] [V/cm], at period `dt` [s]."""
+        """Return K (m, n+q) [V/cm] of the linear control law du = -K [dx_m; y - r], at period `dt`
+        [s].
+        """
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 
@@ -190,8 +194,8 @@ class LinearPredictive(Controller):
         return tuple(u), Memory(x=x, u=state.u)
 
     def _constrained(self, before, error, dt):
-        """Return (m,) first increments of the quadratic programme, for inputs `before` (m) and error x_e
-        (n+q,).
+        """Return the first increments (m,) of the quadratic programme, for inputs `before` (m) and
+        error x_e (n+q,).
 
         Rows of Laguerre functions are nearly collinear; the interior point converges all the same.
         """
