@@ -1,4 +1,7 @@
-"""Laws: from setpoint and estimate to pump voltages."""
+"""Controllers: from setpoint and estimate to pump voltages.
+
+Imports analysis, plants, instruments, signals and core; may be imported by the loop and above.
+"""
 
 from jaxtank.controllers.backstepping import Backstepping
 from jaxtank.controllers.base import Controller

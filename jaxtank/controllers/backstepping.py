@@ -21,27 +21,39 @@ from jaxtank.signals.base import Signal
 
 @component
 class Backstepping(Controller):
-    """Backstepping law of gouta2015, eqs. (46)-(48), for the state-coupled four-tank.
+    """Backstepping of gouta2015, eqs. (46)-(48), for the state-coupled four-tank.
 
         v_i = -(k + k1) (z_i - c_i sqrt(r_i) + k1 (h_i - r_i)),     z = inflow of the lower tanks,
         c_i sqrt(r_i): their outflow at r
 
-    followed by the inversion of `decoupling.decouple`. The printed law knows no rates of the
-    reference and lags behind ramps; with `reference_rates` it carries the missing terms (gouta2015
-    notes S4.4; not in the paper):
+    followed by the inversion of `feedback_linearisation.decouple`; h, r [cm], v [cm/s^2]. The
+    printed control law has no derivatives of the reference and lags behind ramps; with
+    `reference_rates` it has the missing terms (gouta2015 notes S4.4; not in the paper):
 
         v_i = r''_i + c_i r'_i / (2 sqrt(r_i)) - (k + k1) (z_i - c_i sqrt(r_i) - r'_i + k1 (h_i -
         r_i))
 
-    k and k1 act through k1 and k + k1 only, so k is weakly felt.
+    k and k1 enter through k1 and k + k1 only: the loop is insensitive to k where k1 is much larger.
+
+    Examples
+    --------
+    At the steady state the voltages are those that hold the levels:
+
+    >>> from jaxtank.plants.rigs import state_coupled_four_tank
+    >>> controller = Backstepping(
+    ...     model=state_coupled_four_tank(21.213), k=0.03, k1=0.088, level_floor=0.01
+    ... )
+    >>> tick = Tick(t=0.0, r=(9.0, 9.0), dr=(0.0, 0.0), ddr=(0.0, 0.0))
+    >>> upper = 9.0 * (0.48**2 / (0.38**2 + 0.31**2)) ** 2
+    >>> (u1, u2), _ = controller.step((), tick, Estimate(x=(9.0, 9.0, upper, upper)))
+    >>> round(float(u1), 2), round(float(u2), 2)
+    (3.13, 3.13)
     """
 
     model: Plant
     k: float = leaf("1/s", "gain k of the second step", low=0.0, strict=True)
     k1: float = leaf("1/s", "gain k1 of the first step", low=0.0, strict=True)
-    level_floor: float = leaf(
-        "cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True
-    )
+    level_floor: float = leaf("cm", "lower clip of the levels in the roots", low=0.0, strict=True)
     reference_rates: bool = static(
         "-", "use r' and r'' (backstepping-ff)", choices=(False, True), default=False
     )

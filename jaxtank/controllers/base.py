@@ -1,4 +1,7 @@
-"""What every law is to the loop."""
+"""Interface between a controller and the loop.
+
+Imports core, instruments and signals; may be imported by the loop and by every controller.
+"""
 
 import abc
 from collections.abc import Sequence
@@ -11,69 +14,115 @@ from jaxtank.signals.base import Signal
 
 
 class Controller(abc.ABC):
-    """A sampled law. It holds its own model of the plant: what it believes and what is true are
-    different leaves.
+    """A sampled controller. Its model of the plant and the plant itself are different leaves.
+
+    Examples
+    --------
+    A controller of one's own needs a `step` alone:
+
+    >>> from jaxtank.core.tree import component, leaf
+    >>> @component
+    ... class Proportional(Controller):
+    ...     gain: float = leaf("V/cm", "gain")
+    ...
+    ...     def step(self, state, tick, estimate):
+    ...         return tuple(self.gain * (r - h) for r, h in zip(tick.r, estimate.x)), state
+    >>> tick = Tick(t=0.0, r=(12.0,), dr=(0.0,), ddr=(0.0,))
+    >>> (u,), _ = Proportional(gain=2.0).step((), tick, Estimate(x=(11.0,)))
+    >>> float(u)
+    2.0
     """
 
     @pointwise
     def prepare(self, r: tuple[Any, ...], dr: tuple[Any, ...], ddr: tuple[Any, ...]) -> Any:
-        """What the law can compute of the reference before the loop starts: any tree of arrays
-        (samples,), given back at each sample
-        as `tick.plan`. r, dr, ddr: tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2].
+        """Return what depends on the reference alone, computed before the loop starts.
+
+        Parameters
+        ----------
+        r, dr, ddr : tuples of arrays (samples,), one per output [cm, cm/s, cm/s^2]
+
+        Returns
+        -------
+        Any tree of arrays (samples,); its row of each sample is `tick.plan`
         """
         return ()
 
     @pointwise
     def inputs(self, clock: Clock) -> Any:
-        """Signals of the law's own, sampled on `clock` before the loop starts: any tree of arrays
-        (samples,), given back at each sample as `tick.own`. For a law that plays something back
-        (`OpenLoop`).
+        """Return signals of the controller itself, sampled on `clock` before the loop starts.
+
+        For a controller that replays a signal (`OpenLoop`).
+
+        Parameters
+        ----------
+        clock : sampling instants
+
+        Returns
+        -------
+        Any tree of arrays (samples,); its row of each sample is `tick.own`
         """
         return ()
 
     def init(self, x0: tuple[Any, ...], u0: tuple[Any, ...]) -> Any:
-        """State before the first sample, for levels x0 (n) [cm] and pumps that ran at u0 (m) [V]
-        until t = 0.
+        """Return the state before the first sample.
+
+        Parameters
+        ----------
+        x0 : (n) levels at t = 0 [cm]
+        u0 : (m) inputs until t = 0 [V]
         """
         return ()
 
     @abc.abstractmethod
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
-        """((m) commanded voltages [V], new state) at `tick` for `estimate`; the command is not
-        limited here.
+        """Return the commanded voltages and the new state; the pumps' limits are applied later.
 
         Coefficients and gains may be computed here from leaves, with jnp.linalg too: what does not
         depend on state or estimate is moved in front of the loop.
+
+        Parameters
+        ----------
+        state : from `init`, or from `track` of the sample before
+        tick : time, setpoint and what was prepared for this sample
+        estimate : levels [cm] and disturbances [cm/s] from the observer
+
+        Returns
+        -------
+        ((m) commanded voltages [V], new state)
         """
 
     def track(self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]) -> Any:
-        """State after the pumps' limits have made `applied` (m) [V] of `command` (m) [V]:
-        anti-windup of laws with memory.
+        """Return the state after the pumps' limits: anti-windup of controllers with memory.
+
+        Parameters
+        ----------
+        state : from `step`
+        tick : of this sample
+        command : (m) voltages from `step` [V]
+        applied : (m) the command within the pumps' limits [V]
         """
         return state
 
     def input_metric(self, estimate: Estimate) -> tuple[Any, ...] | None:
-        """(g11, g12, g22): how the law's cost weighs a change of its two inputs, for allocation by
-        box QP; None if it has none.
+        """Return the weights (g11, g12, g22) of a change of the two inputs in the controller's
+        cost, for allocation by box QP; None if it has none.
         """
         return None
 
     @property
     def allocates(self) -> bool:
-        """True if the law has an `input_metric`, so that its inputs can be allocated by box QP."""
+        """True if there is an `input_metric`, so that the inputs can be allocated by box QP."""
         return type(self).input_metric is not Controller.input_metric
 
     @property
     def reads_model(self) -> bool:
-        """True if the inputs depend on the coefficients of the law's own model."""
+        """True if the inputs depend on the coefficients of the controller's model."""
         return True
 
     def check_pumps(self, actuator: Actuator) -> None:  # noqa: B027
-        """Raise InputError for pumps whose limits, or whose input before t = 0, the law cannot work
-        with.
+        """Raise InputError for pumps whose limits, or whose input before t = 0, do not suit the
+        controller.
         """
 
     def check(self, reference: Signal) -> None:  # noqa: B027  (there may be nothing to check)
-        """Raise InputError if the law cannot serve this reference, or its model is not of the kind
-        it inverts.
-        """
+        """Raise InputError if the reference or the model does not suit the controller."""

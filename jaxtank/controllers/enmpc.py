@@ -23,11 +23,28 @@ class ENMPC(Controller):
 
         u_i = -(1/c2) (k e_i + f_i(h) - r'_i + d_i),   e = h - r,  k = 3/(2 Tp)
 
-    Unsaturated and with an exact model the loop is e' = -k e. `compensation`: "none" leaves d out
-    (ENMPC); "single" takes the observer's estimate once (CHADPC as it must be read, gouta2022 notes
-    S4.3); "double" subtracts it twice, as eqs. (27) and (28) do together.
-    `drift`: "printed" has f with the sign of eqs. (12) and (27), which is not the minimiser and
-        leaves an offset 2 f/k (gouta2022 notes E2).
+    with h, r [cm], k [1/s], c2 [cm/(s V)], f and d [cm/s]. Unsaturated and with an exact model the
+    loop is e' = -k e. `compensation`: "none" omits d (ENMPC); "single" subtracts the observer's
+    estimate once (CHADPC as it must be read, gouta2022 notes S4.3); "double" subtracts it twice, as
+    eqs. (27) and (28) do together. `drift`: "printed" has f with the sign of eqs. (12) and (27),
+    which is not the minimiser and leaves an offset 2 f/k (gouta2022 notes E2).
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import coupled_tanks
+    >>> rig = coupled_tanks(
+    ...     area=225.0,
+    ...     drain=0.0,
+    ...     pipe=0.0,
+    ...     pump_gain=45.0,
+    ...     rim=30.0,
+    ...     outputs=(0, 1),
+    ...     feeds=(0, 1),
+    ... )
+    >>> tick = Tick(t=0.0, r=(8.0, 10.0), dr=(0.0, 0.0), ddr=(0.0, 0.0))
+    >>> u, _ = ENMPC(model=rig, Tp=1.5).step((), tick, Estimate(x=(7.0, 10.0)))
+    >>> [abs(round(float(v), 6)) for v in u]  # k e A/Kp = 1 1/s * 1 cm * 225/45 V s/cm
+    [5.0, 0.0]
     """
 
     model: Plant
@@ -39,7 +56,10 @@ class ENMPC(Controller):
         default="none",
     )
     drift: str = static(
-        "-", "sign of f in the law: derived, or as printed", choices=DRIFTS, default="derived"
+        "-",
+        "sign of f in the control law: derived, or as printed",
+        choices=DRIFTS,
+        default="derived",
     )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:

@@ -22,13 +22,25 @@ PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 
 
 def membership(size, b, w):
-    """Membership of a size |e| [cm] in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep 3x^2
-    - 2x^3 between.
+    """Return the membership of a size |e| in "high": 0 up to b - w, 1 from b + w, the C1 smoothstep
+    3x^2 - 2x^3 between.
 
-    "Low" is 1 less this (mirakhorli notes S4.5).
+    The membership in "low" is 1 minus this (mirakhorli notes S4.5).
 
-    b: where it is 1/2 [cm]; w: half width [cm], taken as at most b, so that it is exactly 0 at no
-        error.
+    Parameters
+    ----------
+    size : |e| [cm]
+    b : size where the membership is 1/2 [cm]
+    w : half width, clipped to at most b, so that the membership is exactly 0 at no error [cm]
+
+    Returns
+    -------
+    Membership in [0, 1]
+
+    Examples
+    --------
+    >>> [float(membership(size, 1.0, 0.5)) for size in (0.5, 1.0, 1.5)]
+    [0.0, 0.5, 1.0]
     """
     w = jnp.where(w > b, b, w)
     x = clip((size - b + w) / (2.0 * w), 0.0, 1.0)
@@ -40,10 +52,30 @@ class FuzzyBlend(Controller):
     """u_i = mu_H(|e_j|) u_SMC,i + (1 - mu_H(|e_j|)) u_SFC,i: sliding mode far from the setpoint,
     state feedback near it (eqs. 16-17).
 
-    The sliding-mode voltages are held within [low, high] before they are blended. pairing: which
-    error decides on input i: "cross", j = 3 - i, as the text of sec. 4.3 has it (in the non-minimum
-    phase each output is moved by the other pump), or "same", j = i, as eq. (17) prints it. b and w
-    are indexed by input. The inner laws are those of `SlidingMode` and `StateFeedback`.
+    The sliding-mode voltages are clipped to [low, high] [V] before they are blended. pairing: which
+    error weights input i: "cross", j = 3 - i, as in the text of sec. 4.3 (in the non-minimum phase
+    each output is moved by the other pump), or "same", j = i, as eq. (17) is printed. b and w [cm]
+    are indexed by input. The blended controllers are `SlidingMode` and `StateFeedback`.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> controller = FuzzyBlend(
+    ...     model=johansson("non-minimum")[0],
+    ...     K=np.zeros((2, 4)),
+    ...     surface=0.05,
+    ...     ks=0.03,
+    ...     phi=0.1,
+    ...     b=[1.0, 1.0],
+    ...     w=[0.5, 0.5],
+    ...     low=[0.0, 0.0],
+    ...     high=[5.0, 5.0],
+    ... )
+    >>> h0, u0 = (12.0, 12.0, 4.0, 5.0), (3.0, 3.0)
+    >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), plan=(h0, u0))
+    >>> u, _ = controller.step(controller.init(h0, u0), tick, Estimate(x=h0))
+    >>> [float(v) for v in u]  # no error: state feedback alone
+    [3.0, 3.0]
     """
 
     model: Plant
@@ -52,7 +84,10 @@ class FuzzyBlend(Controller):
     ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
     phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
     b: np.ndarray = leaf(
-        "cm", "(2,) size of error at which both laws count half, per input", low=0.0, strict=True
+        "cm",
+        "(2,) size of error at which both controllers weigh half, per input",
+        low=0.0,
+        strict=True,
     )
     w: np.ndarray = leaf(
         "cm", "(2,) half width of the blend, per input; at most b", low=0.0, strict=True
@@ -60,10 +95,10 @@ class FuzzyBlend(Controller):
     low: np.ndarray = leaf("V", "(2,) lower limit of the sliding-mode inputs")
     high: np.ndarray = leaf("V", "(2,) upper limit of the sliding-mode inputs")
     pairing: str = static(
-        "-", "whose error decides on an input", choices=tuple(PAIRINGS), default="cross"
+        "-", "which error weights an input", choices=tuple(PAIRINGS), default="cross"
     )
     switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
-    form: str = static("-", "which sliding-mode law", choices=FORMS, default="corrected")
+    form: str = static("-", "which sliding-mode control law", choices=FORMS, default="corrected")
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -74,10 +109,10 @@ class FuzzyBlend(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         h0, u0 = tick.plan
-        law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
+        design = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
         far = [
             clip(u, self.low[i], self.high[i])
-            for i, u in enumerate(slide(*law, estimate.x, tick.r, u0, state))
+            for i, u in enumerate(slide(*design, estimate.x, tick.r, u0, state))
         ]
         near = feedback(self.K, estimate.x, h0, u0)
         size = [magnitude(h - r) for h, r in zip(estimate.x, tick.r)]

@@ -1,4 +1,4 @@
-"""Gain schedules: gains of any law as piecewise-linear functions of a setpoint or a level."""
+"""Gain schedules: gains of a controller as piecewise-linear functions of a setpoint or a level."""
 
 import functools
 import re
@@ -22,16 +22,35 @@ from jaxtank.xla.reachability import use_of
 VARIABLE = re.compile(r"[rh][1-9]\d*")
 
 
-def check_gains(law, gains):
-    """Raise InputError unless each of `gains` names a number among the leaves of `law`, once."""
+def check_gains(controller, gains):
+    """Check that each of `gains` names a number among the leaves of a controller, once.
+
+    Parameters
+    ----------
+    controller : of which the gains are leaves
+    gains : names such as "k" or "Kc[0]"
+
+    Raises
+    ------
+    InputError for no gain, an unknown or a repeated one, a static value, and a whole array.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("gouta2015/backstepping").loop.controller
+    >>> check_gains(controller, ("k", "k1"))
+    >>> check_gains(controller, ("k", "k"))
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: gain k is scheduled twice
+    """
     if not gains:
         raise InputError("a schedule needs at least one gain")
-    names = [n for n in parameters(law)]
+    names = [n for n in parameters(controller)]
     for gain in gains:
         if gains.count(gain) > 1:
             raise InputError(f"gain {gain} is scheduled twice")
         try:
-            meta = describe(law, gain)
+            meta = describe(controller, gain)
         except InputError:
             raise unknown(
                 "gain", f"controller.{gain}", [f"controller.{n}" for n in names]
@@ -43,16 +62,33 @@ def check_gains(law, gains):
             )
         if gain not in names and "[" not in gain:
             continue  # absent because it is scheduled
-        if np.ndim(get_value(law, gain)):
+        if np.ndim(get_value(controller, gain)):
             raise InputError(
-                f"gain controller.{gain} has shape {np.shape(get_value(law, gain))}: name its"
-                f" entries, as {gain}[0]"
+                f"gain controller.{gain} has shape {np.shape(get_value(controller, gain))}: name"
+                f" its entries, as {gain}[0]"
             )
 
 
 def check_variable(variable, outputs, tanks):
-    """Raise InputError unless `variable` is a setpoint of one of `outputs` or a level of one of
-    `tanks` (None: not known).
+    """Check the operating variable of a schedule.
+
+    Parameters
+    ----------
+    variable : "r1" to "r<outputs>", a setpoint, or "h1" to "h<tanks>", a level
+    outputs : number of outputs
+    tanks : number of tanks; None: not known
+
+    Raises
+    ------
+    InputError for any other variable.
+
+    Examples
+    --------
+    >>> check_variable("h2", 1, 2)
+    >>> check_variable("r2", 1, 2)
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: schedule variable 'r2' does not exist: must be r1 to r1, the \
+setpoint of an output, or h1 to h2, the level of a tank
     """
     good = isinstance(variable, str) and VARIABLE.fullmatch(variable)
     most = (outputs if variable[0] == "r" else tanks) if good else 0
@@ -65,7 +101,24 @@ def check_variable(variable, outputs, tanks):
 
 
 def check_knots(knots):
-    """Raise InputError unless there are at least two knots, finite and increasing."""
+    """Check that there are at least two knots, finite and increasing.
+
+    Parameters
+    ----------
+    knots : (K,) positions of the operating variable [cm]
+
+    Raises
+    ------
+    InputError otherwise.
+
+    Examples
+    --------
+    >>> check_knots([3.0, 9.0])
+    >>> check_knots([3.0])
+    Traceback (most recent call last):
+    jaxtank.core.errors.InputError: schedule knots [3.0]: must be at least two finite numbers, \
+each above the one before
+    """
     p = np.asarray(knots, dtype=float)
     if p.ndim != 1 or p.size < 2 or not np.all(np.isfinite(p)) or not np.all(np.diff(p) > 0):
         raise InputError(
@@ -74,14 +127,30 @@ def check_knots(knots):
         )
 
 
-def refusal(law, gains, gain, on_setpoint, channels):
-    """Why `gain` cannot be scheduled together with the other `gains`, or None; read from the law's
-    traced methods, not from its values.
+def refusal(controller, gains, gain, on_setpoint, channels):
+    """Return why `gain` cannot be scheduled together with the other `gains`, or None.
 
-    law: with absent (None) gains or without; on_setpoint: the operating variable is a setpoint;
-        channels: of the reference.
+    Derived from the traced methods of the controller, not from its values.
+
+    Parameters
+    ----------
+    controller : with absent (None) gains or without
+    gains, gain : names of all scheduled leaves, and one of them
+    on_setpoint : whether the operating variable is a setpoint
+    channels : number of channels of the reference
+
+    Returns
+    -------
+    The reason as part of a sentence, or None
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("khalid/gpc").loop.controller
+    >>> refusal(controller, ("u_low[0]",), "u_low[0]", True, 1)
+    'the controller does not use it'
     """
-    leaves, structure = jax.tree.flatten(law)
+    leaves, structure = jax.tree.flatten(controller)
     return _refusal(
         structure, tuple(np.shape(v) for v in leaves), gains, gain, on_setpoint, channels
     )
@@ -90,122 +159,178 @@ def refusal(law, gains, gain, on_setpoint, channels):
 # a check of a loop comes before every run, and the answer depends on no value
 @functools.lru_cache(maxsize=256)
 def _refusal(structure, shapes, gains, gain, on_setpoint, channels):
-    number, samples = jax.ShapeDtypeStruct((), jnp.result_type(float)), 3
-    leaves = [jax.ShapeDtypeStruct(s, number.dtype) for s in shapes]
-    empty = jax.tree.unflatten(structure, leaves)
-    model = getattr(empty, "model", None)
-    tanks, pumps = (channels, channels) if model is None else (model.tanks, model.pumps)
-    others = [g for g in gains if g != gain]
+    try:
+        traced = _Traced(structure, shapes, gains, gain, channels)
+        return _outside_the_step(traced, on_setpoint) or _in_the_step(traced)
+    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
+        return "the controller branches on its value with Python's if, which cannot be traced"
 
-    def with_gains(value, rest, leaves):
-        law = jax.tree.unflatten(structure, leaves)
-        return with_values(law, {gain: value, **dict(zip(others, rest))})
 
-    def method(name, *args, **fixed):
-        """The use of the gain in one method, and the shapes of what it returns."""
-        f = lambda value, rest, leaves, *args: getattr(with_gains(value, rest, leaves), name)(
-            *args, **fixed
-        )
-        arguments = (number, (number,) * len(others), leaves, *args)
+class _Traced:
+    """Methods of a controller traced for placeholders: which of them depend on one gain."""
+
+    def __init__(self, structure, shapes, gains, gain, channels):
+        self.number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+        self.structure, self.gain = structure, gain
+        self.leaves = [jax.ShapeDtypeStruct(s, self.number.dtype) for s in shapes]
+        self.others = [g for g in gains if g != gain]
+        self.empty = jax.tree.unflatten(structure, self.leaves)
+        model = getattr(self.empty, "model", None)
+        tanks, pumps = (channels, channels) if model is None else (model.tanks, model.pumps)
+        self.x, self.u, self.r = ((self.number,) * n for n in (tanks, pumps, channels))
+        self.before = self._before()
+
+    def method(self, name, *args, **fixed):
+        """Return the use of the gain in one method, and the shapes of what it returns."""
+
+        def f(value, rest, leaves, *args):
+            values = {self.gain: value, **dict(zip(self.others, rest))}
+            controller = with_values(jax.tree.unflatten(self.structure, leaves), values)
+            return getattr(controller, name)(*args, **fixed)
+
+        arguments = (self.number, (self.number,) * len(self.others), self.leaves, *args)
         return use_of(f, *arguments), jax.eval_shape(f, *arguments)
 
-    along = (jax.ShapeDtypeStruct((samples,), number.dtype),) * channels
-    x, u = (number,) * tanks, (number,) * pumps
-    estimate, r = Estimate(x=x, d=x), (number,) * channels
-    try:
-        before = {
-            "prepare": method("prepare", along, along, along),
-            "inputs": method("inputs", clock=Clock(dt=1.0, duration=samples - 1.0)),
-            "init": method("init", x, u),
+    def _before(self):
+        """Return {method that runs before the loop: (use of the gain, shapes of its results)}."""
+        samples = 3
+        along = (jax.ShapeDtypeStruct((samples,), self.number.dtype),) * len(self.r)
+        return {
+            "prepare": self.method("prepare", along, along, along),
+            "inputs": self.method("inputs", clock=Clock(dt=1.0, duration=samples - 1.0)),
+            "init": self.method("init", self.x, self.u),
         }
-        for name, (use, _) in before.items():
-            if use.reached:
-                return f"the law uses it before the loop starts (in its {name})"
-        if on_setpoint and empty.allocates and method("input_metric", estimate)[0].reached:
-            return (
-                "the law's input_metric uses it, which is not told the setpoint: schedule it on a"
-                " level"
-            )
-        plan, own, state = (found for _, found in before.values())
-        row = lambda tree: jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), tree)
-        tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(own))
-        step, (command, state) = method("step", state, tick, estimate)
-        track, _ = method("track", state, tick, command, u)
-    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError):
-        return "the law decides on its value with Python's if, which a schedule cannot follow"
-    own_size = int(np.prod(np.shape(parameters(empty).get(gain.split("[")[0], 0.0)), dtype=int))
+
+
+def _outside_the_step(traced, on_setpoint):
+    """Return why a gain cannot be scheduled that acts elsewhere than in `step`, or None."""
+    for name, (use, _) in traced.before.items():
+        if use.reached:
+            return f"the controller uses it before the loop starts (in its {name})"
+    estimate = Estimate(x=traced.x, d=traced.x)
+    if (
+        on_setpoint
+        and traced.empty.allocates
+        and traced.method("input_metric", estimate)[0].reached
+    ):
+        return (
+            "the controller's input_metric depends on it and does not receive the setpoint:"
+            " schedule it on a level"
+        )
+    return None
+
+
+def _in_the_step(traced):
+    """Return why a gain cannot be scheduled for what `step` and `track` compute, or None."""
+    number, x, r = traced.number, traced.x, traced.r
+    plan, own, state = (found for _, found in traced.before.values())
+    row = lambda tree: jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), tree)
+    tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=row(plan), own=row(own))
+    step, (command, state) = traced.method("step", state, tick, Estimate(x=x, d=x))
+    track, _ = traced.method("track", state, tick, command, traced.u)
+    absent = parameters(traced.empty).get(traced.gain.split("[")[0], 0.0)
+    own_size = int(np.prod(np.shape(absent), dtype=int))
     if step.looped or track.looped or max(step.largest, track.largest) > own_size:
         return (
-            "the law designs with it (matrices, or a loop of its own), which would be done anew at"
-            " every sample"
+            "the controller designs with it (matrices, or a loop of its own), which would be"
+            " repeated at every sample"
         )
     if not (step.reached or track.reached):
-        return "the law does not use it"
+        return "the controller does not use it"
     return None
 
 
 class Memory(NamedTuple):
-    """State of the law, and the operating variable of this sample [cm] where `track` cannot read it
-    from the tick (a level); else ().
+    """State of the scheduled controller, and the operating variable of this sample [cm] where
+    `track` cannot take it from the tick (a level); else ().
     """
 
-    law: Any
+    inner: Any
     at: Any
 
 
 def interpolate(at, knots, values):
-    """Piecewise-linear values of the operating variable, held outside the knots.
+    """Return piecewise-linear functions of the operating variable, constant outside the knots.
 
         g(s) = v_1 + sum_j (v_{j+1} - v_j)/(p_{j+1} - p_j) (min(max(s, p_j), p_{j+1}) - p_j)
 
-    at: scalar [cm]; knots: (K,) increasing [cm]; values: (gains, K); returns a tuple of scalars,
-    one per gain. Exactly v where all values of a gain are equal. On a knot the slopes are the means
-    of those of both sides; a level that rests on a knot within rounding has those of the side it is
-    on.
+    Exactly v where all values of a gain are equal. On a knot the derivatives are the means of those
+    of both sides; a level at a knot within rounding has those of the side it is on.
+
+    Parameters
+    ----------
+    at : scalar, operating variable [cm]
+    knots : (K,) increasing [cm]
+    values : (gains, K), each in the unit of its gain
+
+    Returns
+    -------
+    Tuple of scalars, one per gain
+
+    Examples
+    --------
+    >>> [float(v) for v in interpolate(4.0, np.array([3.0, 5.0]), np.array([[1.0, 2.0]]))]
+    [1.5]
     """
-    count, pieces = np.shape(values)[0], np.shape(knots)[0] - 1
-    parts = [portion(at, knots[j], knots[j + 1]) for j in range(pieces)]
+    count, intervals = np.shape(values)[0], np.shape(knots)[0] - 1
+    parts = [portion(at, knots[j], knots[j + 1]) for j in range(intervals)]
     slope = lambda i, j: (values[i, j + 1] - values[i, j]) / (knots[j + 1] - knots[j])
     return tuple(
-        sum((slope(i, j) * parts[j] for j in range(pieces)), start=values[i, 0])
+        sum((slope(i, j) * parts[j] for j in range(intervals)), start=values[i, 0])
         for i in range(count)
     )
 
 
 @component
 class Scheduled(Controller):
-    """A law whose `gains` follow an operating variable: linear between knots, constant outside
-    them.
+    """A controller whose `gains` depend on an operating variable: linear between knots, constant
+    outside them (see `interpolate`).
 
-    gains: names of leaves of the law, "k" or an entry "Kc[0]", "K[0,1]". A scheduled leaf that is a
-    number is absent (None) in `law`; of an array the scheduled entries are not used. variable:
-    "r1", the setpoint of output 1, or "h2", the estimated level of tank 2, counted from 1 as on the
-    rig. Build one with `jaxtank.rig.schedule.schedule`.
+    gains: names of leaves of the controller `law`, "k" or an entry "Kc[0]", "K[0,1]". A scheduled
+    leaf that is a number is absent (None) in `law`; of an array the scheduled entries are not used.
+    variable: "r1", the setpoint of output 1, or "h2", the estimated level of tank 2, counted
+    from 1 as on the rig. Build one with `jaxtank.rig.schedule.schedule`.
 
-    A gain of which the law makes anything before the loop (`prepare`, `inputs`, `init`), or from
-    which it designs matrices or runs a loop in `step` (weights of a Riccati equation or of a
-    predictive law, the order of a fractional integral), is refused by `check`: the first would be
-    left unscheduled, the second done anew at every sample. Inside a trace, where nothing is
-    checked, the former
-    ends in a run that is not finite: before the loop the law is given NaN for its scheduled gains.
+    `check` refuses a gain that is used before the loop (`prepare`, `inputs`, `init`), or from which
+    `step` designs matrices or computes in a loop (weights of a Riccati equation or of a predictive
+    controller, the order of a fractional integral): the former would not be scheduled, the latter
+    would be repeated at every sample. Inside a trace, where nothing is checked, the former ends in
+    a non-finite run: before the loop the scheduled gains are NaN.
+
+    Examples
+    --------
+    >>> from jaxtank.controllers import StateFeedback
+    >>> from jaxtank.plants.rigs import johansson
+    >>> scheduled = Scheduled(
+    ...     law=StateFeedback(model=johansson("minimum")[0], K=np.zeros((2, 4))),
+    ...     knots=[10.0, 14.0],
+    ...     values=[[0.1, 0.3]],
+    ...     gains=("K[0,0]",),
+    ...     variable="r1",
+    ... )
+    >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(), ddr=(), plan=((12.0, 12.0, 2.0, 2.0), (3.0, 3.0)))
+    >>> estimate = Estimate(x=(13.0, 12.0, 2.0, 2.0))
+    >>> (u1, u2), _ = scheduled.step(scheduled.init((), ()), tick, estimate)
+    >>> round(float(u1), 6), float(u2)  # 3 V - K[0,0] 1 cm, with K[0,0] = 0.2 V/cm at 12 cm
+    (2.8, 3.0)
     """
 
     law: Controller
     knots: np.ndarray = leaf("cm", "(K,) positions of the operating variable, increasing")
     values: np.ndarray = leaf("-", "(gains, K) each gain at each knot")
-    gains: tuple = static(doc="leaves of the law that are scheduled, one per row of values")
+    gains: tuple = static(doc="leaves of the controller that are scheduled, one per row of values")
     variable: str = static(
         doc="operating variable: r1, a setpoint, or h1, a level estimate, and so on, counted from 1"
     )
 
-    def _law(self, gains):
+    def _with_gains(self, gains):
         return with_values(self.law, dict(zip(self.gains, gains)))
 
-    def _blind(self):
-        return self._law((np.nan,) * len(self.gains))
+    def _without_gains(self):
+        return self._with_gains((np.nan,) * len(self.gains))
 
-    def _law_at(self, at):
-        return self._law(interpolate(at, self.knots, self.values))
+    def _controller_at(self, at):
+        return self._with_gains(interpolate(at, self.knots, self.values))
 
     @property
     def _index(self):
@@ -221,34 +346,41 @@ class Scheduled(Controller):
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
-        return self._blind().prepare(r, dr, ddr)
+        return self._without_gains().prepare(r, dr, ddr)
 
     @pointwise
     def inputs(self, clock: Clock) -> Any:
-        return self._blind().inputs(clock)
+        return self._without_gains().inputs(clock)
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         return Memory(
-            law=self._blind().init(x0, u0), at=() if self._on_setpoint else x0[self._index]
+            inner=self._without_gains().init(x0, u0),
+            at=() if self._on_setpoint else x0[self._index],
         )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         at = tick.r[self._index] if self._on_setpoint else estimate.x[self._index]
-        command, inner = self._law_at(at).step(state.law, tick, estimate)
-        return command, Memory(law=inner, at=state.at if self._on_setpoint else at)
+        command, inner = self._controller_at(at).step(state.inner, tick, estimate)
+        return command, Memory(inner=inner, at=state.at if self._on_setpoint else at)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         at = tick.r[self._index] if self._on_setpoint else state.at
-        return state._replace(law=self._law_at(at).track(state.law, tick, command, applied))
+        return state._replace(
+            inner=self._controller_at(at).track(state.inner, tick, command, applied)
+        )
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
-        # the setpoint is not told here: `check` refuses gains that would need it
-        law = self._blind() if self._on_setpoint else self._law_at(estimate.x[self._index])
-        return law.input_metric(estimate)
+        # the setpoint is not available here: `check` refuses gains that would need it
+        inner = (
+            self._without_gains()
+            if self._on_setpoint
+            else self._controller_at(estimate.x[self._index])
+        )
+        return inner.input_metric(estimate)
 
     def metadata_of(self, field: str) -> dict[str, Any]:
-        """What to change of a field's metadata: the values are in the units and ranges of their
-        gains.
+        """Return what to change of a field's metadata: the values have the units and ranges of
+        their gains.
         """
         if field != "values":
             return {}
@@ -293,4 +425,4 @@ class Scheduled(Controller):
             if why := refusal(self.law, self.gains, gain, self._on_setpoint, reference.channels):
                 raise InputError(f"controller.law.{gain} cannot be scheduled: {why}")
         for column in np.asarray(self.values).T:
-            self._law(column).check(reference)
+            self._with_gains(column).check(reference)

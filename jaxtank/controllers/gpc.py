@@ -18,8 +18,15 @@ class GPC(LinearPredictive):
         Y = F x + Phi dU,   J = |Rs - Y|^2 + r_w |dU|^2,   dU = (Phi'Phi + r_w I)^-1 Phi' (Rs - F x)
         (khalid eqs. 21-22, khalid notes S4.2)
 
-    The first of them is applied. Modes and constraints as in `LinearPredictive`; with "constrained"
-    they are imposed on the Nc samples.
+    with y, r [cm] and du [V]. The first increment is applied. Modes and constraints as in
+    `LinearPredictive`; with "constrained" they are imposed on the Nc samples.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("khalid/gpc").loop.controller
+    >>> controller.Nc, controller.Np, controller.mode
+    (10, 40, 'unconstrained')
     """
 
     model: TankNetwork
@@ -31,11 +38,11 @@ class GPC(LinearPredictive):
     du_limit: np.ndarray = leaf(
         "V", "(m,) largest change of each input in a sample", low=0.0, strict=True
     )
-    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
-    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
+    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input in the constraints")
+    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input in the constraints")
     Nc: int = static("-", "control horizon (Nc)", low=1, high=100, default=10)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
-    mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
+    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     def ahead(self) -> int:

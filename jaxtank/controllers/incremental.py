@@ -1,5 +1,5 @@
-"""What the linear predictive laws of khalid share: the incremental model, the quadratic cost, the
-constraints, and the sampled law.
+"""Base of the linear predictive controllers of khalid: the incremental model, the quadratic cost,
+the constraints, and the sampled controller.
 """
 
 import abc
@@ -23,26 +23,44 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-# knee of the roots in the linearisation, in the rig's length unit: the paper's roots are exact
+# laminar threshold of the roots in the linearisation, in the rig's length unit: the roots of the
+# paper are exact
 EXACT = 1e-9
 
 
 class Memory(NamedTuple):
-    """What the law keeps of the last sample: levels measured (n) [cm], inputs applied (m) [V]."""
+    """What is kept of the last sample: levels measured (n) [cm], inputs applied (m) [V]."""
 
     x: Sequence
     u: Sequence
 
 
 def incremental_model(model, operating_point, dt):
-    """(A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample (khalid eqs.
-    16-17, khalid notes S4.1; C_m for C_m^T).
+    """Return (A, B, C) of x = [dx_m; y], dx_m the change of the levels since the last sample
+    (khalid eqs. 16-17, khalid notes S4.1; C_m for C_m^T).
 
         A = [[Am, 0], [Cm Am, I]],   B = [Bm; Cm Bm],   C = [0, I]
 
-    Am, Bm: the rig linearised at levels `operating_point` (n) [cm] and sampled every `dt` [s]. A:
-    (n+q, n+q), B: (n+q, m), C: (q, n+q) for n tanks, m pumps, q outputs. No steady input enters: u
-    is absolute, and its changes are what is decided.
+    Am, Bm: the rig linearised at the operating point and sampled. No steady-state input enters:
+    u is absolute, and its increments are optimised.
+
+    Parameters
+    ----------
+    model : network of n tanks, m pumps and q outputs
+    operating_point : (n,) levels [cm]
+    dt : sampling period [s]
+
+    Returns
+    -------
+    A (n+q, n+q), B (n+q, m), C (q, n+q)
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> model = presets.find("khalid/gpc").loop.plant
+    >>> point = np.array([0.3, 0.06])
+    >>> [v.shape for v in jax.eval_shape(lambda: incremental_model(model, point, 5.0))]
+    [(3, 3), (3, 1), (1, 3)]
     """
     still = jnp.zeros(model.pumps)  # the rig is linear in its inputs, so any value serves
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=EXACT), operating_point, still)
@@ -57,16 +75,32 @@ def incremental_model(model, operating_point, dt):
 
 
 def quadratic_cost(A, B, C, q, r_w, basis):
-    """(Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) =
+    """Return (Omega, Psi) of J = eta' Omega eta + 2 eta' Psi x_e + const, for increments du(k+m) =
     basis(m) eta (khalid eqs. 29-31, khalid notes S4.3).
 
         phi(m)' = A phi(m-1)' + B basis(m-1),   Omega = sum_m phi(m) Q phi(m)' + r_w I,   Psi =
         sum_m phi(m) Q A^m,   m = 1 .. Np
 
-    with Q = C' diag(q) C and x_e = [dx_m; y - r]. A, B, C: `incremental_model`; q: (outputs,) [-];
-    r_w [cm^2/V^2];
-    basis: (Np, m, variables). The sums go to Np, not to the number of terms as printed (khalid
-        notes E10).
+    with Q = C' diag(q) C and x_e = [dx_m; y - r]. The sums go to Np, not to the number of terms as
+    printed (khalid notes E10).
+
+    Parameters
+    ----------
+    A, B, C : from `incremental_model`
+    q : (outputs,) weights [-]
+    r_w : weight of the increments [cm^2/V^2]
+    basis : (Np, m, variables)
+
+    Returns
+    -------
+    Omega (variables, variables) [cm^2/V^2], Psi (variables, n+q) [cm/V]
+
+    Examples
+    --------
+    >>> one = jnp.eye(1)
+    >>> omega, psi = quadratic_cost(one, one, one, jnp.ones(1), 0.5, jnp.ones((1, 1, 1)))
+    >>> float(omega[0, 0]), float(psi[0, 0])  # one step of an integrator: 1 + r_w, 1
+    (1.5, 1.0)
     """
     n, variables = A.shape[0], basis.shape[2]
 
@@ -84,14 +118,21 @@ def quadratic_cost(A, B, C, q, r_w, basis):
 
 
 class LinearPredictive(Controller):
-    """A sampled law u(k) = u(k-1) + du(k) whose du minimises a quadratic cost over a horizon, on
-    the incremental model.
+    """A sampled controller u(k) = u(k-1) + du(k) [V] whose du minimises a quadratic cost over a
+    horizon, on the incremental model (khalid section III).
 
-    Fields of every such law: model, operating_point, r_w, q, du_limit, u_low, u_high, Np, mode.
-    `mode`: "unconstrained" is the linear law du = -K x_e, which knows no limits; "clipped" holds
-    its du within du_limit and then u within [u_low, u_high]; "constrained" solves the quadratic
-    programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid notes
-    S4.4). u(k-1) is what the pumps' limits let through, which is all the anti-windup there is.
+    Fields of every such controller: model, operating_point, r_w, q, du_limit, u_low, u_high, Np,
+    mode. `mode`: "unconstrained" is the linear control law du = -K x_e, without limits; "clipped"
+    holds its du within du_limit and then u within [u_low, u_high]; "constrained" solves the
+    quadratic programme with these limits on the first `rows` samples ahead (khalid eq. 32, khalid
+    notes S4.4). u(k-1) is the input after the pumps' limits, which is the only anti-windup.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("khalid/laguerre").loop.controller
+    >>> isinstance(controller, LinearPredictive), controller.ahead, controller.basis().shape
+    (True, 15, (40, 1, 4))
     """
 
     model: TankNetwork
@@ -106,22 +147,24 @@ class LinearPredictive(Controller):
     @property
     @abc.abstractmethod
     def ahead(self) -> int:
-        """Number of samples ahead on which the constraints are imposed [-]."""
+        """Return the number of samples ahead on which the constraints are imposed [-]."""
 
     @abc.abstractmethod
     def basis(self) -> jax.Array:
-        """(Np, m, variables): increments of m pumps over the horizon, one column per variable."""
+        """Return (Np, m, variables): increments of the pumps over Np samples, by variable."""
 
     def design(self, dt: float) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """(Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period `dt`
-        [s]; see `quadratic_cost`.
+        """Return (Omega (v, v), Psi (v, n+q), basis (Np, m, v)) for v variables, at sampling period
+        `dt` [s]; see `quadratic_cost`.
         """
         basis = self.basis()
         A, B, C = incremental_model(self.model, self.operating_point, dt)
         return *quadratic_cost(A, B, C, jnp.asarray(self.q), self.r_w, basis), basis
 
     def gain(self, dt: float) -> jax.Array:
-        """K (m, n+q) of the linear controller du = -K [dx_m; y - r] [V/cm], at period `dt` [s]."""
+        """Return K (m, n+q) [V/cm] of the linear control law du = -K [dx_m; y - r], at period `dt`
+        [s].
+        """
         Omega, Psi, basis = self.design(dt)
         return basis[0] @ jnp.linalg.solve(Omega, Psi)
 
@@ -144,18 +187,17 @@ class LinearPredictive(Controller):
         u = [state.u[i] + du[i] for i in pumps]
         if (
             self.mode != "unconstrained"
-            # of a constrained law this takes off what the interior point leaves, some 1e-9 of the
+            # with constraints this removes the residual of the interior point, some 1e-9 of the
             # range
         ):
             u = [clip(u[i], self.u_low[i], self.u_high[i]) for i in pumps]
         return tuple(u), Memory(x=x, u=state.u)
 
     def _constrained(self, before, error, dt):
-        """(m,) first increments of the quadratic programme, for inputs `before` (m) and error x_e
-        (n+q,).
+        """Return the first increments (m,) of the quadratic programme, for inputs `before` (m) and
+        error x_e (n+q,).
 
-        An active limit on the sum over several samples is not lost when its row is one of many:
-        rows of Laguerre functions are nearly collinear, which the interior point does not mind.
+        Rows of Laguerre functions are nearly collinear; the interior point converges all the same.
         """
         Omega, Psi, basis = self.design(dt)
         steps = basis[: self.ahead]
@@ -173,7 +215,7 @@ class LinearPredictive(Controller):
         return state._replace(u=applied)
 
     def check_pumps(self, actuator: Actuator) -> None:
-        """A quadratic programme that begins outside its range may have no answer."""
+        """A quadratic programme that begins outside its range may be infeasible."""
         if self.mode != "constrained":
             return
         unit = self.model.units[1]
@@ -188,12 +230,12 @@ class LinearPredictive(Controller):
             if not low <= before <= high:
                 raise InputError(
                     f"actuator.initial[{i}] = {before:g} {unit}: must lie within the limits of a"
-                    f" constrained law, {own}"
+                    f" constrained controller, {own}"
                 )
             if bottom > high or top < low:
                 raise InputError(
                     f"actuator.low[{i}] = {bottom:g} {unit} to {top:g} {unit}: must meet the limits"
-                    f" of a constrained law, {own}"
+                    f" of a constrained controller, {own}"
                 )
 
     def check(self, reference: Signal) -> None:

@@ -12,14 +12,29 @@ from jaxtank.signals.base import Signal
 
 
 def laguerre_functions(a, N, samples):
-    """L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25, khalid
-    notes S4.3).
+    """Return L(k)' of k = 0 .. samples-1: (samples, N), orthonormal over all k (khalid eq. 25,
+    khalid notes S4.3).
 
         L(0) = sqrt(1 - a^2) [1, -a, a^2, ...]',   L(k+1) = A_l L(k)
 
-    A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below. a: pole, 0 <= a < 1
-    [-]. With a = 0 they are unit pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a)
+    A_l: lower triangular, a on its diagonal and (1 - a^2) (-a)^(i-j-1) below.
+    With a = 0 they are unit pulses at k = 0 .. N-1. As z-transforms, sqrt(1-a^2) z/(z-a)
     [(1-az)/(z-a)]^(i-1): the printed eq. (23) is a sample late (khalid notes E7).
+
+    Parameters
+    ----------
+    a : scalar array, pole, 0 <= a < 1 [-]
+    N : number of functions
+    samples : number of samples
+
+    Returns
+    -------
+    (samples, N) [-]
+
+    Examples
+    --------
+    >>> laguerre_functions(jnp.full((), 0.6), 2, 3).shape
+    (3, 2)
     """
     beta = 1.0 - a * a
     power = [jnp.ones_like(a)]  # products, not powers: 0^0 has no slope
@@ -38,9 +53,16 @@ class Laguerre(LinearPredictive):
 
         J = eta' Omega eta + 2 eta' Psi x_e,   eta = -Omega^-1 Psi x_e,   du_i(k) = L_i(0)' eta_i
 
-    N numbers per pump do what takes GPC ten or more. With a = 0 it is GPC with Nc = N. Modes and
-    constraints as in `LinearPredictive`; with "constrained" they are imposed on the next `rows`
-    samples: 5 are enough, 15 those of the tables in khalid notes S7.2.
+    with y, r [cm] and du [V]. N numbers per pump replace ten or more increments of GPC; with a = 0
+    it is GPC with Nc = N. Modes and constraints as in `LinearPredictive`; with "constrained" they
+    are imposed on the next `rows` samples: 5 suffice, the tables of khalid notes S7.2 have 15.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("khalid/laguerre").loop.controller
+    >>> controller.N, controller.a.tolist(), controller.basis().shape
+    (4, [0.4], (40, 1, 4))
     """
 
     model: TankNetwork
@@ -55,14 +77,14 @@ class Laguerre(LinearPredictive):
     du_limit: np.ndarray = leaf(
         "V", "(m,) largest change of each input in a sample", low=0.0, strict=True
     )
-    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input that the law observes")
-    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input that the law observes")
+    u_low: np.ndarray = leaf("V", "(m,) lower limit of each input in the constraints")
+    u_high: np.ndarray = leaf("V", "(m,) upper limit of each input in the constraints")
     N: int = static("-", "Laguerre functions per pump (N)", low=1, high=30, default=4)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
     rows: int = static(
         "-", "samples ahead on which constraints are imposed (Ncon)", low=1, high=1000, default=15
     )
-    mode: str = static("-", "what the law knows of limits", choices=MODES, default="unconstrained")
+    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     def ahead(self) -> int:

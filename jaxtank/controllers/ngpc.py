@@ -19,21 +19,32 @@ from jaxtank.signals.base import Signal
 
 @component
 class NGPC(Controller):
-    """Closed-form predictive law of gouta2015, eq. (28), for the state-coupled four-tank.
+    """Closed-form predictive controller of gouta2015, eq. (28), for the state-coupled four-tank.
 
         v_i = r''_i - K1 e_i - K2 e'_i + c_i z'_i / (2 sqrt(h_i)),   e = h - r,  K1 = 10/(3 Tp^2),
         K2 = 5/(2 Tp)
 
-    followed by the inversion of `decoupling.decouple`. z'_i is the level rate the model predicts
+    with h, r [cm], K1 [1/s^2], K2 [1/s], v [cm/s^2], followed by the inversion of
+    `feedback_linearisation.decouple`. z'_i is the level rate the model predicts
     (no differentiation). Without saturation the loop is exactly e'' + K2 e' + K1 e = 0: damping
     0.685, natural frequency 1.826/Tp.
+
+    Examples
+    --------
+    At the steady state the voltages are those that hold the levels:
+
+    >>> from jaxtank.plants.rigs import state_coupled_four_tank
+    >>> controller = NGPC(model=state_coupled_four_tank(21.213), Tp=11.0, level_floor=0.01)
+    >>> tick = Tick(t=0.0, r=(9.0, 9.0), dr=(0.0, 0.0), ddr=(0.0, 0.0))
+    >>> upper = 9.0 * (0.48**2 / (0.38**2 + 0.31**2)) ** 2
+    >>> (u1, u2), _ = controller.step((), tick, Estimate(x=(9.0, 9.0, upper, upper)))
+    >>> round(float(u1), 2), round(float(u2), 2)
+    (3.13, 3.13)
     """
 
     model: Plant
     Tp: float = leaf("s", "prediction horizon Tp", low=0.0, strict=True)
-    level_floor: float = leaf(
-        "cm", "level below which the law takes a tank to hold this much", low=0.0, strict=True
-    )
+    level_floor: float = leaf("cm", "lower clip of the levels in the roots", low=0.0, strict=True)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         c = coefficients(self.model)

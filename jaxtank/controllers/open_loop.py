@@ -1,4 +1,4 @@
-"""No feedback: inputs played back."""
+"""No feedback: the inputs are those of a signal."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,11 +12,18 @@ from jaxtank.signals.base import Signal
 
 @component
 class OpenLoop(Controller):
-    """u(t_k) = s(t_k): the inputs are those of a signal, whatever the levels do (a recorded
+    """u(t_k) = s(t_k): the inputs are those of a signal, independent of the levels (a recorded
     experiment, a constant flow).
 
-    signal: one channel per pump, in the unit of the pumps' input; the signal's units are read as
-        the input's.
+    signal: one channel per pump, in the unit of the pumps' input (V), whatever the signal's unit.
+
+    Examples
+    --------
+    >>> from jaxtank.signals.base import Constant
+    >>> controller = OpenLoop(signal=Constant(level=[3.0, 2.5]))
+    >>> inputs = controller.inputs(Clock(dt=1.0, duration=2.0))
+    >>> [float(v[0]) for v in inputs]
+    [3.0, 2.5]
     """
 
     signal: Signal

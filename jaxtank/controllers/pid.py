@@ -22,7 +22,7 @@ LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N +
 
 
 class Memory(NamedTuple):
-    """What each loop keeps: tuples with one entry per pump."""
+    """State of the loops: tuples with one entry per pump."""
 
     integral: tuple  # integral action I [V]
     slow: tuple  # filtered level [cm], empty without derivative action
@@ -31,11 +31,28 @@ class Memory(NamedTuple):
 
 
 def oustaloup(g):
-    """(direct gain, poles (2N+1), residues (2N+1)) of s^g on [1e-3, 1e2] rad/s: s^g ~ direct + sum
-    residue/(s + pole).
+    """Return direct gain, poles and residues of s^g on [1e-3, 1e2] rad/s:
+
+        s^g ~ direct + sum residue/(s + pole)
 
     Zeros wb (wh/wb)^((j + N + (1-g)/2)/(2N+1)), poles with (1+g)/2, j = -N .. N, gain wh^g
-    (Oustaloup 2000; gouta2022 notes S4.5). g [-].
+    (Oustaloup 2000; gouta2022 notes S4.5).
+
+    Parameters
+    ----------
+    g : order [-]
+
+    Returns
+    -------
+    (direct gain, poles (2N+1) [rad/s], residues (2N+1))
+
+    Examples
+    --------
+    >>> direct, poles, residues = oustaloup(0.5)
+    >>> direct, poles.size
+    (10.0, 11)
+    >>> round(abs(complex(direct + (residues / (0.3j + poles)).sum())) / 0.3**0.5, 2)
+    1.0
     """
     j = np.arange(2 * SECTIONS + 1)
     at = lambda shift: (
@@ -57,11 +74,24 @@ class PID(Controller):
         v = base + Kc (r - y) + I - Kc Td y'_f,    I' = Kc/Ti^order D^(1-order) [(r - y) + Ti (u -
         v)/(Tt Kc)]
 
-    with u what the limits leave of v (back-calculation, tracking time Tt), and the derivative of
-    the measurement behind a lag of Td/8. Without Td there is no derivative; without `order` the
-    integral is an ordinary one, with it s^-order = (1/s) s^(1-order), where the second factor is
-    Oustaloup's filter: a true integrator is kept. base = bias, or with `feed_forward` the input
-    that the model needs on the reference, (r' - f(r))/c2.
+    (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits
+    (back-calculation, tracking time Tt), and the derivative of the measurement filtered by a lag of
+    Td/8. Without Td there is no derivative; without `order` the integral is of order one, with it
+    s^-order = (1/s) s^(1-order), where the second factor is Oustaloup's filter: a true integrator
+    is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
+    reference, (r' - f(r))/c2.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import coupled_tanks
+    >>> rig = coupled_tanks(
+    ...     area=225.0, drain=0.8, pipe=0.9, pump_gain=35.0, rim=30.0, outputs=(0,), feeds=(0,)
+    ... )
+    >>> controller = PID(model=rig, Kc=[4.0], Ti=[6.0], Tt=[36.0], bias=[5.0])
+    >>> tick = Tick(t=0.0, r=(8.0,), dr=(0.0,), ddr=(0.0,), dt=0.1)
+    >>> (v,), _ = controller.step(controller.init((7.5, 7.0), (5.0,)), tick, Estimate(x=(7.5, 7.0)))
+    >>> float(v)  # bias + Kc (r - y)
+    7.0
     """
 
     model: Plant

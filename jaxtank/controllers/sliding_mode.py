@@ -25,7 +25,7 @@ SMALLEST = 1e-3
 
 
 class LowerTanks(NamedTuple):
-    """What the model knows of tanks 1 and 2: pairs, tank 1 first."""
+    """Coefficients of the model at tanks 1 and 2: pairs, tank 1 first."""
 
     drift: tuple  # phi_i: rate of the level without the tank's own pump [cm/s]
     slope: tuple  # D_i: how the drift falls with the level [1/s]
@@ -38,7 +38,7 @@ class LowerTanks(NamedTuple):
 
 
 def lower_tanks(model, x):
-    """`LowerTanks` of a quadruple tank at levels x (4) [cm].
+    """Return `LowerTanks` of a quadruple tank at levels x (4) [cm].
 
     phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
     less the direct flow. The root is the smooth one (numerics.smooth_signed_sqrt): its slope, which
@@ -69,9 +69,10 @@ class Acceleration(NamedTuple):
 
 
 def acceleration(tanks, damping):
-    """f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i. damping: [1/s]; 0 gives f and G of
-    mirakhorli eq. (4), all terms of which are right except that gamma_i k_i u_i'/A_i is missing
-    from it (mirakhorli notes E2).
+    """Return f and M of d/dt(damping h_i + phi_i) = f_i + (M u)_i.
+
+    damping: [1/s]; 0 gives f and G of mirakhorli eq. (4), all terms of which
+    are right except that gamma_i k_i u_i'/A_i is missing from it (mirakhorli notes E2).
     """
     net = tuple(damping - d for d in tanks.slope)
     return Acceleration(
@@ -82,8 +83,8 @@ def acceleration(tanks, damping):
 
 
 def slide(model, surface, ks, phi, switch, form, x, r, u0, previous) -> tuple[Any, Any]:
-    """(2) voltages [V] of the sliding-mode law, not limited; arguments as the fields of
-    `SlidingMode`.
+    """Return the (2) voltages [V] of the sliding-mode control law, not limited; arguments as the
+    fields of `SlidingMode`.
 
     x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2)
     voltages now at the pumps [V], used by the printed form alone.
@@ -116,22 +117,33 @@ def check_quadruple(model):
 
 @component
 class SlidingMode(Controller):
-    """Sliding-mode law for the quadruple tank: M u = -f - ks sw(s / phi), sw one of tanh, clip to
-    [-1, 1], sign.
+    """Sliding-mode controller of the quadruple tank (mirakhorli sec. 4.1):
+
+        M u = -f - ks sw(s / phi),   sw one of tanh, clip to [-1, 1], sign
+
+    with u [V], s [cm/s], f [cm/s^2].
 
     "corrected" (mirakhorli notes S4.4): s_i = surface e_i + phi_i(h) + gamma_i k_i u0_i / A_i,
     whose rate f + M u is exact in u and needs no u'. The surface is zero at the steady state of the
     setpoint. A sliding mode exists and is stable for surfaces between two bounds: 0.0088 and 0.088
-    1/s for the paper's rig at 12 cm (mirakhorli notes S4.3). Setpoints that are held: their rates
+    1/s for the paper's rig at 12 cm (mirakhorli notes S4.3). For constant setpoints: their rates
     are not used.
 
     "printed" (mirakhorli eq. 10): s_i = surface e_i + h_i', f and M without the surface, and
     surface h_i' subtracted; h_i' from the full model with the voltages applied in the last sample
-    (the paper does not say how h_i' is had: reading (a) of mirakhorli notes S4.2).
+    (the paper does not define how h_i' is obtained: reading (a) of mirakhorli notes S4.2).
 
     Gradients: with tanh they are good while ks Ts / phi < 2; above, the sampled loop chatters and
     they grow without bound (mirakhorli notes H2). With sign, phi has no effect and the other
-    derivatives miss the jumps.
+    derivatives omit the jumps.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> rig, _ = johansson("non-minimum")
+    >>> controller = SlidingMode(model=rig, surface=0.05, ks=0.03, phi=0.1)
+    >>> controller.switch, controller.form
+    ('tanh', 'corrected')
     """
 
     model: Plant
@@ -139,7 +151,7 @@ class SlidingMode(Controller):
     ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
     phi: float = leaf("cm/s", "half width of the boundary layer", low=0.0, strict=True)
     switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
-    form: str = static("-", "which law", choices=FORMS, default="corrected")
+    form: str = static("-", "which control law", choices=FORMS, default="corrected")
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -149,8 +161,8 @@ class SlidingMode(Controller):
         return u0 if self.form == "printed" else ()
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        law = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
-        return slide(*law, estimate.x, tick.r, tick.plan, state), state
+        design = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
+        return slide(*design, estimate.x, tick.r, tick.plan, state), state
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state

@@ -23,11 +23,16 @@ from jaxtank.signals.base import Signal
 
 
 def feedback(K, x, h0, u0):
-    """u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and the
-    steady state h0 (n) [cm], u0 (m) [V].
+    """Return u0 - K (h - h0): (m) voltages [V] for a gain K (m, n) [V/cm], levels x (n) [cm] and
+    the steady state h0 (n) [cm], u0 (m) [V].
 
     mirakhorli eqs. (14)-(15) print u = -K'x with K = -R^-1 B'P: the literal sign is unstable, and
-    without u0 the pumps stand (mirakhorli notes E11).
+    without u0 the pumps are off (mirakhorli notes E11).
+
+    Examples
+    --------
+    >>> [float(u) for u in feedback(np.array([[0.5, 0.0]]), (12.0, 8.0), (10.0, 8.0), (3.0,))]
+    [2.0]
     """
     away = [h - h_s for h, h_s in zip(x, h0)]
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
@@ -40,16 +45,26 @@ def check_free_outlets(model):
     if getattr(model, "pipes", None) != () or model.pumps != len(model.outputs):
         raise InputError(
             "controller.model must be a network without pipes and with as many pumps as outputs:"
-            " this law needs its steady states"
+            " this controller needs its steady states"
         )
 
 
 @component
 class StateFeedback(Controller):
-    """u = u0(r) - K (h - h0(r)), with levels h0 and voltages u0 at which the model stands still at
-    the setpoint (mirakhorli sec. 4.2).
+    """u = u0(r) - K (h - h0(r)), with h0 [cm] and u0 [V] the steady state of the model at the
+    setpoint (mirakhorli sec. 4.2).
 
     No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21).
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> controller = StateFeedback(model=johansson("minimum")[0], K=np.full((2, 4), 0.1))
+    >>> h0 = (12.0, 12.0, 2.0, 2.0)
+    >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(), ddr=(), plan=(h0, (3.0, 3.0)))
+    >>> u, _ = controller.step((), tick, Estimate(x=(11.0, 12.0, 2.0, 2.0)))
+    >>> [round(float(v), 6) for v in u]
+    [3.1, 3.1]
     """
 
     model: Plant
@@ -79,13 +94,20 @@ class LQI(Controller):
         u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r while no pump is at its limit
 
     [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
-    with z beneath its levels, for the weights diag(Q) and diag(R). The gain follows its weights,
-    its model and its operating point, derivatives included.
+    extended by z, for the weights diag(Q) and diag(R); h, r [cm], z [cm s], u [V]. The gain depends
+    on its weights, model and operating point, and so do its derivatives.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("mirakhorli/lqi").loop.controller
+    >>> controller.operating_point.tolist(), controller.R.tolist()
+    ([12.0, 12.0], [3.0, 3.0])
     """
 
     model: TankNetwork
-    # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that words say them, whatever a rig
-    # counts in
+    # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that the description names them,
+    # whatever the units of a rig
     Q: np.ndarray = leaf(
         "-",
         "(tanks + outputs,) weight of each level, over its unit squared, then of each integral,"
@@ -106,7 +128,7 @@ class LQI(Controller):
         return zero, zero  # integrals z [cm s], errors of this sample [cm]
 
     def gain(self) -> jax.Array:
-        """[K, Ki] (pumps, tanks + outputs) [V/cm], [V/(cm s)]."""
+        """Return [K, Ki] (pumps, tanks + outputs) [V/cm], [V/(cm s)]."""
         speeds, voltages = steady_flows(self.model, self.operating_point)
         A, B, C = linearise(self.model, speeds * speeds / (2.0 * self.model.gravity), voltages)
         n, p = A.shape[0], C.shape[0]

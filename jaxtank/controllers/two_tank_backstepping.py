@@ -19,7 +19,7 @@ from jaxtank.signals.base import Signal
 
 @component
 class TwoTankBackstepping(Controller):
-    """Backstepping law of calofir, eqs. (16)-(21) with the errata of calofir notes S5, for a pumped
+    """Backstepping of calofir, eqs. (16)-(21) with the errata of calofir notes S5, for a pumped
     tank that drains through a second one.
 
     With h1, h3 the levels of tanks 0 and 1, s = sqrt(h3), Z = sqrt(h1 - h3), e = h3 - h3r and h3r =
@@ -30,27 +30,35 @@ class TwoTankBackstepping(Controller):
 
     Without limits the loop is e' = -K_phi e + a Y, Y' = -a e - K_y Y. It is a feedback
     linearisation of h3, of which only K_phi + K_y and K_phi K_y + a^2 matter: the two gains may be
-    exchanged. a^2 carries a length, so the same gains are another law where levels count in other
-    units. The output h1 follows h3; there is no integral action. Units in this class are the rig's
-    (m, m^3/s).
+    exchanged. a^2 carries a length, so the same gains are another controller where levels have
+    other units. The output h1 follows h3; there is no integral action. Units in this class are the
+    rig's (m, m^3/s).
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> controller = presets.find("calofir/backstepping").loop.controller
+    >>> float(controller.K_phi), float(controller.K_y)
+    (0.02, 0.1)
+    >>> tick = Tick(t=0.0, r=(0.4,), dr=(0.0,), ddr=(0.0,), plan=controller.prepare((0.4,), (), ()))
+    >>> (flow,), _ = controller.step((), tick, Estimate(x=(0.4, tick.plan[0])))
+    >>> bool(abs(float(flow) - float(tick.plan[1])) < 1e-8)  # the steady-state flow
+    True
     """
 
     model: TankNetwork
     K_phi: float = leaf("1/s", "gain K_phi of the first step", low=0.0, strict=True)
     K_y: float = leaf("1/s", "gain K_y of the second step", low=0.0, strict=True)
     level_floor: float = leaf(
-        "cm",
-        "level h3 below which the law takes the second tank to hold this much",
-        low=0.0,
-        strict=True,
+        "cm", "lower clip of the level h3 in the control law", low=0.0, strict=True
     )
     difference_floor: float = leaf(
-        "cm", "least h1 - h3 that the law reckons with", low=0.0, strict=True
+        "cm", "lower clip of h1 - h3 in the control law", low=0.0, strict=True
     )
 
     def coefficients(self) -> tuple:
-        """(a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3 = a in
-        the paper, whose tanks are equal.
+        """Return (a1, a3, b): c1/A of the first and of the second tank, c2/A [cm^0.5/s]; a1 = a3
+        = a in the paper, whose tanks are equal.
         """
         w = jnp.sqrt(2.0 * self.model.gravity)
         A1, A3 = self.model.area[0], self.model.area[1]
@@ -62,8 +70,8 @@ class TwoTankBackstepping(Controller):
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
-        """(h3r, Q_s) of every sample: the level of the second tank and the flow at which h1 rests
-        at r (calofir notes S2.2) [cm, cm^3/s].
+        """Return (h3r, Q_s) of every sample: the level of the second tank and the flow at the
+        steady state h1 = r (calofir notes S2.2) [cm, cm^3/s].
         """
         c1, c2 = self.model.pipe[0], self.model.drain[1]
         h3r = c1**2 / (c1**2 + c2**2) * r[0]  # kappa h1r
@@ -90,11 +98,11 @@ class TwoTankBackstepping(Controller):
         )
         if float(self.model.drain[0]) != 0.0:
             raise InputError(
-                f"controller.model.drain[0] = {float(self.model.drain[0]):g}: this law takes the"
-                " first tank to drain only into the second"
+                f"controller.model.drain[0] = {float(self.model.drain[0]):g}: this controller needs"
+                " a first tank that drains only into the second"
             )
         for field in ("initial", "targets", "level"):
             if np.any(np.asarray(getattr(reference, field, 1.0), dtype=float) <= 0.0):
                 raise InputError(
-                    f"reference.{field}: must be above 0 (the law takes its square root)"
+                    f"reference.{field}: must be above 0 (the controller computes its square root)"
                 )

@@ -1,4 +1,4 @@
-"""Observers: what the law believes the levels are."""
+"""Observers: from measurements to the estimate that the controller receives."""
 
 from jaxtank.observers.base import Direct, Observer
 from jaxtank.observers.disturbance import DisturbanceObserver

@@ -1,4 +1,4 @@
-"""What every observer is to the loop, and the shortest one."""
+"""Interface between an observer and the loop, and the direct observer."""
 
 import abc
 from collections.abc import Sequence
@@ -10,23 +10,27 @@ from jaxtank.plants.base import Plant
 
 
 class Observer(abc.ABC):
-    """Turns measurements into an estimate: corrected by what is measured, carried on by what is
-    applied. State is handed in and out.
+    """Estimator of the levels: corrected by measurements, predicted with the applied inputs.
+
+    Examples
+    --------
+    >>> Direct().init((9.0, 9.0))  # no state
+    ()
     """
 
     def init(self, x0: tuple[Any, ...]) -> Any:
-        """State before the first sample, for levels x0 (n) [cm] at t = 0."""
+        """Return the state before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()
 
     @abc.abstractmethod
     def step(self, state: Any, tick: Tick, y: Sequence[Any]) -> tuple[Estimate, Any]:
-        """(Estimate, new state) for measured levels y (n) [cm] at `tick`."""
+        """Return (Estimate, new state) for measured levels y (n) [cm] at `tick`."""
 
     def predict(
         self, state: Any, tick: Tick, command: Sequence[Any], applied: Sequence[Any]
     ) -> Any:
-        """State at the next sample, for the law's command (m) and what the pumps were told after
-        their limits, `applied` (m) [V].
+        """Return the state at the next sample, for the controller's `command` (m) and that command
+        after the pumps' limits, `applied` (m) [V].
 
         `applied` is known to the computer; dead zone, lag and delay of the pumps are not in it.
         """
@@ -38,7 +42,14 @@ class Observer(abc.ABC):
 
 @component
 class Direct(Observer):
-    """All levels are measured and taken as they are: x_hat = y (gouta2015, Fig. 3 and 4)."""
+    """All levels are measured and taken as they are: x_hat = y [cm] (gouta2015, Fig. 3 and 4).
+
+    Examples
+    --------
+    >>> tick = Tick(t=0.0, r=(9.0,), dr=(0.0,), ddr=(0.0,))
+    >>> Direct().step((), tick, (8.9,))[0].x
+    (8.9,)
+    """
 
     def step(self, state: Any, tick: Tick, y: Sequence[Any]) -> tuple[Estimate, Any]:
         return Estimate(x=y), state

@@ -15,7 +15,7 @@ FED = ("applied", "command")
 
 @component
 class DisturbanceObserver(Observer):
-    """Estimates what moves each level besides the model, one number per tank:
+    """Estimate of the rate of each level that the model does not explain, one per tank [cm/s]:
 
         d^ = z + l h,   z' = -l z - l (l h + f(h) + c2 u)      (gouta2022 eqs. 23-24), so that d^' =
         l (d - d^)
@@ -24,18 +24,36 @@ class DisturbanceObserver(Observer):
     with z, and good in float32): d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are
     measured; x_hat = y.
 
-    u is what the pumps were told after their limits: with `fed` = "command", the unlimited command,
+    u [V] is the command after the pumps' limits: with `fed` = "command", the unlimited command,
     the observer winds up while a pump is saturated (gouta2022 notes S4.2). `before_compensation`
-    feeds it the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23) prints
-    it (gouta2022 notes S4.3): the loop is then that of a single compensation with 2 l, and d^ reads
+    uses the input before eq. (28) subtracts the estimate again, u + d^/c2, as eq. (23) prints
+    it (gouta2022 notes S4.3): the loop is then that of a single compensation with 2 l, and d^ is
     half the disturbance.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import coupled_tanks
+    >>> rig = coupled_tanks(
+    ...     area=225.0,
+    ...     drain=0.0,
+    ...     pipe=0.0,
+    ...     pump_gain=45.0,
+    ...     rim=30.0,
+    ...     outputs=(0, 1),
+    ...     feeds=(0, 1),
+    ... )
+    >>> observer = DisturbanceObserver(model=rig, l=[2.0, 2.0])
+    >>> tick = Tick(t=0.0, r=(8.0, 8.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)
+    >>> estimate, _ = observer.step(observer.init((8.0, 8.0)), tick, (8.1, 8.0))
+    >>> [round(float(d), 6) for d in estimate.d]  # l times the innovation
+    [0.2, 0.0]
     """
 
     model: Plant
     l: Any = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
-    fed: str = static("-", "input that the observer is told", choices=FED, default="applied")
+    fed: str = static("-", "input that the observer uses", choices=FED, default="applied")
     before_compensation: bool = static(
-        "-", "as printed: told the input before eq. (28)", choices=(False, True), default=False
+        "-", "as printed: use the input before eq. (28)", choices=(False, True), default=False
     )
 
     def init(self, x0: tuple) -> Any:

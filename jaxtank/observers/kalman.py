@@ -1,4 +1,4 @@
-"""Steady-state Kalman filter about an operating point."""
+"""Kalman filters: extended, and with the steady-state gain about an operating point."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from jaxtank.plants.runge_kutta import advance
 
 
 class Belief(NamedTuple):
-    """What the filter carries on."""
+    """State of the extended filter."""
 
     x: Sequence  # (n) levels [cm]
     P: tuple  # (n) rows of n covariances [cm^2]
@@ -26,16 +26,32 @@ class Belief(NamedTuple):
 
 @component
 class ExtendedKalman(Observer):
-    """Extended Kalman filter (Jazwinski 1970): the model is carried on by an integrator step, its
-    covariance by that step's Jacobian.
+    """Extended Kalman filter (Jazwinski 1970): the levels are predicted by an integrator step,
+    their covariance by that step's Jacobian.
 
         correct, for each measured tank i in turn:  K = P e_i / (P_ii + r_i),  x += K (y_i - x_i),
         P -= K e_i' P
-        carry on:  x = Phi(x, u),  P = F P F' + Q dt,   F = d Phi / d x
+        predict:  x = Phi(x, u),  P = F P F' + Q dt,   F = d Phi / d x
 
     Phi is one or more steps of "rk4" or "midpoint" with u, the input after the pumps' limits, held.
     The noises of the sensors are independent, so that correcting by one after the other is the
-    joint correction and no matrix is inverted.
+    joint correction and no matrix is inverted. x [cm], P [cm^2].
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> observer = ExtendedKalman(
+    ...     model=johansson("minimum")[0],
+    ...     process=[0.01] * 4,
+    ...     measurement=[0.04] * 4,
+    ...     spread=[0.04] * 4,
+    ...     measured=(0, 1),
+    ... )
+    >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)
+    >>> start = observer.init((12.0, 12.0, 2.0, 2.0))
+    >>> estimate, _ = observer.step(start, tick, (12.2, 12.0, 0.0, 0.0))
+    >>> [round(float(h), 6) for h in estimate.x]  # equal variances: half the innovation
+    [12.1, 12.0, 2.0, 2.0]
     """
 
     model: Plant
@@ -48,10 +64,10 @@ class ExtendedKalman(Observer):
         low=0.0,
         strict=True,
     )
-    spread: np.ndarray = leaf("cm^2", "(n,) variance of the levels believed at t = 0", low=0.0)
+    spread: np.ndarray = leaf("cm^2", "(n,) variance of the initial estimate at t = 0", low=0.0)
     start: np.ndarray | None = leaf(
         "cm",
-        "(n,) levels believed at t = 0; absent: the true ones",
+        "(n,) initial estimate at t = 0; absent: the true ones",
         low=0.0,
         like="spread",
         default=None,
@@ -59,7 +75,7 @@ class ExtendedKalman(Observer):
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
     substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
     integrator: str = static(
-        doc="how the model is carried on", choices=("rk4", "midpoint"), default="rk4"
+        doc="how the model is integrated", choices=("rk4", "midpoint"), default="rk4"
     )
 
     def init(self, x0: tuple) -> Any:
@@ -110,13 +126,13 @@ class ExtendedKalman(Observer):
 
 
 def _symmetric(P):
-    """Rows whose lower half is the upper one: round-off would tear them apart."""
+    """Rows whose lower half is the upper one: round-off would make them differ."""
     return tuple(tuple(P[min(i, j)][max(i, j)] for j in range(len(P))) for i in range(len(P)))
 
 
 @component
 class Kalman(Observer):
-    """Linear Kalman filter in current form, with the gain it settles at, on the model linearised at
+    """Linear Kalman filter in current form, with its steady-state gain, on the model linearised at
     (levels, inputs).
 
         x_hat = x_prior + L (y - C x_prior),      L = P C' (C P C' + R)^-1
@@ -124,9 +140,23 @@ class Kalman(Observer):
         held
 
     P is the prior covariance of the steady filter (Kalman 1960; discrete Riccati equation), Q =
-    process * dt, R = measurement. The drift is the model's rate at (xo, uo), 0 where it rests
-    there. u is the input after the pumps' limits. Levels that are not in `measured` are estimated
-    from the rest.
+    process * dt, R = measurement. The drift is the model's rate at (xo, uo), 0 at a steady
+    state. u [V] is the input after the pumps' limits. Levels that are not in `measured` are
+    estimated from the others.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> observer = Kalman(
+    ...     model=johansson("minimum")[0],
+    ...     levels=[12.0, 12.0, 2.0, 2.0],
+    ...     inputs=[3.0, 3.0],
+    ...     process=[0.01] * 4,
+    ...     measurement=[0.04] * 4,
+    ...     measured=(0, 1),
+    ... )
+    >>> observer.measured, observer.levels.tolist()
+    ((0, 1), [12.0, 12.0, 2.0, 2.0])
     """
 
     model: Plant
@@ -147,7 +177,7 @@ class Kalman(Observer):
     measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
 
     def design(self, dt: float) -> tuple:
-        """(Ad (n, n), Bd (n, m), drift (n,) [cm], L (n, measured)) for sampling every dt [s]."""
+        """Return (Ad (n, n), Bd (n, m), drift (n,) [cm], L (n, measured)) for period dt [s]."""
         A, B, _ = linearise(self.model, self.levels, self.inputs)
         rest = jnp.stack(
             self.model.derivative(

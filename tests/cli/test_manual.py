@@ -160,3 +160,10 @@ def test_python_m_jaxtank_is_the_command():
     assert done.returncode == 0 and kept(done.stdout) == kept(
         manual.text(presets.find("cascaded/pi"))
     )
+
+
+def test_the_page_prints_the_description_of_a_class_without_its_sections():
+    case = presets.find("gouta2015/backstepping")
+    page = manual.text(case)
+    assert "Examples\n--------" in (type(case.loop.controller).__doc__ or "").replace("    ", "")
+    assert "Examples" not in page and "Parameters\n---" not in page and ">>>" not in page

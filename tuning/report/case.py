@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import itertools
+import re
 import textwrap
 
 import numpy as np
@@ -19,6 +20,8 @@ from tuning.report import safety, tables
 from tuning.report.case_loop import actuator, called, own_name, sampled, sensor, signals
 
 WIDTH = 100
+# the head of a numpydoc section: a title underlined with dashes
+SECTION = re.compile(r"^[A-Z]\w*(?: \w+)*\n-{3,}$", re.M)
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
 """Names of the plant that controller and observer compute with."""
 
@@ -231,14 +234,18 @@ def _item(sentence):
 
 
 def _docstring(part):
-    """The docstring of a component's class: prose is wrapped, indented lines stay as they are."""
+    """Return the description of a component's class: its docstring up to the numpydoc sections.
+
+    Prose is wrapped; indented lines stay as they are.
+    """
     lines, prose = [], []
+    description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]
 
     def flush():
         lines.extend(textwrap.wrap(" ".join(prose), WIDTH))
         prose.clear()
 
-    for line in inspect.cleandoc(type(part).__doc__ or "").splitlines():
+    for line in description.rstrip().splitlines():
         if not line.strip() or line.startswith("  "):
             flush()
             lines.extend(
