@@ -146,7 +146,9 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
             )
     since = None if loop.disturbance is None else loop.disturbance.since(times)
     if since is None and "since" in wanted:
-        raise InputError("recovery_time needs a disturbance with a beginning (signals.Pours)")
+        raise InputError(
+            "recovery_time needs a disturbance with a beginning (signals.InflowPulses)"
+        )
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
         window = tuple(

@@ -77,14 +77,11 @@ def sensitivities_compiled(
     def sampled(theta: Any) -> Any:
         return inputs(at(theta), clock, kept, key)
 
-    def start(here: ClosedLoop) -> Any:
-        return initial(here, clock), ms.start(run_of(here, clock), kept)
-
-    carried = _floats_of(jax.eval_shape(lambda: start(loop)))
+    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept)))
     known = _dependent(sampled, flat)
 
     def begin(theta: Any) -> Any:
-        floats, rest = carried.split(start(keyed(at(theta), key)))
+        floats, rest = carried.split(_start(keyed(at(theta), key), clock, kept))
         moving, fixed = known.split(sampled(theta))
         return (floats, moving), (rest, fixed)
 
@@ -110,16 +107,19 @@ def sensitivities_compiled(
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    (floats, dfloats, rest, matrix), _ = scan(
-        body, carry, (moving, dmoving, fixed), length=clock.samples
-    )
+    carry = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
+    floats, dfloats, rest, matrix = carry
 
     def finish(floats: Any, theta: Any) -> Any:
-        _, acc = carried.join(floats, rest)
-        return ms.read(run_of(at(theta), clock), acc, names), None
+        return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
+
+
+def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> Any:
+    """(state, accumulators of the measures) before the first sample."""
+    return initial(loop, clock), ms.start(run_of(loop, clock), names)
 
 
 def _floats_of(tree: Any) -> Partition:

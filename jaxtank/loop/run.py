@@ -7,9 +7,8 @@ other modules of `loop` and the folders below.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +34,7 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import COLUMNS, Trajectory
 from jaxtank.loop.validation import check
-from jaxtank.xla.hoist import scan
+from jaxtank.xla.hoist import checkpointed_scan, scan
 from jaxtank.xla.jit import compiled
 
 
@@ -252,27 +251,6 @@ def evaluate_compiled(
         carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
     state, acc = carry
     return ms.read(run, acc, names), is_broken(state)
-
-
-def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-    """Return the carry of a scan over about sqrt(length) chunks, each recomputed in the reverse
-    pass.
-    """
-
-    def chunk(carry: Any, now: Any) -> Any:
-        return scan(body, carry, now, length=inner)[0], None
-
-    def first(a: Any) -> Any:
-        return a[: outer * inner].reshape(outer, inner)
-
-    def last(a: Any) -> Any:
-        return a[outer * inner :]
-
-    inner = math.isqrt(length)
-    outer = length // inner
-    checkpoint = cast(Any, jax.checkpoint)
-    carry = scan(checkpoint(chunk), carry, jax.tree.map(first, xs), length=outer)[0]
-    return scan(body, carry, jax.tree.map(last, xs), length=length - outer * inner)[0]
 
 
 @compiled("clock", "save_every")

@@ -13,13 +13,14 @@ from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
+from jaxtank.core.toml_schema import NEEDED, Key, Section, type_of
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.observers import Direct, DisturbanceObserver, ExtendedKalman, Kalman, Observer
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import read_entry, sizes_of
-from jaxtank.rig.schema import KIND, NEEDED, OPEN_LOOP, Key, Section, type_of
+from jaxtank.rig.schema import KIND, OPEN_LOOP
 from jaxtank.rig.signals import ramp_values, ramps_of
 from jaxtank.signals.setpoints import Ramps, ramps
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtank.core.checks import check_value
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.text import shortened
+from jaxtank.core.toml_schema import NEEDED
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
-from jaxtank.rig.schema import NEEDED
 
 LARGEST = 1e300
 """Magnitude of a number of a rig file: products of two stay finite for most."""
@@ -43,7 +43,7 @@ def read_entry(
 
     Parameters
     ----------
-    section : schema.Section
+    section : Section
     table : {key: value} as in the file
     sizes : of the rig
     index : number of the table in its list, from 0, or None

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.toml_schema import Section
 from jaxtank.core.units import DEFAULT
 from jaxtank.rig.entry import unit, written
-from jaxtank.rig.schema import Section
 
 
 class Line(NamedTuple):
@@ -38,7 +38,7 @@ def lines_of(section: Section, values: Mapping[str, Any], units=DEFAULT) -> list
 
     Parameters
     ----------
-    section : schema.Section
+    section : Section
     values : {key: value}, as the loop has it: tanks from 0, arrays
     units : (length, pump input) of the rig
     """

@@ -66,11 +66,11 @@ def build(table):
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
     plant = network(**_fields(columns, "plant"), **more, outputs=outputs, units=sizes.units)
-    law = table.get("law", {})
+    control = table.get("law", {})
     return Case(
         name="my rig",
-        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {law.get('kind', '')}",
-        loop=_loop(plant, columns, law, table.get("observer")),
+        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {control.get('kind', '')}",
+        loop=_loop(plant, columns, control, table.get("observer")),
         clock=Clock(dt=1.0, duration=600.0),
         limits={"max_level": "rim"},
         free={},
@@ -101,7 +101,7 @@ def _fields(columns, part):
     return {k.removeprefix(start): v for k, v in columns.items() if k.startswith(start)}
 
 
-def _loop(plant, columns, law, observer):
+def _loop(plant, columns, control, observer):
     """The ClosedLoop of a plant and of the columns of its tables."""
     pumps, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow, initial = columns["disturbance.level"], number(pumps["initial"])
@@ -114,7 +114,7 @@ def _loop(plant, columns, law, observer):
         plant=plant,
         sensor=LevelSensor(**_numbers({**sensor, **_fields(columns, "sensor")})),
         observer=Direct() if observer is None else observer_of(observer, plant, levels, initial),
-        controller=controller_of(law, plant, start, initial),
+        controller=controller_of(control, plant, start, initial),
         actuator=PumpBank(**_numbers(bank)),
         reference=ramps(start, [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,

@@ -72,10 +72,15 @@ def sections(case, tankwise=False):
     table = schedule.table_of(case.loop)
     found = [top, *built, *([block(SECTIONS["schedule"], table, case.loop.units)] if table else [])]
     found += [*_values(case, base, origin is None, same), *_tuning(case)]
-    titles = {b.title for b in found} | {line.name for line in top.lines}
+    return [*found, *template.suggestions(case, _titles(found))]
+
+
+def _titles(found):
+    """The titles of the tables of these Blocks, and the names of the lines above the first."""
+    titles = {b.title for b in found} | {line.name for line in found[0].lines}
     if any(line.name == "sine" for b in found for line in b.lines):
         titles.add("[reference.sine]")
-    return [*found, *template.suggestions(case, titles)]
+    return titles
 
 
 def _none(name, doc="none"):

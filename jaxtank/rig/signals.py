@@ -13,7 +13,7 @@ from jaxtank.plants.faults import faults
 from jaxtank.rig.entry import is_finite, read_entries, read_entry, sizes_of, written
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import Pours, pours
+from jaxtank.signals.inflows import InflowPulses, inflow_pulses
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
 
@@ -130,7 +130,7 @@ def disturbance_of(table, loop, names):
     if "pour" in table:
         old = _pulses(read_entries(SECTIONS["pour"], table, sizes), old, loop.plant.tanks)
     if "window" in more:
-        if not isinstance(old, Pours):
+        if not isinstance(old, InflowPulses):
             raise InputError(
                 f"disturbance.window = {more['window']:g} s: is how long tanks are watched after a"
                 " [[pour]], and there is none: leave it out"
@@ -142,12 +142,14 @@ def disturbance_of(table, loop, names):
 def _pulses(entries, old, tanks):
     """The disturbance of the [[pour]] tables; without any, `old` if it is no pulses."""
     if not entries:
-        return None if isinstance(old, Pours) else old
+        return None if isinstance(old, InflowPulses) else old
     if isinstance(old, Constant) and np.any(np.asarray(old.level) != 0.0):
         raise InputError(
             "[[pour]]: this rig has a steady inflow already, and a rig file can have one of the two"
         )
-    return pours(tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries])
+    return inflow_pulses(
+        tanks, [(e["time"], e["duration"], e["tank"], e["volume"]) for e in entries]
+    )
 
 
 def faults_of(entries, plant):
@@ -170,7 +172,7 @@ def disturbance_tables(disturbance):
     steady = SECTIONS["disturbance"]
     if isinstance(disturbance, Constant):
         return [(steady, {"inflow": disturbance.level})]
-    if not isinstance(disturbance, Pours):
+    if not isinstance(disturbance, InflowPulses):
         return None
     volumes = np.asarray(disturbance.volume).tolist()
     rows = [(*event, volume) for event, volume in zip(disturbance.events, volumes)]

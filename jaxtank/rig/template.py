@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
+from jaxtank.core.toml_schema import Section
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.measures import MEASURES, of_loop
 from jaxtank.measures import unit as measure_unit
@@ -13,7 +14,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components
 from jaxtank.rig import schedule as scheduling
 from jaxtank.rig.lines import Block, Line, suggestion, toml
-from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT, Section
+from jaxtank.rig.schema import SECTIONS, SHARE, WEIGHT
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
@@ -151,7 +152,7 @@ def _seconds(case, share):
     return _rounded(share * case.clock.duration)
 
 
-def _law(case):
+def _controller(case):
     """The case's own controller, as a start for another."""
     part = case.loop.controller
     known = components.kind_of("law", part) is not None
@@ -286,7 +287,7 @@ def _log(case):
 
 
 EXAMPLES = {
-    "law": _law,
+    "law": _controller,
     "schedule": schedule,
     "observer": _observer,
     "reference.sine": _sine,

@@ -9,7 +9,7 @@ from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import is_component, split_index, walk
 from jaxtank.rig.signals import steps
-from jaxtank.signals.inflows import Pours
+from jaxtank.signals.inflows import InflowPulses
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -79,7 +79,7 @@ def _late(case):
         case.clock.duration,
     )
     changes = () if reference is None else reference.changes
-    pulses = disturbance.events if isinstance(disturbance, Pours) else ()
+    pulses = disturbance.events if isinstance(disturbance, InflowPulses) else ()
     for name, events in (("changes of the reference", changes), ("inflow pulses", pulses)):
         late = sum(time >= end for time, *_ in events)
         if late:

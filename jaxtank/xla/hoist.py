@@ -6,8 +6,9 @@ run of the four-tank. Here the body is traced once, and what depends on constant
 once; equal coefficients (each Runge-Kutta stage makes its own) become one. Imports jax only.
 """
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,27 @@ def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> A
         return jax.tree.unflatten(structure, [_read(v, values, same) for v in jaxpr.outvars])
 
     return jax.lax.scan(lean, carry, xs, length=length)
+
+
+def checkpointed_scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
+    """Return the carry of a scan over about sqrt(length) chunks, each recomputed in the reverse
+    pass.
+    """
+
+    def chunk(carry: Any, now: Any) -> Any:
+        return scan(body, carry, now, length=inner)[0], None
+
+    def first(a: Any) -> Any:
+        return a[: outer * inner].reshape(outer, inner)
+
+    def last(a: Any) -> Any:
+        return a[outer * inner :]
+
+    inner = math.isqrt(length)
+    outer = length // inner
+    checkpoint = cast(Any, jax.checkpoint)
+    carry = scan(checkpoint(chunk), carry, jax.tree.map(first, xs), length=outer)[0]
+    return scan(body, carry, jax.tree.map(last, xs), length=length - outer * inner)[0]
 
 
 def _split(jaxpr):

@@ -111,13 +111,6 @@ def test_jaxtank_never_imports_tuning(trees):
     assert up == {("jaxtank.__main__", "tuning.cli.main")}
 
 
-def test_a_folder_holds_at_most_sixteen_modules():
-    folders = {
-        path.parent for p in (jaxtank, tuning) for path in Path(p.__file__).parent.rglob("*.py")
-    }
-    assert max(len(list(folder.glob("*.py"))) for folder in folders) <= 16
-
-
 def test_only_pictures_import_matplotlib(trees):
     """Pictures are drawn on given axes; reports open and close the figures."""
     found = set()

@@ -274,25 +274,18 @@ def _minimise(batch, iterations):
         count += 1
         trial = np.clip(z + _step(batch, z, here, damping), batch.low, batch.high)
         step = trial - z
-        predicted = -np.einsum("li,li->l", here.gradient, step) - 0.5 * np.einsum(
-            "li,lij,lj->l", step, here.matrix, step
-        )
+        curved = np.einsum("li,lij,lj->l", step, here.matrix, step)
+        predicted = -np.einsum("li,li->l", here.gradient, step) - 0.5 * curved
         at = batch.normal(np.where((done | stuck)[:, None], z, trial))
         gain = np.where(np.isfinite(at.cost), here.cost - at.cost, -np.inf)
         ratio = gain / np.maximum(predicted, 1e-300)
         better = (gain > 0) & ~done & ~stuck
         small = predicted <= STATIONARY * here.cost + 1e-25
         done |= small & (gain >= -1e-12 * here.cost)
-        z[better] = trial[better]
-        here = _Normal(
-            *(
-                np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-                for new, old in zip(at, here)
-            )
-        )
-        damping = np.where(
-            better, damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3), damping * growth
-        )
+        for new, old in zip((trial, *at), (z, *here)):
+            old[better] = new[better]
+        eased = damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3)
+        damping = np.where(better, eased, damping * growth)
         growth = np.where(better, 2.0, 2 * growth)
         stuck |= damping > 1e12
         damping = np.maximum(damping, 1e-12)

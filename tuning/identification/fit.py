@@ -22,7 +22,7 @@ from tuning.identification.identified_case import bare
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.least_squares import profile_likelihood as _profile
 from tuning.identification.problem import Estimation
-from tuning.identification.proposal import check_law
+from tuning.identification.proposal import check_kind
 from tuning.identification.residuals import quality, validate
 from tuning.identification.result import Identification
 from tuning.problem.status import Status
@@ -133,28 +133,17 @@ def identify(
     check_float64()
     _check_options(loss, starts=starts, iterations=iterations)
     case = bare(case) if isinstance(case, Plant) else case
-    check_law(law, case)
+    check_kind(law, case)
     logs = [log] if isinstance(log, experiment.Log) else list(log)
     check_data(logs, case.loop, gap)
     kept = [first_samples(one, hold_back) for one in logs]
     options = {"free": free, "start": start, "noise": noise, "substeps": substeps}
     partial, options = _first_problem(case, logs, kept, options)
     check_length(logs)
+    settings = {"loss": loss, "iterations": iterations}
     cache = EvaluationCache()
     if folder is not None:
-        what = fingerprint(
-            case,
-            command="identify",
-            logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
-            free=partial.bounds,
-            held_back=[one.samples for one in partial.logs],
-            noise=partial.noise,
-            substeps=partial.substeps,
-            start=options["start"],
-            loss=loss,
-            iterations=iterations,
-            gap=gap,
-        )
+        what = _what(case, logs, partial, start=start, gap=gap, **settings)
         cache = EvaluationLog(folder, what, resume)
     if ready is not None:
         ready()
@@ -162,7 +151,6 @@ def identify(
     first = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
     if not np.isfinite(first.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
-    settings = {"loss": loss, "iterations": iterations}
     estimation, best, validation = _final_fit(partial, first, logs, kept, options, settings)
     best, spread, fit_quality = _spread(estimation, best, settings)
     return Identification(
@@ -178,6 +166,20 @@ def identify(
         wall_s=time.perf_counter() - began,
         seed=seed,
         law=law,
+    )
+
+
+def _what(case, logs, partial, **options):
+    """Return the fingerprint of the searches: case, experiment data and what decides a number."""
+    return fingerprint(
+        case,
+        command="identify",
+        logs=digest(*(v for one in logs for v in (one.t, one.u, one.y))),
+        free=partial.bounds,
+        held_back=[one.samples for one in partial.logs],
+        noise=partial.noise,
+        substeps=partial.substeps,
+        **options,
     )
 
 

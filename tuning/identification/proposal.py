@@ -20,7 +20,7 @@ from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 
-LAWS = ("pi",)
+KINDS = ("pi",)
 STEPS = (1.1, 0.9, 1.05, 0.95)
 """Setpoint of each output after its change, over its steady level [-]: the first that the rig can
 hold is taken.
@@ -33,19 +33,19 @@ MOST = 100_000
 """Samples of the proposed run at most."""
 
 
-def check_law(law, case):
-    """Raise InputError unless `law` is None or one of LAWS that suits the rig of `case`."""
-    if law is None:
+def check_kind(kind, case):
+    """Raise InputError unless `kind` is None or one of KINDS that suits the rig of `case`."""
+    if kind is None:
         return
-    if law not in LAWS:
+    if kind not in KINDS:
         raise InputError(
-            f"--law {law!r}: must be one of {', '.join(LAWS)}; other controllers go into the [law]"
-            " section of a rig file"
+            f"--law {kind!r}: must be one of {', '.join(KINDS)}; other controllers go into the"
+            " [law] section of a rig file"
         )
     plant = case.loop.plant
     if len(plant.outputs) != plant.pumps:
         raise InputError(
-            f"--law {law}: needs one pump per controlled tank, the rig has {plant.pumps} pumps and"
+            f"--law {kind}: needs one pump per controlled tank, the rig has {plant.pumps} pumps and"
             f" {len(plant.outputs)}: add a [law] section of another kind to the rig file"
         )
 

@@ -14,11 +14,11 @@ from jaxtank import measures as ms
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.numerics import magnitude
 from jaxtank.instruments import LevelSensor
-from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import initial, inputs, run_of
 from jaxtank.loop.step import step
 from jaxtank.observers import Direct
 from jaxtank.signals.base import Table
+from jaxtank.xla.hoist import checkpointed_scan, scan
 
 POINTWISE = {m: ms.MEASURES[m].sense for m in ("max_level", "min_level", "max_error")}
 """Measures whose limit is held at every sample: +1 for an upper limit, -1 for a lower one."""
@@ -109,7 +109,7 @@ def evaluate(loop, clock, terms, u, lagrangian):
             _pointwise_excess(terms, lagrangian, sample)
         )
 
-    (_, acc), over = lp.scan(
+    (_, acc), over = scan(
         body,
         (initial(loop, clock), ms.start(run, names)),
         inputs(loop, clock, names, None),
@@ -148,7 +148,7 @@ def _search_cost(u, loop, clock, terms, lagrangian):
     extra = ((zero,) * loop.plant.pumps if "input_travel" in smoothed else (), zero, zero)
     carry = (initial(loop, clock), ms.start(run, names), extra, zero)
     xs = (inputs(loop, clock, names, None), lagrangian.multipliers)
-    _, acc, (_, variation, absolute), penalty = lp.checkpointed_scan(body, carry, xs, clock.samples)
+    _, acc, (_, variation, absolute), penalty = checkpointed_scan(body, carry, xs, clock.samples)
     measures = ms.read(run, acc, names)
     smooth = {"input_travel": variation, "iae": absolute * clock.dt}
     cost = sum(w * (smooth[m] if m in smooth else jnp.sum(measures[m])) for m, w in terms.objective)

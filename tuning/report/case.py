@@ -54,7 +54,7 @@ def json_of(case):
         "plant": type(loop.plant).__name__,
         "names": {kind: list(names) for kind, names in case.names.items()},
         "equations": equations(loop.plant, loop.disturbance is not None),
-        "law": _law(loop.controller),
+        "law": _class_of(loop.controller),
         "observer": type(loop.observer).__name__,
         "parameters": _parameters(case, preset),
         "free": {n: list(Free(*spec)) for n, spec in case.free.items()},
@@ -261,9 +261,9 @@ def _docstring(part):
     return lines
 
 
-def _law(law):
-    inner = getattr(law, "law", None)
-    return type(law).__name__ + (f"({type(inner).__name__})" if inner is not None else "")
+def _class_of(controller):
+    inner = getattr(controller, "law", None)
+    return type(controller).__name__ + (f"({type(inner).__name__})" if inner is not None else "")
 
 
 def _tuned(case, preset, parameters):

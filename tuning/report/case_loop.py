@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtank.instruments import LevelSensor, PumpBank
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import Pours
+from jaxtank.signals.inflows import InflowPulses
 from jaxtank.signals.setpoints import Ramps, Sine
 from tuning.problem.wording import count
 
@@ -108,7 +108,7 @@ def _disturbance(loop):
             f"Constant inflow disturbance: {', '.join(f'{float(v):g}' for v in signal.level)}"
             f" {length}^3/s, by tank."
         ]
-    if isinstance(signal, Pours):
+    if isinstance(signal, InflowPulses):
         each = (
             f"{float(v):g} {length}^3 into tank {tank + 1} at {t:g} s over {s:g} s"
             for (t, s, tank), v in zip(signal.events, signal.volume)

@@ -105,8 +105,8 @@ def _proposal(found):
     case, why = found.proposed
     if why:
         return f"no {found.law} controller is proposed: {why}"
-    law = case.loop.controller
-    Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (law.Kc, law.Ti))
+    pi = case.loop.controller
+    Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (pi.Kc, pi.Ti))
     unit = local("V/cm", case.loop.units)
     return (
         f"proposed: PI with controller.Kc = {Kc} {unit}, controller.Ti = {Ti} s, from the"

@@ -286,3 +286,17 @@ def symmetric(problem, outcomes, values):
         "objective": cost,
         "starts": starts,
     }
+
+
+def symmetry_words(image, objective):
+    """Return the gains of `symmetric` as a sentence; objective: that of the answer."""
+    at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
+    above = 100 * (image["objective"] / objective - 1)
+    same = (
+        "the same objective"
+        if abs(above) < 1e-3
+        else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
+    )
+    searches = len(image["starts"])
+    ended = f", {searches} of the searches ended there and count as this answer" * (searches > 0)
+    return f"permutation symmetry: {image['words']}: {at} gives {same}{ended}"

@@ -44,7 +44,7 @@ from jaxtank import measures as ms
 from tuning.problem.point import DIVERGED
 from tuning.problem.status import Status
 from tuning.problem.wording import count
-from tuning.search.diagnostics import direction_words
+from tuning.search.diagnostics import direction_words, symmetry_words
 from tuning.search.kkt import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 
@@ -292,24 +292,9 @@ def _agreement(result: TuningResult) -> Found:
     yield Message(
         "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"
     )
-    image = result.symmetry
-    if not image or image["objective"] is None:
-        return
-    at = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
-    above = 100 * (image["objective"] / result.objective["after"] - 1)
-    same = (
-        "the same objective"
-        if abs(above) < 1e-3
-        else f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
-    )
-    ended = (
-        f", {len(image['starts'])} of the searches ended there and count as this answer"
-        if image["starts"]
-        else ""
-    )
-    yield Message(
-        "permutation-symmetry", f"permutation symmetry: {image['words']}: {at} gives {same}{ended}"
-    )
+    if result.symmetry and result.symmetry["objective"] is not None:
+        words = symmetry_words(result.symmetry, result.objective["after"])
+        yield Message("permutation-symmetry", words)
 
 
 def _out_of_sample(result: TuningResult) -> Found:

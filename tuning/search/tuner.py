@@ -213,19 +213,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
         tuned=tuned,
         method=plan.method,
         status=status_of(found, all(row.margin >= 0 for row in rows)),
-        parameters={
-            b.name: {
-                "before": own[b.name],
-                "after": values[b.name],
-                "unit": b.unit,
-                "lower": b.low,
-                "upper": b.high,
-                "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
-                "sensitivity_percent": percent,
-                "exercised": not idle,
-            }
-            for b, v, percent, idle in zip(problem.bounds, z, change, found.idle.tolist())
-        },
+        parameters=_parameters(problem, z, values, change, found.idle.tolist()),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
         measures={"before": before, "after": after},
@@ -247,6 +235,24 @@ def _result(problem, plan, found: Outcome, first, before, key):
         provenance=provenance(case, plan.seed),
         problem=problem,
     )
+
+
+def _parameters(problem, z, values, change, idle):
+    """Return {name: values before and after, range, sensitivity} of the parameters at z."""
+    own = problem.own_values()
+    return {
+        b.name: {
+            "before": own[b.name],
+            "after": values[b.name],
+            "unit": b.unit,
+            "lower": b.low,
+            "upper": b.high,
+            "at_bound": "lower" if v < 1e-6 else "upper" if v > 1 - 1e-6 else None,
+            "sensitivity_percent": percent,
+            "exercised": not still,
+        }
+        for b, v, percent, still in zip(problem.bounds, z, change, idle)
+    }
 
 
 def _check_precision():

@@ -16,7 +16,7 @@ except ImportError:
     fcntl = None
 
 PATIENCE = 0.2
-"""How long a lock may be in the way before it is a refusal [s]: one that lets go removes its file
+"""How long a lock may be in the way before it is a refusal [s]: one that ends removes its file
 in less.
 """
 

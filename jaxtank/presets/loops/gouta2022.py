@@ -14,7 +14,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import coupled_tanks
 from jaxtank.signals.base import Sum
-from jaxtank.signals.inflows import pours
+from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import Sine, ramps
 
 # Kp of Table 1, and ten times that (notes S2.2) [cm^3/(s V)]
@@ -25,6 +25,7 @@ DEAD_ZONE = (2.7538, 4.3248)
 
 SENSOR = 1 / 0.04413  # MPX5010DP: 450 mV/kPa [cm/V]
 PULSE = 1.1  # duration that follows from the reported peak of d^, 2 cm/s (notes S3.2) [s]
+PULSES = [(500.0, PULSE, 1, 500.0), (700.0, PULSE, 0, 500.0)]
 # What an ordinary rig would add; fitted to the paper's Table 3, not unique (notes S2.4; its inflow
 # pulse of 0.7 s is left at 1.1 s).
 PAPER_LIKE = {
@@ -187,8 +188,6 @@ def build(name):
             initial=number([0.0] * 2),
         ),
         reference=trapezoids() if trapezoid else benchmark(),
-        disturbance=(
-            None if trapezoid else pours(2, [(500.0, PULSE, 1, 500.0), (700.0, PULSE, 0, 500.0)])
-        ),
+        disturbance=None if trapezoid else inflow_pulses(2, PULSES),
         x0=number([1.0, 1.0]),
     )

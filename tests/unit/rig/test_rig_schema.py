@@ -9,12 +9,13 @@ import pytest
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
+from jaxtank.core.toml_schema import NEEDED, Key
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.rig import components, schema
 from jaxtank.rig.entry import Sizes, read_value, written
 from jaxtank.rig.lines import toml
-from jaxtank.rig.schema import SECTIONS, Key
+from jaxtank.rig.schema import SECTIONS
 
 # every key of every section, none of them at its default
 EVERY = """
@@ -209,7 +210,7 @@ def test_a_key_added_to_a_section_is_read_checked_written_and_listed(
     assert re.search(rf"(?m)^{re.escape(about)}.*\n{re.escape(line)}$", rig.complete(case))
     with pytest.raises(InputError, match=re.escape(wrong[1])):
         rig.loads(TANK.replace(head, f"{head}\n{wrong[0]}"))
-    if key.default is schema.NEEDED:
+    if key.default is NEEDED:
         with pytest.raises(InputError, match=rf"{section} 1 needs {key.name} \[V\]: {key.doc}"):
             rig.loads(TANK)
     else:

@@ -1,0 +1,125 @@
+"""What a section of a TOML file may hold: a Key, and a Section of keys.
+
+`jaxtank.rig.schema` makes the schema of a rig file of them; may import the rest of `core`.
+"""
+
+import dataclasses
+from typing import Any
+
+from jaxtank.core.units import DEFAULT, local
+
+NEEDED: Any = object()
+"""Default of a key that a file must have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """A key of a section: what it is, which values it may have, and where its value goes.
+
+    Parameters
+    ----------
+    name : the key in the file
+    doc : what it is, printed by `init` and where it is missing
+    kind : how a value is read and written, a name in `entry.READ`
+    unit : of its number, written for ("cm", "V")
+    low, high, strict : allowed range, or None; strict: `low` itself is excluded
+    choices : allowed values, or None
+    default : value, as in a file, where the key is left out; None: it is then absent
+    target : dotted name of the field of ClosedLoop that holds the values of all tables of a list
+        ("actuator.low"); a number after it is a part of each entry ("plant.links.0")
+    """
+
+    name: str
+    doc: str = ""
+    kind: str = "number"
+    unit: str = "-"
+    low: float | None = None
+    high: float | None = None
+    strict: bool = False
+    choices: tuple[Any, ...] | None = None
+    default: Any = NEEDED
+    target: str = ""
+
+    @classmethod
+    def of(cls, owner: type, field: str, doc: str = "", **changes: Any) -> "Key":
+        """Return the key of a component's field: unit, description, range and kind are the field's.
+
+        Parameters
+        ----------
+        owner : class made by `jaxtank.component`
+        field : name of one of its leaves or static fields
+        doc : what the key is; "": what the field is
+        changes : what is different in the key
+
+        Examples
+        --------
+        >>> from jaxtank.plants.network import TankNetwork
+        >>> key = Key.of(TankNetwork, "rim", "height")
+        >>> key.name, key.kind, key.unit, key.low, key.strict
+        ('rim', 'number', 'cm', 0.0, True)
+        """
+        found = next(f for f in dataclasses.fields(owner) if f.name == field)
+        meta = found.metadata
+        own: dict[str, Any] = {
+            k: meta[k] for k in ("unit", "doc", "low", "high", "strict") if k in meta
+        }
+        if meta["kind"] == "static":
+            own |= {"kind": _KINDS.get(type_of(found), "number"), "choices": meta["choices"]}
+        if doc:
+            own["doc"] = doc
+        values: dict[str, Any] = {"name": field, **own, **changes}
+        return cls(**values)
+
+    def meta(self, units: tuple[str, str] = DEFAULT) -> dict[str, Any]:
+        """Return the metadata of a value, as of a leaf, in the units of a rig.
+
+        >>> Key("level", unit="cm").meta(("m", "V"))["unit"]
+        'm'
+        """
+        found = {k: getattr(self, k) for k in ("kind", "doc", "low", "high", "strict", "choices")}
+        return {**found, "unit": local(self.unit, units)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Section:
+    """A table of a rig file, or a list of tables.
+
+    Parameters
+    ----------
+    name : of the table, "reference.sine" for a table in a table
+    keys : what it may have; () where the names are parameters, measures, or fields of a class
+    many : whether it is a list of tables, [[name]]
+    prose : sentence that `init` prints above it where a case has none
+    per : field of TankNetwork with an entry for each table of the list
+    elsewhere : (part of the loop, class) whose other fields are in [values], for all tables at once
+    """
+
+    name: str
+    keys: tuple[Key, ...] = ()
+    many: bool = False
+    prose: str = ""
+    per: str = ""
+    elsewhere: tuple[Any, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """The line that begins the table: "[plant]", "[[tank]]"; "" of the top of a file."""
+        return f"[[{self.name}]]" if self.many else f"[{self.name}]" if self.name else ""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its keys."""
+        return [key.name for key in self.keys]
+
+    def __getitem__(self, name: str) -> Key:
+        return next(key for key in self.keys if key.name == name)
+
+
+_KINDS: dict[Any, str] = {bool: "flag", int: "integer", str: "choice", tuple: "tanks"}
+_TYPES: dict[Any, Any] = {kind.__name__: kind for kind in (bool, int, float, str, tuple)}
+
+
+def type_of(field: dataclasses.Field[Any]) -> Any:
+    """The type of a field, also where `from __future__ import annotations` makes it a text."""
+    kind: Any = field.type
+    return _TYPES.get(kind, kind)
