@@ -152,11 +152,7 @@ def design(
         slope=found.slopes,
         # of a lagged input every older reading is a part: neighbours count with their `reach`
         age=setting.delay if setting.lag == 0.0 else UNKNOWN,
-        held=tuple(
-            i
-            for i in range(n)
-            if not found.idle[i] and (setting.rates.pumps[i] or found.slopes[i] > 0.0)
-        ),
+        held=_held(setting, found),
     ), rows
 
 
@@ -186,11 +182,19 @@ def _proved(setting, plant, wanted, kappa, bound, start):
     return _Proved(heights, slopes, idle, reasons, reach)
 
 
+def _held(setting, found):
+    """Tanks that need a row: with a pump or a k1 of their own, where full pumps can fill them."""
+    pumps = setting.rates.pumps
+    return tuple(
+        i for i, idle in enumerate(found.idle) if not idle and (pumps[i] or found.slopes[i] > 0.0)
+    )
+
+
 def _row(setting, nominal, found, tank, wanted, kappa, bound):
     """Return the TankCertificate of one tank."""
     idle, spare = found.idle[tank], setting.spare[tank]
     limit = (wanted if idle else found.heights)[tank]
-    theorem = "Theorem 2" if found.slopes[tank] > 0.0 else theorem_of(setting)
+    theorem = "Theorem 2" if found.slopes[tank] > 0.0 else theorem_of(setting, tank)
     return TankCertificate(
         tank=tank,
         limit=float(limit + spare),

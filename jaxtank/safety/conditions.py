@@ -18,8 +18,10 @@ from jaxtank.safety.setting import (
 )
 
 
-def theorem_of(setting):
-    """The theorem that proves the limit of a tank with a pump."""
+def theorem_of(setting, tank):
+    """What proves the limit of a tank without a second-order row."""
+    if not setting.rates.pumps[tank]:
+        return "no pump, and its inflow cannot pass the limit"
     if setting.lag > 0.0:
         return "Theorem 4"
     return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
@@ -127,4 +129,5 @@ def gap_of(setting, nominal, tank, kappa, limit, reach):
         return min(full, gain / most * cap) + phi(nominal, tank, h, others)
 
     free = lambda h: full + phi(nominal, tank, h, others)
-    return float(highest_level(free, limit) - highest_level(filtered, limit))
+    # the levels are found to about 1e-12 of the limit
+    return max(round(float(highest_level(free, limit) - highest_level(filtered, limit)), 9), 0.0)

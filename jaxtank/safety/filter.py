@@ -147,7 +147,7 @@ class SafetyFilter:
                 )
                 rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, lower_clip(m, 0.0)))
             else:
-                rows.append(self._row_above(r, i, y, hold))
+                rows.append(self._row_above(r, i, y, hold, high))
         return rows
 
     def _fastest(self, r, tank, high):
@@ -155,7 +155,7 @@ class SafetyFilter:
         pumped = sum(b * lower_clip(high[j], 0.0) for j, (_, b) in r.pumps[tank].items())
         return pumped + lower_clip(rise(r, tank, 0.0, self.reach), 0.0)
 
-    def _row_above(self, r, tank, y, hold):
+    def _row_above(self, r, tank, y, hold, high):
         """Return the row of a tank without a pump on the pumps of the tanks that feed it.
 
         g = c_min s(h) + k1 (H - h) - sum_j c_j,max max(s(h_j), a0)    g >= 0 keeps h' <= k1 (H - h)
@@ -179,7 +179,9 @@ class SafetyFilter:
         m = lower_clip(drains + k2 * g - k1 * k1 * (top - lowest), 0.0)
         x = y[tank] + eps + hold * full
         far = r.out[tank] * s(x) + k1 * (top - x) >= full
-        return row, jnp.where(far, jnp.inf, m)
+        # no row far below: more than all pumps can bring, and finite, for its derivative
+        idle = 1.0 + 2.0 * sum(a * lower_clip(high[j], 0.0) for j, a in row.items())
+        return row, jnp.where(far, idle, m)
 
     def limits(self, y: Sequence, hold: Any, low: Sequence, high: Sequence) -> tuple:
         """Return ((m) upper limits of the inputs [V], the rows that bind two pumps or more).
@@ -190,8 +192,9 @@ class SafetyFilter:
         for row, m in self.bounds(y, hold, high):
             if len(row) == 1:
                 ((j, a),) = row.items()
-                cap = jnp.where(a > 0.0, m / jnp.where(a > 0.0, a, 1.0), jnp.inf)
-                caps[j] = jnp.minimum(caps[j], lower_clip(cap, low[j]))
+                cap = jnp.where(a > 0.0, m / jnp.where(a > 0.0, a, 1.0), high[j])
+                cap = lower_clip(cap, low[j])
+                caps[j] = jnp.where(cap < caps[j], cap, caps[j])
             else:
                 shared.append((row, m))
         return tuple(caps), shared

@@ -3,8 +3,6 @@
 Imported by the page of `jaxtank show`.
 """
 
-import math
-
 from jaxtank.core.errors import InputError
 from jaxtank.core.units import local
 from tuning.report import tables
@@ -43,21 +41,16 @@ def certificates(case):
 def rows_of(case, found):
     """Return (heads, rows) of the table of `certificates`, its numbers in the case's units."""
     length = local("cm", case.loop.units)
-    heads = [
-        "tank",
-        f"limit [{length}]",
-        "certified",
-        "kappa, at most [1/s]",
-        f"gap [{length}]",
-        "",
-    ]
+    heads = ["tank", f"limit [{length}]", "proved", "kappa [1/s]", "at most [1/s]"]
+    heads += [f"gap [{length}]", "by, or why not"]
     rows = [
         [
             row["tank"],
             f"{row['limit']:.4g}",
             "yes" if row["certified"] else "no",
-            f"{row['rate']:.3g}, {row['rate_bound']:.3g}",
-            "-" if row["gap"] is None or not math.isfinite(row["gap"]) else f"{row['gap']:.3g}",
+            f"{row['rate']:.3g}",
+            f"{row['rate_bound']:.3g}",
+            "-" if row["gap"] is None else f"{row['gap']:.3g}",
             row["why"],
         ]
         for row in found
@@ -70,8 +63,11 @@ def sentences(case):
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"
     return [
         f"The safety filter is {on}.",
-        "certified: no plant of the case's intervals passes the limit, under any controller and for"
-        " readings within their band; a proof, or the condition that failed.",
-        "gap: by how much the filter lowers the level at which the nominal rig rests with its pumps"
-        " full; kappa: how fast a level may approach its limit.",
+        "proved: no plant of the case's intervals passes the limit, under any controller and for"
+        " readings within their band. The last column names the theorem (jaxtank/safety/README.md),"
+        " or the condition that failed.",
+        "kappa: a level may rise by at most kappa x its distance to the limit; at most: the largest"
+        " kappa that is proved.",
+        "gap: with its pumps at full command the nominal rig settles this far below the limit, or"
+        " below where it would settle without the filter; -: no pump of its own.",
     ]

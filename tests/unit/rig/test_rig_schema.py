@@ -102,6 +102,11 @@ extra = 0.01
 gains = ["controller.Kc[0]"]
 variable = "r1"
 knots = [3.0, 6.0]
+[safety_filter]
+limit = [2.5, 2.4]
+band = [0.01, 0.02]
+rate = 0.5
+widths = { "plant.drain" = 0.01 }
 [covariance]
 names = ["plant.drain[0]"]
 matrix = [[0.0001]]

@@ -60,7 +60,7 @@ def test_show_prints_what_is_proved_and_the_condition_that_failed():
     assert code == 0 and "pays out more than was commanded" in " ".join(out.split())
     code, out, _ = command("show", "gouta2015/ngpc")
     table = out.split("Limits on levels")[1].split("The safety filter")[0]
-    assert table.count("yes") == 4 and "Theorem 2" in table
+    assert table.count("yes") == 4 and "Theorem 2" in table and "0.108" in table
 
 
 @pytest.mark.parametrize(

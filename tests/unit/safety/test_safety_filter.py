@@ -350,19 +350,27 @@ def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
     assert float(value) == pytest.approx(by_qp, abs=1e-4) and highest <= loop.plant.rim.max()
 
 
-def test_gradients_through_the_filter_are_central_differences():
-    case = presets.find("gouta2015/ngpc")
-    loop, clock = case.loop, dataclasses.replace(case.clock, duration=600.0)
+@pytest.mark.parametrize(
+    ("name", "gain", "value", "duration"),
+    [
+        ("gouta2015/ngpc", "controller.Tp", 9.0, 600.0),
+        ("cascaded/pi", "controller.Kc", 2.0, 4000.0),
+    ],
+)
+def test_gradients_through_the_filter_are_central_differences(name, gain, value, duration):
+    case = presets.find(name)
+    loop, clock = case.loop, dataclasses.replace(case.clock, duration=duration)
     found, _ = design(loop.plant, loop.actuator, loop.sensor, clock.dt, widths=of(loop.plant, 0.05))
     loop = dataclasses.replace(loop, safety_filter=found)
 
     @jax.jit
     def cost(theta):
-        values = {"controller.Tp": theta[0], "safety_filter.rate": theta[1] * np.ones(4)}
+        rate = theta[1] * np.ones(loop.plant.tanks)
+        values = {gain: theta[0], "safety_filter.rate": rate}
         found = evaluate(with_values(loop, values), clock, ["mean_square_error"])
         return found["mean_square_error"].sum()
 
-    theta = np.array([9.0, 1.7])
+    theta = np.array([value, 0.85 * float(found.rate[0])])
     slopes = jax.jacfwd(cost)(theta)
     for i, step in enumerate([1e-4, 1e-5]):
         e = np.eye(2)[i] * step
