@@ -202,8 +202,8 @@ def _start_violates(result: TuningResult) -> Found:
     if parts and not _violated(result):
         yield Message(
             "start-violates-limit",
-            f"the starting values violate a limit ({_first(parts)}), so their objective is no"
-            " reference",
+            f"the starting values violate a limit ({_first(parts)}), so the"
+            " objectives before and after do not compare",
         )
 
 
@@ -301,10 +301,12 @@ def _out_of_sample(result: TuningResult) -> Found:
     found = result.validation
     share = found["limits_held"]["after"] if found else None
     if found and share is not None and share < 1.0 and result.problem.limits:
+        wanted = {x.measure for x in result.problem.limits if not result.problem.loop.safety_filter}
+        caps = "--safety-filter keeps levels below their limits, " if "max_level" in wanted else ""
         yield Message(
             "limit-violated-out-of-sample",
             f"on the validation set every limit holds in {100 * share:.0f} % of"
-            f" {found['samples']} runs: --robust tunes for perturbed plants",
+            f" {found['samples']} runs: {caps}--robust tunes for perturbed plants",
         )
 
 
@@ -314,7 +316,7 @@ def _screened_again(result: TuningResult) -> Found:
         yield Message(
             "screened-at-true-step",
             f"{count(redone, 'screening point')} diverged at the coarse step of the screening and"
-            " did not at the case's own step, at which they were run again",
+            " were run again at the case's own step: no action is needed",
         )
 
 
