@@ -57,6 +57,9 @@ rms_error_total = 1.0
 names = ["plant.drain[0]", "plant.drain[1]"]
 matrix = [[1e-6, 0.0], [0.0, 1e-6]]
 
+[safety_filter]              # caps on the pumps: no level passes its limit on any plant of the
+rate = 1.0                   # intervals above; every key may be left out
+
 [log]                        # columns of experiment data: a header, or [header, unit]
 pump1 = ["pump speed", "V"]
 h1 = "level 1 [mm]"

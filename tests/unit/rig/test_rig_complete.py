@@ -194,6 +194,7 @@ def test_the_example_of_the_module_can_be_used():
         ("pump_gain[0]", 300.0, 400.0),
     )
     assert set(again.free) == {f"controller.values[1,{j}]" for j in range(3)}
+    assert again.loop.safety_filter.rate.tolist() == [1.0] * 4
 
 
 def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
