@@ -103,7 +103,8 @@ _OPTIONAL = {
     "environment": "jaxtank.interop.gymnasium",
 }
 
-__all__ = [*_NAMES, *_FOLDERS]  # pyright: ignore[reportUnsupportedDunderAll]  the names of the table
+# the names of the table
+__all__ = [*_NAMES, *_FOLDERS]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 if not TYPE_CHECKING:  # a checker would take any name for one that is here

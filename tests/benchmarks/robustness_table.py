@@ -55,7 +55,7 @@ class Row(NamedTuple):
 
 class Found(NamedTuple):
     """One law on N plants: {measure: (N, ...)}, errors (N, rows, 2) [cm] every EVERY seconds, and
-    True where a run left the numbers.
+    True where a run diverged.
     """
 
     measures: dict

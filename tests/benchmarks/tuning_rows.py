@@ -113,8 +113,8 @@ def four_tank():
 
 
 def unseen():
-    """The held-out runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal` does
-    not have.
+    """The validation runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal`
+    does not have.
     """
     x0, u0 = equilibrium(mirakhorli.plant(), mirakhorli.SETPOINT)
     warm_x, warm_u = equilibrium(mirakhorli.plant(), mirakhorli.WARM)

@@ -114,7 +114,7 @@ def test_a_fit_from_elsewhere_comes_back():
 def test_gradients_against_central_differences(name, names):
     case = CASES[name]
     if name == "pi":
-        # so that the anti-windup is at work and Tt is felt
+        # so that the anti-windup is at work and Tt has an effect
         case = rig.set_values(case, {"actuator.high": 3.3})
     f = jax.jit(
         lambda z: jaxtank.evaluate(

@@ -6,7 +6,8 @@ compilation, in a run. Only a search that has found something (`Interrupts`) goe
 Ctrl-C, to report the best point so far.
 """
 
-import _signal  # pyright: ignore[reportMissingImports]  no stubs; `signal` adds enumerations to it, whose import takes longer than all of this
+# `signal` adds enumerations, whose import takes longer than all of this; _signal has no stubs
+import _signal  # pyright: ignore[reportMissingImports]
 import _thread
 import atexit
 import os

@@ -321,7 +321,9 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
         traces.append(None)
         return jaxtank.evaluate(loop, clock, ["rms_error_total"])["rms_error_total"]
 
-    case = gouta("backstepping", {"x0": 5.0})  # away from rest, so that the gain is felt
+    case = gouta(
+        "backstepping", {"x0": 5.0}
+    )  # away from the steady state, so that the gain has an effect
     changes = [
         {"controller.k1": 0.05},
         {"controller.k1": np.float32(0.1)},

@@ -155,8 +155,8 @@ initial = [{setpoint}]
     ("rim", "dt"), [(1e4, 0.1), (1e3, 0.06), (1e3, 0.07), (1e3, 0.08), (40.0, 0.06)]
 )
 def test_a_rim_far_above_all_levels_hides_nothing(rim, dt, tmp_path, capsys):
-    """The tank empties from 20 cm and is thrown up by centimetres, whether its rim is at 40 cm or,
-    as a mere limit, at 100 m.
+    """The tank empties from 20 cm and rises by centimetres in one unstable step, whether its rim is
+    at 40 cm or, as a mere limit, at 100 m.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
@@ -195,7 +195,7 @@ def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
 @pytest.mark.parametrize("rim", [20.0, 1e4])
 @pytest.mark.parametrize("case", ["fed", "empty", "fault", "pour"])
 def test_a_run_that_is_right_is_not_refused(case, rim):
-    """The film is too fast for the steps, and yet nothing was thrown up: the tank is fed all the
+    """The film is too fast for the steps, and yet no level rose: the tank is fed all the
     time, or starts empty and fills, or more comes in than its pump brings.
     """
     text = (
