@@ -198,18 +198,35 @@ def from_table(table: Mapping[str, Any]) -> Case:
     return filtered(validate.check(case))
 
 
-def filtered(case: Case, on: bool | None = None) -> Case:
+def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
     """Return the case with the safety filter of its settings, designed for its present values.
 
     Parameters
     ----------
     case : Case
     on : True: with default settings where it has none; False: without a filter
+    changes : {key of [safety_filter]: value} in place of the case's
+
+    Raises
+    ------
+    InputError for an unknown key, a value out of its range, and changes without a filter.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = rig.filtered(presets.find("cascaded/pi"), on=True, changes={"rate": 0.1})
+    >>> case.safety, case.loop.safety_filter.rate.tolist()
+    ({'rate': 0.1}, [0.1, 0.1])
     """
-    if on is False:
+    changes = read_entry(SECTIONS["safety_filter"], changes or {}, sizes_of(case.loop.plant))
+    if (case.safety is None and not on) or on is False:
+        if changes:
+            raise InputError(
+                f"safety_filter.{next(iter(changes))}: the safety filter is off;"
+                " --safety-filter turns it on"
+            )
         return case.without_safety_filter()
-    settings = case.safety if case.safety is not None or not on else {}
-    return case if settings is None else case.with_safety_filter(**settings)
+    return case.with_safety_filter(**{**(case.safety or {}), **changes})
 
 
 TUNING = {

@@ -36,10 +36,10 @@ def open_case(args):
     of_file = rig.case_warnings(opened) if args.case.endswith(".toml") and not args.quiet else []
     for sentence in of_file:
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
-    values = settings(args)
+    values, of_filter = _apart(settings(args))
     case = rig.check(rig.set_and_schedule(opened, values, schedule(args.schedule)))
     case, replaced = rig.overridden(case, values)
-    case = rig.filtered(case, args.safety_filter)
+    case = rig.filtered(case, args.safety_filter, of_filter)
     if not args.quiet:
         for sentence in _warnings(args, opened, case, replaced):
             if sentence not in of_file:
@@ -62,7 +62,26 @@ def _warnings(args, opened, case, replaced):
     found += rig.model_warnings(case)
     if case.clock != opened.clock:
         found += rig.clock_warnings(case.clock)
-    return found + step_size.step_warnings(case.loop, case.clock)
+    return found + _not_proved(case) + step_size.step_warnings(case.loop, case.clock)
+
+
+def _apart(values):
+    """({name: value} of the rig, {key: value} of its safety filter), from those of --set."""
+    prefix = "safety_filter."
+    own = {n.removeprefix(prefix): v for n, v in values.items() if n.startswith(prefix)}
+    return {n: v for n, v in values.items() if not n.startswith(prefix)}, own
+
+
+def _not_proved(case):
+    """Sentences on tanks whose limits the safety filter of the case is not proved to keep."""
+    if case.loop.safety_filter is None:
+        return []
+    rows = case.safety_design(**case.safety)[1]
+    return [
+        f"safety filter: the limit of tank {row.tank + 1} is not proved: {row.reason}"
+        for row in rows
+        if not row.certified
+    ]
 
 
 def settings(args):

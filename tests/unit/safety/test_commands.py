@@ -88,3 +88,21 @@ def test_a_filter_made_by_hand_has_no_rig_file():
     case = presets.find("cascaded/pi").with_safety_filter()
     with pytest.raises(InputError, match="its safety filter is not that of"):
         rig.dump(case.replace(safety=None))
+
+
+def test_a_setting_of_the_filter_is_set_by_its_name():
+    tight = highest("cascaded/pi", "--safety-filter", "--set", "safety_filter.limit=[9.0,9.0]")
+    assert np.all(tight <= 9.0)
+    code, _, err = command("simulate", "cascaded/pi", "--set", "safety_filter.rate=0.1")
+    assert code == 2 and "the safety filter is off; --safety-filter turns it on" in err
+    words = ["cascaded/pi", "--safety-filter", "--set", "safety_filter.rat=0.1"]
+    code, _, err = command("simulate", *words)
+    assert code == 2 and "nearest: rate" in err
+
+
+def test_a_limit_that_is_not_proved_is_reported():
+    fast = ["cascaded/pi", "--safety-filter", "--set", "safety_filter.rate=0.3"]
+    code, _, err = command("simulate", *fast)
+    assert code == 0 and "tank 1 is not proved: kappa 0.3 above its bound 0.25 1/s" in err
+    code, _, err = command("simulate", *fast[:2])
+    assert code == 0 and "not proved" not in err
