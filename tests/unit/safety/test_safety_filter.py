@@ -15,8 +15,10 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import design
-from jaxtank.safety.box import widths_of
+from jaxtank.safety.box import box_of, widths_of
 from jaxtank.safety.certificate import rate_bound
+from jaxtank.safety.setting import phi
+from jaxtank.safety.worst_case import rates_of, rise
 
 NAMES = ("drain", "orifice", "pipe", "pump_gain", "split")
 
@@ -294,6 +296,21 @@ def test_a_dead_time_needs_a_smaller_rate(delay):
     forgotten, (row,) = design(plant, actuator, sensor_of(plant), 0.5, **given)
     assert row.certified  # for a rig without it
     assert passes(plant, delayed, forgotten, 0.0, delay=delay, start=start).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_filter_and_certificate_reckon_with_the_same_rates(seed):
+    """`worst_case.rise`, compiled into the loop, and `setting.phi`, in numbers before a run."""
+    rng = np.random.default_rng(seed)
+    plant, _ = random_rig(rng)
+    plant = dataclasses.replace(plant, bottom=seed % 2 == 0)
+    inflow = rng.uniform(0.0, 5.0, plant.tanks)
+    rates = rates_of(*box_of(plant, of(plant, 0.1)), inflow, 0.5)
+    for _ in range(20):
+        others = rng.uniform(0.0, 40.0, plant.tanks)
+        tank, level = int(rng.integers(plant.tanks)), float(rng.choice([0.0, 0.005, 0.1, 12.0]))
+        expected = float(rise(rates, tank, level, tuple(others)))
+        assert phi(rates, tank, level, others) == pytest.approx(expected, rel=1e-12, abs=1e-12)
 
 
 def rate_by_hand(c, area, pumped):
