@@ -13,6 +13,8 @@ import importlib
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
 TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
+    from tuning.answer.answer import Answer as Answer
+    from tuning.answer.default import tune as tune
     from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
@@ -37,7 +39,6 @@ if TYPE_CHECKING:
     from tuning.search.result import TuningResult as TuningResult
     from tuning.search.robust import Certificate as Certificate
     from tuning.search.robust import tune_robust as tune_robust
-    from tuning.search.tuner import tune as tune
     from tuning.uncertainty.distributions import Correlated as Correlated
     from tuning.uncertainty.distributions import Discrete as Discrete
     from tuning.uncertainty.distributions import LogUniform as LogUniform
@@ -80,7 +81,8 @@ _NAMES = {
     "tune_robust": "tuning.search.robust",
     "sensitivity": "tuning.uncertainty.sensitivity_study",
     "tradeoff": "tuning.search.pareto",
-    "tune": "tuning.search.tuner",
+    "Answer": "tuning.answer.answer",
+    "tune": "tuning.answer.default",
 }
 
 __all__ = list(_NAMES)  # pyright: ignore[reportUnsupportedDunderAll]  the names of the table

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.loop.trajectory import csv
-from tuning.report import html
+from tuning.report import answer, html
 from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
 from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
 from tuning.report.tuning_figures import CAPTIONS, figures, result_key
@@ -44,6 +44,7 @@ def json_of(result):
         "tradeoff": clean(result.tradeoff),
         "certificate": None if result.certificate is None else result.certificate._asdict(),
         "wall_s": result.wall_s,
+        **answer.json_parts(result),
         "bound": None if result.bound is None else clean(result.bound.to_json()),
         "validation": clean(result.validation),
         "provenance": result.provenance,
@@ -52,6 +53,8 @@ def json_of(result):
 
 def lines(result):
     """Return what is printed of a TuningResult: lines and Tables."""
+    if result.answer is not None:
+        return answer.lines_of(result)
     return [*parts_of(result), "\n".join(f"- {m.text}" for m in result.messages)]
 
 
@@ -86,7 +89,7 @@ def page_of(result, drawn, command=None):
         facts,
         [m.text for m in result.messages],
         html.drawings(drawn, CAPTIONS),
-        parts_of(result)[1:],
+        (answer.parts_of(result) if result.answer else parts_of(result))[1:],
         command,
         result.provenance,
         {"The tuned rig as a file (rig.toml)": rig} if rig else None,

@@ -3,6 +3,9 @@
 import dataclasses
 from typing import ClassVar
 
+import jax
+import numpy as np
+
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Problem
 
@@ -122,6 +125,15 @@ class Adam(Solver):
 
     method: ClassVar[str] = "adam"
     batch: int | None = None
+
+
+def check_precision() -> None:
+    """Raise InputError where the default numbers of JAX are not of 64 bits."""
+    if jax.numpy.result_type(float) != np.float64:
+        raise InputError(
+            "tune needs float64 (float32 cannot resolve a limit to 1e-3 cm):"
+            " jax.config.update('jax_enable_x64', True)"
+        )
 
 
 def check_options(*, tolerance=None, **counts):

@@ -162,6 +162,7 @@ class TuningResult(Result):
     bound : perfect-information open-loop optimum (`tuning.bound`), where asked.
     tradeoff : objective over one limit (`tuning.tradeoff`), where asked.
     certificate : violation probability on new plants (`tune_robust`), where asked.
+    answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
     Examples
     --------
@@ -197,6 +198,7 @@ class TuningResult(Result):
     bound: Any = None
     tradeoff: Any = None
     certificate: Any = None
+    answer: Any = None
     cloud: dict[str, Any] | None = None
 
     @property
@@ -242,29 +244,50 @@ def constraint_rows(
     multipliers = multipliers or {}
     rows = []
     for limit in problem.limits:
-        spec, run = ms.MEASURES[limit.measure], problem.runs[limit.run]
-        value = _value(limit, after)
-        margin, multiplier = limit.margin(after[limit.run]), multipliers.get(limit.label, 0.0)
-        reached = spec.reached
+        reached = ms.MEASURES[limit.measure].reached
         rows.append(
-            ConstraintRow(
-                name=limit.label,
-                measure=limit.measure,
-                unit=ms.unit(limit.measure, problem.loop.units),
-                limit=limit.value,
-                value=value,
+            row_of(
+                limit,
+                problem,
+                _value(limit, after),
                 before=None if before is None else _value(limit, before),
-                margin=margin,
-                tank=_tank(limit, run.case.loop.plant),
-                pump=limit.index + 1 if spec.per == "pump" else None,
                 time_s=float(after[limit.run][reached][limit.index]) if reached else None,
                 scenario=limit.scenario or None,
-                reason=_reason(limit, value),
-                active=margin >= 0 and (margin < ACTIVE * abs(limit.value) or multiplier > 0),
-                multiplier=multiplier,
+                multiplier=multipliers.get(limit.label, 0.0),
             )
         )
     return rows
+
+
+def row_of(
+    limit: Limit,
+    problem: Problem,
+    value: float,
+    *,
+    before: float | None = None,
+    time_s: float | None = None,
+    scenario: str | None = None,
+    multiplier: float = 0.0,
+) -> ConstraintRow:
+    """Return the ConstraintRow of a limit whose measure has this value; see its fields."""
+    spec, plant = ms.MEASURES[limit.measure], problem.runs[limit.run].case.loop.plant
+    margin = float(limit.margins(value))
+    return ConstraintRow(
+        name=limit.label,
+        measure=limit.measure,
+        unit=ms.unit(limit.measure, problem.loop.units),
+        limit=limit.value,
+        value=value,
+        before=before,
+        margin=margin,
+        tank=_tank(limit, plant),
+        pump=limit.index + 1 if spec.per == "pump" else None,
+        time_s=time_s,
+        scenario=scenario,
+        reason=_reason(limit, value),
+        active=margin >= 0 and (margin < ACTIVE * abs(limit.value) or multiplier > 0),
+        multiplier=multiplier,
+    )
 
 
 def _value(limit: Limit, table: Sequence[Mapping[str, Any]]) -> float:

@@ -24,7 +24,7 @@ from tuning.search.discrete import tune_choices
 from tuning.search.kkt import optimality
 from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
-from tuning.search.options import Solver, check_options, spelled_out
+from tuning.search.options import Solver, check_options, check_precision, spelled_out
 from tuning.search.provenance import provenance
 from tuning.search.result import TuningResult, constraint_rows
 from tuning.search.stages import Outcome, Plan, solve, status_of
@@ -135,7 +135,7 @@ def tune(
 def _tune(case, method, *, checkpoint, resume, validation, progress, **options):
     """Check everything, run the stages, and put the result together."""
     began = time.perf_counter()
-    _check_precision()
+    check_precision()
     numbers = ("starts", "screening", "iterations", "batch", "tolerance")
     check_options(validation=validation, **{n: options[n] for n in numbers})
     stated = ("free", "objective", "limits", "scenarios", "seed", "risk")
@@ -253,14 +253,6 @@ def _parameters(problem, z, values, change, idle):
         }
         for b, v, percent, still in zip(problem.bounds, z, change, idle)
     }
-
-
-def _check_precision():
-    if jax.numpy.result_type(float) != np.float64:
-        raise InputError(
-            "tune needs float64 (float32 cannot resolve a limit to 1e-3 cm):"
-            " jax.config.update('jax_enable_x64', True)"
-        )
 
 
 def _check_objective(problem, before):

@@ -1,0 +1,1 @@
+"""The default answer of `tune`: gains for many plants at once, with noise, priced inputs, a filter."""

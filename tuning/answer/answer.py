@@ -1,0 +1,112 @@
+"""What the default answer of `tune` gives besides the gains, as data.
+
+Imported by `recommend`, `findings` and the report.
+"""
+
+import dataclasses
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxtank.core.jsonable import clean
+from tuning.answer.judged import Judged
+from tuning.answer.setting import Setting
+from tuning.problem.result import Shown
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Answer(Shown):
+    """How the default answer was found and judged: `TuningResult.answer`.
+
+    Parameters
+    ----------
+    setting : what was searched: noise, plants, cost, safety filter.
+    before, after : the published and the tuned case on the same plants, none used by the search.
+    nominal : {"before", "after": total rms error of the case's own run, without noise}.
+    kept : {parameter: True where it stays at its first value}.
+    agreed : True if two searches ended at the same cost; followed : False where the tuned loop no
+        longer follows its setpoints.
+    idle : numbers of the tanks, from 1, whose limit no plant comes near.
+    tightened : share by which the limits were tightened for the search [-].
+    coarse_dt : step of the search [s].
+    measures : {"before", "after": {measure: value} of the case's own run}.
+    feasibility : which setpoints no controller can hold; None where that is not known.
+
+    Examples
+    --------
+    >>> import tuning
+    >>> from jaxtank import presets
+    >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
+    >>> result.answer.after.share_held()["share"]  # doctest: +SKIP
+    1.0
+    """
+
+    setting: Setting
+    before: Judged
+    after: Judged | None
+    nominal: Mapping[str, float]
+    kept: Mapping[str, bool]
+    agreed: bool
+    followed: bool
+    idle: tuple[int, ...]
+    tightened: float
+    coarse_dt: float
+    measures: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    feasibility: Any = None
+
+    @property
+    def held(self) -> bool:
+        """True if every limit holds on every plant that judged the answer."""
+        return self.after is not None and bool(self.after.held.all())
+
+    def _lines(self) -> list[Any]:
+        return importlib.import_module("tuning.report.answer").of_answer(self)
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self._lines()))
+
+    def holds(self) -> dict[str, Any]:
+        """Return the object `holds` of the JSON: share of plants, interval, certificates."""
+        found = None if self.after is None else self.after.share_held()
+        return {
+            "limits_on_validation": found["share"] if found else None,
+            "interval95": found["interval95"] if found else None,
+            "samples": found["samples"] if found else 0,
+            "certified": [
+                {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
+                for row in self.setting.certificates
+            ],
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what the JSON of a result says of its plants, its noise and its safety filter."""
+        sides = {"before": self.before, "after": self.after}
+        return clean(
+            {
+                "noise": self.setting.noise,
+                "noise_assumed": self.setting.assumed,
+                "plants_stated": self.setting.stated,
+                "objective": dict(self.setting.objective),
+                "safety_filter": self.setting.filter,
+                "nominal_error": dict(self.nominal),
+                "plants": {name: self._side(j) for name, j in sides.items() if j is not None},
+                "kept": [name for name, stays in self.kept.items() if stays],
+                "idle_limits_of_tanks": list(self.idle),
+                "limits_tightened": self.tightened,
+                "search_dt_s": self.coarse_dt,
+            }
+        )
+
+    def _side(self, judged):
+        good = ~judged.failed
+        return {
+            "samples": judged.samples,
+            "failed": int(judged.failed.sum()),
+            "objective": float(np.mean(judged.cost[good])) if good.any() else None,
+            "error": float(np.mean(judged.error[good])) if good.any() else None,
+            "highest_level": judged.level[good].max(axis=0).tolist() if good.any() else None,
+            "travel_percent": 100.0 * float(np.mean(judged.travel[good])) if good.any() else None,
+            "limits_held": float(judged.held.mean()),
+        }

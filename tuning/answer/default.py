@@ -1,0 +1,139 @@
+"""tune: the default answer, or the optimum of a problem as it is stated.
+
+Imported by the command line and as `tuning.tune`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxtank.case import Case, Scenario
+from jaxtank.core.errors import InputError
+from tuning.answer.judged import FRESH
+from tuning.answer.recommend import recommend
+from tuning.problem.problem import Problem
+from tuning.search import tuner
+from tuning.search.options import Solver, check_options, check_precision
+from tuning.search.result import TuningResult
+from tuning.storage.checkpoint import checkpoint_folder
+
+DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
+NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
+
+
+def tune(
+    case: Case | Problem,
+    method: str | Solver = "auto",
+    *,
+    nominal: bool | None = None,
+    free: Mapping[str, Any] | None = None,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    distributions: Mapping[str, Any] | None = None,
+    safety_filter: bool | None = None,
+    scenarios: Sequence[Scenario] | None = None,
+    risk: str = "mean",
+    choices: Mapping[str, Sequence] | None = None,
+    starts: int | None = None,
+    seed: int = 0,
+    screening: int | None = None,
+    iterations: int | None = None,
+    batch: int | None = None,
+    validation: int | None = None,
+    tolerance: float | None = None,
+    log: str | Path | None = None,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    progress: Callable | None = None,
+) -> TuningResult:
+    """Return better values for the free parameters of a case, under its limits.
+
+    By default, values for a rig that is not exactly known: the mean over 32 plants drawn from what
+    the case calls uncertain, with sensor noise, of the squared error plus a price on the change of
+    the inputs from sample to sample. A safety filter keeps levels below their limits where they
+    come near them. A parameter stays at its value unless changing it is worth 1 % of the cost. The
+    answer is judged on 256 other plants at the case's own step (`result.answer`).
+
+    With nominal=True the optimum of the case as it is: its own run or scenarios alone, its own
+    objective, no noise and no filter that it does not have; so too where a Problem, a method,
+    scenarios, risk, choices or batch say what is to be solved and how.
+
+    Parameters
+    ----------
+    case : Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its
+        own (and its seed, unless another is given).
+    method : solver options (SQP, TRF, LBFGS, Adam), or "auto" (trf where the cost is a sum of
+        squares and no limit is active, else slsqp), "slsqp", "trf", "coarse-trf" (trf at a tenth
+        of the samples, then at all), "lbfgs" or "adam".
+    nominal : True for the optimum of the case as it is, False for the default answer, None for the
+        default answer unless method, scenarios, risk, choices or batch are given.
+    free : {name: (low, high) or Free}; the case's own where None.
+    objective : {measure: weight}; where None the case's own (of a preset, the default cost, unless
+        nominal).
+    limits : {measure: value}, {} for none, the case's own where None.
+    distributions : {name: distribution or share}, the plants of the default answer; what the case
+        calls uncertain where None, 5 % of every flow where that is nothing.
+    safety_filter : of the default answer; None: where a level comes near its limit.
+    scenarios : tuple of Scenario, () for the case's own run alone.
+    risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
+    choices : {static name: [values]}, each combination of which is tuned, the best taken.
+    starts : local searches, 8 if nominal; else at most 4, until two agree.
+    seed : of the Sobol points, the plants and the sensor noise.
+    screening : number of Sobol points (nominal: 64).
+    iterations : of each local search (60; 40 of the default answer).
+    batch : scenarios drawn for each step of adam, None for all.
+    validation : plants that judge the answer (256; 64 runs where nominal, 0 for none).
+    tolerance : change of the objective, as a share of its first value, below which a search under
+        limits has converged; None for 1e-8 and a last search to 1e-12.
+    checkpoint : folder for the log of evaluations, with which a killed search is continued by
+        resume=True, to the same bits; `log` is its former name.
+    progress : called with a dict after every evaluation. Ctrl-C ends the search with the best
+        point so far.
+
+    Returns
+    -------
+    TuningResult
+
+    Raises
+    ------
+    InputError : for anything that cannot be used, before anything is run.
+
+    Examples
+    --------
+    >>> import jax, tuning
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
+    >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
+    """
+    states = {"scenarios": scenarios, "choices": choices, "batch": batch, "tolerance": tolerance}
+    asked = [n for n, v in states.items() if v is not None]
+    asked += ["risk"] * (risk != "mean") + ["method"] * (method != "auto")
+    asked += ["screening"] * (screening is not None and nominal is False)
+    if nominal is False and (asked or isinstance(case, Problem)):
+        what = asked[0] if asked else "a Problem"
+        raise InputError(f"{what}: belongs to the nominal optimum (nominal=True, --nominal)")
+    common: dict[str, Any] = dict(free=free, objective=objective, limits=limits, seed=seed)
+    common |= dict(checkpoint=checkpoint_folder(checkpoint, log=log), resume=resume)
+    own = NOMINAL if nominal or asked or isinstance(case, Problem) else DEFAULT
+    counts = {"starts": starts, "iterations": iterations, "validation": validation}
+    common |= {n: own[n] if v is None else v for n, v in counts.items()} | {"progress": progress}
+    if own is DEFAULT:
+        check_precision()
+        check_options(**{n: common[n] for n in counts})
+        assert isinstance(case, Case)
+        return recommend(case, distributions=distributions, safety_filter=safety_filter, **common)
+    if distributions is not None or safety_filter is not None:
+        name = "distributions" if distributions is not None else "safety_filter"
+        raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
+    return tuner.tune(
+        case,
+        method,
+        scenarios=scenarios,
+        risk=risk,
+        choices=choices,
+        screening=NOMINAL["screening"] if screening is None else screening,
+        batch=batch,
+        tolerance=tolerance,
+        **common,
+    )

@@ -1,0 +1,163 @@
+"""The sentences about a default answer; imported by `recommend`."""
+
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+
+from jaxtank import measures as ms
+from tuning.answer.answer import Answer
+from tuning.answer.setting import SPREAD
+from tuning.problem.status import Status
+from tuning.search.result import Message, TuningResult
+
+Found = Iterator[Message]
+
+BUSIER = 20.0
+"""Growth of the change of the inputs from sample to sample above which it is reported [-]."""
+
+
+def findings_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
+    """Return the findings about a default answer, most important first.
+
+    steps : sentences on integration steps that are too long.
+    """
+    first = [Message("step-too-long", text) for text in steps]
+    answer: Answer = result.answer
+    return (*first, *(m for rule in RULES for m in rule(result, answer)))
+
+
+def _interrupted(result, answer) -> Found:
+    if result.status == Status.INTERRUPTED:
+        yield Message("interrupted", "interrupted: these are the best gains so far, not yet judged")
+
+
+def _violated(result, answer) -> Found:
+    if answer.after is None or answer.held:
+        return
+    held = answer.after.share_held()
+    worst = [r for r in answer.after.worst() if r["margin"] < 0]
+    parts = [_words(result, r) for r in worst[:4]]
+    if answer.after.failed.any():
+        parts.append(f"{int(answer.after.failed.sum())} runs diverged")
+    remedy = (
+        "a limit without a certificate cannot be guaranteed: other --free ranges, or a limit that"
+        " leaves more margin"
+    )
+    if answer.setting.filter is None and any(r["limit"].measure == "max_level" for r in worst):
+        remedy = "--safety-filter keeps levels below their limits"
+    yield Message(
+        "limit-violated-out-of-sample",
+        f"limits hold on {100 * held['share']:.3g} % of {held['samples']} plants"
+        f" ({'; '.join(parts)}): {remedy}",
+    )
+
+
+def _words(result, row):
+    limit = row["limit"]
+    unit = ms.unit(limit.measure, result.tuned.loop.units)
+    return f"{limit.label} up to {row['value']:.4g} {unit}, limit {limit.value:.4g} {unit}"
+
+
+def _lost(result, answer) -> Found:
+    if answer.after is not None and not answer.followed:
+        unit = result.tuned.loop.units[0]
+        yield Message(
+            "no-longer-follows",
+            "the tuned loop no longer follows its setpoints: total rms error of the case's own run"
+            f" {answer.nominal['after']:.3g} {unit}, {answer.nominal['before']:.3g} {unit} before",
+        )
+
+
+def _not_agreed(result, answer) -> Found:
+    if result.status != Status.INTERRUPTED and not answer.agreed:
+        yield Message(
+            "not-converged",
+            "no two of the local searches ended within 1 % of each other: raise --starts or"
+            " --iterations, or narrow the ranges (--free)",
+        )
+
+
+def _certificates(result, answer) -> Found:
+    for row in answer.setting.certificates:
+        if not row.certified:
+            yield Message(
+                "limit-not-certified",
+                f"the limit of tank {row.tank + 1} is not proved: {row.reason}",
+            )
+
+
+def _idle(result, answer) -> Found:
+    if answer.idle:
+        tanks = ", ".join(map(str, answer.idle))
+        yield Message(
+            "limit-idle", f"no plant comes within 10 % of the limit on the level of tank {tanks}"
+        )
+
+
+def _bounds(result, answer) -> Found:
+    for name in result:
+        p = result[name]
+        if not p.exercised:
+            yield Message(
+                "parameter-not-exercised",
+                f"no run exercises {name}, which is left at {p.after:g} {p.unit}",
+            )
+        elif p.at_bound:
+            end = p.lower if p.at_bound == "lower" else p.upper
+            yield Message(
+                "parameter-at-bound",
+                f"{name} ended at its {p.at_bound} bound {end:g} {p.unit}: a wider range (--free)"
+                " may give more",
+            )
+
+
+def _busier(result, answer) -> Found:
+    if answer.after is None or answer.after.failed.all():
+        return
+    old, new = (float(np.nanmean(side.travel)) for side in (answer.before, answer.after))
+    if new > BUSIER * old > 0:
+        yield Message(
+            "input-total-variation",
+            f"the inputs change by {100 * new:.2g} % of their range from sample to sample,"
+            f" {new / old:.0f} times as much as before",
+        )
+
+
+def _assumed(result, answer) -> Found:
+    setting = answer.setting
+    if setting.assumed:
+        unit = setting.case.loop.units[0]
+        yield Message(
+            "noise-assumed",
+            f"the case states no sensor noise: {setting.noise:.3g} {unit} (0.1 % of the height) is"
+            " assumed; --set sensor.noise=... states it",
+        )
+    if not setting.stated:
+        yield Message(
+            "plants-assumed",
+            f"the case names nothing uncertain: every flow is taken to be within"
+            f" {100 * SPREAD:g} %; a table [uncertain] or --vary states it",
+        )
+
+
+def _tightened(result, answer) -> Found:
+    if answer.tightened:
+        yield Message(
+            "constraints-tightened",
+            f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that it holds"
+            " on other plants",
+        )
+
+
+RULES: tuple[Callable[..., Found], ...] = (
+    _interrupted,
+    _violated,
+    _lost,
+    _not_agreed,
+    _certificates,
+    _bounds,
+    _busier,
+    _tightened,
+    _assumed,
+    _idle,
+)

@@ -1,0 +1,293 @@
+"""The default answer of `tune`: noise, many plants, priced inputs, a safety filter, fresh plants.
+
+Imported by `default`.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.case import Case
+from jaxtank.core.tree import with_values
+from tuning.answer.answer import Answer
+from tuning.answer.findings import findings_of
+from tuning.answer.judged import FRESH, Judged, judge, matters
+from tuning.answer.result import result_of
+from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, setting_of
+from tuning.answer.stay_put import Found, search_from
+from tuning.problem.problem import Problem
+from tuning.problem.reported import run_measures
+from tuning.problem.scenarios import noisy
+from tuning.search import diagnostics
+from tuning.search.result import TuningResult
+from tuning.storage.evaluation_log import EvaluationLog
+from tuning.storage.fingerprint import fingerprint
+
+ATTEMPTS = 4
+"""Searches at most: with a filter, at the true step, with tightened limits."""
+
+MISLED = 1.5
+"""Ratio of the costs at the true and at the coarse step above which the coarse one misleads [-]."""
+
+LOST = 2.0
+"""Growth of the error, on the nominal plant and in the mean, above which a loop counts as not
+following its setpoints any more [-]."""
+
+TIGHTER = 1.2
+"""Factor on the largest violation by which limits are tightened for the next search [-]."""
+
+
+class _Task:
+    """What was asked for, and what stays the same from one search to the next."""
+
+    def __init__(self, case, free, setting, plan, samples, progress):
+        self.case, self.free, self.plan, self.samples = case, free, plan, samples
+        self.setting, self.progress = setting, progress
+        self.may_filter = True
+        self.cache: Any = None
+        self.simulations = 0
+
+    def problem(self, setting: Setting, case: Case, limits: Mapping[str, Any]) -> Problem:
+        """Return the problem of the search on the plants of a case."""
+        seed = self.plan["seed"]
+        plants = setting.plants(case, PLANTS, seed)
+        found = Problem(case, self.free, setting.objective, limits, plants, seed)
+        if self.cache is not None:
+            found.cache, self.cache = self.cache, None
+        return found
+
+    def report(self, problem):
+        """Return what a Search calls after every evaluation."""
+
+        def report(search):
+            if self.progress is None or not search.history:
+                return
+            best, last = search.best, search.history[-1]
+            self.progress(
+                {
+                    "start": search.start,
+                    "starts": self.plan["starts"],
+                    "evaluations": len(search.history),
+                    "cost": last[1],
+                    "violation": last[2],
+                    "best": None if best is None else best.cost,
+                    "best_violation": None if best is None else search.violation(best),
+                    "values": None if best is None else problem.values(best.z),
+                }
+            )
+
+        return report
+
+
+def recommend(
+    case: Case,
+    *,
+    free: Mapping[str, Any] | None = None,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    distributions: Mapping[str, Any] | None = None,
+    safety_filter: bool | None = None,
+    starts: int = 4,
+    iterations: int = 40,
+    seed: int = 0,
+    validation: int = FRESH,
+    checkpoint: Any = None,
+    resume: bool = False,
+    progress: Callable | None = None,
+) -> TuningResult:
+    """Return the default answer; parameters and errors as `tuning.tune`."""
+    began = time.perf_counter()
+    setting = setting_of(case, objective, limits, distributions)
+    if safety_filter is False:
+        setting = setting.without_filter()
+    plan = {"starts": starts, "iterations": iterations, "seed": seed}
+    task = _Task(case, free, setting, plan, max(validation, 1), progress)
+    Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed).start()
+    if checkpoint is not None:
+        what = _what(setting, free, plan, validation, safety_filter)
+        task.cache = EvaluationLog(checkpoint, what, resume)
+    task.may_filter = safety_filter is not False
+    before = judge(setting.replace(searched=_as_given(setting)), task.samples, seed)
+    near = matters(setting, before, NEAR)
+    if safety_filter or (safety_filter is None and near.any()):
+        setting = setting.with_filter()
+    setting, found, problem, after, tightened = _attempts(task, setting, near)
+    values = _values(problem, found)
+    answer = _answer(setting, before, after, found, problem, values, tightened)
+    result = result_of(answer, found, problem, values, validation)
+    steps = diagnostics.step_warnings(_own(problem), result.tuned, values)
+    messages = findings_of(result, steps)
+    problem.cache = problem.cache.in_memory()
+    return result.replace(messages=messages, wall_s=time.perf_counter() - began)
+
+
+def _as_given(setting):
+    """Return the searched case without a filter, unless the case as given has one."""
+    if setting.case.loop.safety_filter is not None:
+        return setting.searched
+    return setting.searched.without_safety_filter()
+
+
+def _own(problem):
+    """Return a Problem whose only run is the case's own: what step warnings are of."""
+    return Problem(problem.case, problem.given["free"], problem.objective, {}, ())
+
+
+def _attempts(task, setting, near):
+    """Search until the answer holds on fresh plants, or nothing is left to try.
+
+    Returns the setting, the Found and the Problem of the last search, its Judged (None where the
+    search was interrupted), and the share by which limits were tightened.
+    """
+    coarse, tightened, limits = True, 0.0, _searched_limits(setting, near)
+    for attempt in range(ATTEMPTS):
+        case = setting.coarse() if coarse else setting.searched
+        problem, found = task.problem(setting, case, _tightened(limits, tightened)), Found()
+        try:
+            search_from(problem, task.plan, task.report(problem), found)
+            if found.point is None:
+                return setting, found, problem, None, tightened
+            tuned = _at(setting, _values(problem, found))
+            after = judge(tuned, task.samples, task.plan["seed"], round_=1 + attempt)
+        except KeyboardInterrupt:
+            found.interrupted = True
+            return setting, found, problem, None, tightened
+        if coarse and case is not setting.searched and _misled(found.point.cost, after):
+            coarse = False
+        elif after.held.all():
+            break
+        elif task.may_filter and setting.filter is None and _levels_broken(after):
+            filtered = setting.with_filter()
+            limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
+            setting = filtered
+        elif limits and not found.search.violation(found.point) > 0:
+            tightened = TIGHTER * _violation(after, setting) + tightened
+        else:
+            break
+    return setting, found, problem, after, tightened
+
+
+def _searched_limits(setting, near):
+    """Return the limits of the search: those not proved, without levels that stay far below."""
+    limits = dict(setting.limits)
+    if not near.any():
+        limits.pop("max_level", None)
+    return limits
+
+
+def _at(setting, values):
+    """Return the setting with the searched case at `values`."""
+    loop = with_values(setting.searched.loop, values)
+    return setting.replace(searched=setting.searched.replace(loop=loop))
+
+
+def _values(problem, found):
+    """Return {name: value} of the answer; exactly the first value of a gain that stays."""
+    own = problem.own_values()
+    if found.point is None:
+        return own
+    values = problem.values(found.point.z)
+    if found.kept is not None:
+        stays = found.kept if found.idle is None else found.kept | found.idle
+        values |= {n: own[n] for n, same in zip(own, stays) if same}
+    return values
+
+
+def _misled(cost, after: Judged):
+    """Return True if the cost at the true step is another than at the coarse one."""
+    good = ~after.failed
+    if not good.any():
+        return True
+    ratio = float(np.mean(after.cost[good])) / cost if cost > 0 else 1.0
+    return not 1.0 / MISLED < ratio < MISLED
+
+
+def _levels_broken(after):
+    return any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
+
+
+LEVELS = ("max_level", "overflow_volume")
+
+
+def _violation(after, setting):
+    """Return the largest violation on the fresh plants, as a share of its limit [-]."""
+    rows = [r for r in after.worst() if r["margin"] < 0 and abs(r["limit"].value) > 0]
+    shares = [-r["margin"] / abs(r["limit"].value) for r in rows]
+    return min(max(shares, default=0.0), 0.5)
+
+
+def _tightened(limits, share):
+    """Return `limits` tightened by a share of each; "rim" stays where it is."""
+    if not share:
+        return limits
+    found = {}
+    for measure, value in limits.items():
+        if isinstance(value, str):
+            found[measure] = value
+            continue
+        numbers = np.asarray(value, dtype=float)
+        found[measure] = (numbers - share * ms.MEASURES[measure].sense * np.abs(numbers)).tolist()
+    return found
+
+
+def _answer(setting, before, after, found, problem, values, tightened):
+    """Return the Answer: what was judged, on which plants, and the case's own run."""
+    own = problem.own_values()
+    sides = {"before": setting.case, "after": setting.tuned(values)}
+    nominal = {side: _nominal(case) for side, case in sides.items()}
+    errors = {side: float(m["rms_error_total"]) for side, m in nominal.items()}
+    stays = {n: bool(k) for n, k in zip(own, found.kept)} if found.kept is not None else {}
+    return Answer(
+        setting=setting,
+        before=before,
+        after=after,
+        nominal=errors,
+        kept=stays or dict.fromkeys(own, False),
+        agreed=found.agreed,
+        followed=_follows(before, after, errors),
+        idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
+        tightened=tightened,
+        coarse_dt=problem.case.clock.dt,
+        measures=nominal,
+    )
+
+
+def _nominal(case):
+    """Return the measures of the case's own run, without noise unless it has some."""
+    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
+
+
+def _follows(before, after, errors):
+    """Return False where the error has grown by LOST, on the nominal plant and in the mean."""
+    if after is None or after.failed.all():
+        return False
+    mean = np.mean(after.error[~after.failed]) / np.mean(before.error[~before.failed])
+    return not (errors["after"] > LOST * errors["before"] and mean > LOST)
+
+
+def _idle(setting, before, after):
+    """Return the indices of the tanks that have a limit which no plant comes near."""
+    limited = np.isfinite(limited_levels(setting.case))
+    near = matters(setting, before, NEAR)
+    if after is not None:
+        near = near | matters(setting, after, NEAR)
+    return np.flatnonzero(limited & ~near)
+
+
+def _what(setting, free, plan, validation, safety_filter):
+    """Return the fingerprint of a search."""
+    return fingerprint(
+        setting.searched,
+        command="tune, default",
+        free=free or {n: tuple(f) for n, f in setting.case.free.items()},
+        objective=setting.objective,
+        limits=dict(setting.case.limits),
+        distributions={n: repr(d) for n, d in setting.distributions.items()},
+        safety_filter=safety_filter,
+        validation=validation,
+        **plan,
+    )

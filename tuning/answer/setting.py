@@ -1,0 +1,247 @@
+"""What the default answer is searched on: noise, plants, cost, safety filter, and a coarser clock.
+
+Imported by the other modules of `answer`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank import rig
+from jaxtank.case import Case, Scenario
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import parameters, with_values
+from jaxtank.loop import run as lp
+from jaxtank.presets import find
+from tuning.problem.scenarios import screening_clock
+from tuning.search.robust import scenarios_of
+from tuning.uncertainty.distributions import Uniform
+from tuning.uncertainty.distributions import stated as stated_of
+from tuning.uncertainty.sampling import spread_of
+
+NOISE = 1e-3
+"""Standard deviation of the sensor noise where the case states none, as a share of the rim [-]."""
+
+PRICE = (5e-3, 1e-2)
+"""An error of the first share of the rim is worth a change of a pump's input from sample to sample
+of the second share of its range [-].
+"""
+
+FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split")
+SPREAD = 0.05
+"""Share by which every flow may be off where a case does not say what is uncertain."""
+
+NEAR = 0.9
+"""Share of its limit that a level must reach on some plant for the limit to matter."""
+
+PLANTS = 32
+"""Plants that the search runs on."""
+
+COST = ("mean_square_error", "mean_square_travel")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Setting:
+    """The case as given, and what is searched and judged in its place.
+
+    Parameters
+    ----------
+    case : as given, with the limits that were asked for.
+    searched : the case with sensor noise, and a safety filter where it helps.
+    objective : {measure: weight} that is minimised, the mean over the plants.
+    own_objective : True where the objective is the user's.
+    distributions : what varies from plant to plant; stated : True if the case says so.
+    noise : standard deviation of the sensor noise [unit of length]; assumed : not of the case.
+    filter : settings of the safety filter, None where there is none.
+    certificates : a TankCertificate of each tank with a filter, else ().
+    """
+
+    case: Case
+    searched: Case
+    objective: Mapping[str, float]
+    own_objective: bool
+    distributions: Mapping[str, Any]
+    stated: bool
+    noise: float
+    assumed: bool
+    filter: Mapping[str, Any] | None = None
+    certificates: tuple = ()
+
+    def replace(self, **changes: Any) -> "Setting":
+        """Return a copy with the named fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def limits(self) -> Mapping[str, Any]:
+        """Limits that the search must keep to: those that no certificate covers."""
+        proved = bool(self.certificates) and all(row.certified for row in self.certificates)
+        return {m: v for m, v in self.case.limits.items() if not (proved and m == "max_level")}
+
+    def coarse(self) -> Case:
+        """Return the searched case at ten times its step, or itself where that cannot be."""
+        clock = screening_clock(self.searched.clock)
+        if clock == self.searched.clock:
+            return self.searched
+        try:
+            found = self.searched.replace(clock=clock)
+            lp.check(found.loop, clock, jax.random.key(0))
+            if self.filter is not None:
+                found = found.without_safety_filter().with_safety_filter(**self.filter)
+            return found
+        except InputError:  # a dead time that is no multiple of the longer step, for one
+            return self.searched
+
+    def plants(self, case: Case, samples: int, seed: int) -> tuple[Scenario, ...]:
+        """Return the scenarios of `samples` plants of `case`, the searched case at some clock."""
+        return scenarios_of(case, self.distributions, samples, seed)
+
+    def with_filter(self) -> "Setting":
+        """Return the setting with a safety filter; itself where the plant can have none."""
+        given = dict(self.case.safety or {})
+        try:
+            searched = self.searched.without_safety_filter().with_safety_filter(**given)
+        except InputError:
+            return self
+        band = np.asarray(searched.loop.safety_filter.band).tolist()
+        rows = searched.safety_design(**given)[1]
+        return self.replace(searched=searched, filter={"band": band} | given, certificates=rows)
+
+    def without_filter(self) -> "Setting":
+        """Return the setting without a safety filter."""
+        searched = self.searched.without_safety_filter()
+        return self.replace(searched=searched, filter=None, certificates=())
+
+    def tuned(self, values: Mapping[str, float]) -> Case:
+        """Return the case as given with `values`, the filter, and the objective of the search."""
+        found = self.case.replace(
+            loop=with_values(self.case.loop, values), objective=dict(self.objective)
+        )
+        if self.filter is None:
+            return found.without_safety_filter()
+        return found.without_safety_filter().with_safety_filter(**self.filter)
+
+
+def setting_of(
+    case: Case,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    distributions: Mapping[str, Any] | None = None,
+) -> Setting:
+    """Return the Setting of a case, without a safety filter unless the case has one.
+
+    objective, limits, distributions : those asked for; where None, the limits and the uncertainty
+    of the case, and its objective if that is neither the default of cases nor that of a preset.
+    """
+    if limits is not None:
+        case = case.replace(limits=dict(limits))
+    case = case.replace(limits=dict(rig.check_limits(case.loop, case.limits)))
+    if distributions is not None:
+        distributions = stated_of(distributions)
+        case = _with_box(case, distributions)
+    size, (noise, assumed) = height(case), _noise(case)
+    stated = bool(case.uncertain) or case.covariance is not None
+    found = Setting(
+        case=case,
+        searched=_noisy(case, noise) if assumed or noise else case,
+        objective=_price(case, size) if objective is None else rig.check_objective(objective),
+        own_objective=objective is not None,
+        distributions=distributions or (spread_of(case) if stated else _default_box(case)),
+        stated=stated or distributions is not None,
+        noise=noise,
+        assumed=assumed,
+    )
+    if objective is None and _has_own_objective(case):
+        found = found.replace(objective=dict(case.objective), own_objective=True)
+    return found.with_filter() if case.loop.safety_filter is not None else found
+
+
+def _with_box(case, distributions):
+    """Return the case with the box of `distributions`, where they are shares of parameters: a
+    safety filter is then designed for it.
+    """
+    shares = {n: d.relative for n, d in distributions.items() if isinstance(d, Uniform)}
+    if len(shares) < len(distributions) or None in shares.values():
+        return case
+    return case.replace(uncertain=shares, covariance=None)
+
+
+def height(case: Case) -> float:
+    """Return the highest rim [unit of length], or setpoint where no rim is finite."""
+    rims = np.asarray(getattr(case.loop.plant, "rim", np.inf), dtype=float)
+    if np.isfinite(rims).any():
+        return float(rims[np.isfinite(rims)].max())
+    plateaus = case.loop.reference.plateaus()
+    return float(np.max(np.abs(plateaus))) if plateaus is not None else 1.0
+
+
+def input_range(case: Case) -> np.ndarray:
+    """Return the (pumps,) range of each pump's input; of a pump, only what is not negative."""
+    actuator = case.loop.actuator
+    low, high = (np.asarray(v, dtype=float) for v in (actuator.low, actuator.high))
+    return np.broadcast_to(high - np.maximum(low, 0.0), (case.loop.plant.pumps,))
+
+
+def _price(case, size):
+    """The default cost: the mean square error, and the priced mean square change of the input."""
+    pumps, span = case.loop.plant.pumps, float(np.mean(input_range(case)))
+    weight = (PRICE[0] * size) ** 2 / (pumps * (PRICE[1] * span) ** 2)
+    return {COST[0]: 1.0, COST[1]: weight}
+
+
+def _has_own_objective(case):
+    """Return True if the objective is the user's: not the default, and not that of a preset."""
+    given = dict(case.objective)
+    if given == {"rms_error_total": 1.0}:
+        return False
+    try:
+        return given != dict(find(case.name).objective)
+    except InputError:
+        return True
+
+
+def _noise(case):
+    """Return (standard deviation of the sensor noise, True if it is neither the case's nor that of
+    one of its scenarios).
+    """
+    own = float(np.max(np.asarray(case.loop.sensor.noise)))
+    loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
+    stated = max([own, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
+    return (stated, False) if stated > 0.0 else (NOISE * height(case), True)
+
+
+def _noisy(case, noise):
+    """Return the case with sensor noise where it has none."""
+    own = np.asarray(case.loop.sensor.noise, dtype=float)
+    if np.any(own > 0.0):
+        return case
+    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(own.shape, noise)}))
+
+
+def _default_box(case):
+    """{name: share} of every flow of the plant; of the noise alone where it has no such names."""
+    names = parameters(case.loop)
+    found = {f"plant.{n}": SPREAD for n in FLOWS if np.size(names.get(f"plant.{n}", ()))}
+    split = np.asarray(names.get("plant.split", 0.0))
+    if np.max(split, initial=0.0) * (1.0 + SPREAD) > 1.0:
+        found.pop("plant.split")
+    return spread_of(case.replace(uncertain=found or {"sensor.noise": SPREAD}))
+
+
+def limited_levels(case: Case) -> np.ndarray:
+    """Return the (tanks,) limits on the highest levels; inf where there is none."""
+    tanks = case.loop.plant.tanks
+    if "max_level" not in case.limits:
+        return np.full(tanks, np.inf)
+    limit = case.limits["max_level"]
+    rims = np.asarray(case.loop.plant.rim, dtype=float)
+    return rims if isinstance(limit, str) else np.broadcast_to(np.asarray(limit, float), (tanks,))
+
+
+def measured(setting: Setting) -> tuple[str, ...]:
+    """Return the measures of every judged plant."""
+    own = [*setting.objective, *COST, "rms_error_total", "max_level", "mean_square_travel"]
+    return tuple(m for m in dict.fromkeys(own) if ms.serves(m, setting.searched.loop))

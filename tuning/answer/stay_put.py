@@ -1,0 +1,215 @@
+"""The search behind the default answer: a few local searches, then every gain that may stays put.
+
+Imported by `recommend`.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from tuning.problem.problem import Problem
+from tuning.search import diagnostics
+from tuning.search.driver import Search
+from tuning.search.methods import METHODS, restore
+from tuning.search.screening import distinct_starts, sobol
+
+WORTH = 0.01
+"""A gain is changed only where that lowers the cost by this share [-]."""
+
+AGREE = 0.01
+"""Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
+to a few percent."""
+
+TOLERANCE = 1e-4
+"""Change of the cost, as a share of its first value, at which a search has converged [-]."""
+
+LINE = 32
+"""Values that are tried between a gain's best and its first value; also the screened points, so
+that one compiled program serves both."""
+
+MANY = 4
+"""Number of parameters from which Gauss-Newton is tried before limits are considered."""
+
+
+@dataclasses.dataclass
+class Found:
+    """What the search found so far; Ctrl-C leaves it as it is.
+
+    z : (P,) the answer.  kept : (P,) True for gains at their first value.  agreed : True if two
+    searches ended within AGREE.  starts : as in `TuningResult`.
+    """
+
+    search: Search | None = None
+    starts: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    z: Any = None
+    kept: Any = None
+    idle: Any = None
+    agreed: bool = False
+    interrupted: bool = False
+
+    @property
+    def point(self) -> Any:
+        """The Point of the answer; None where none is finite."""
+        if self.search is None:
+            return None
+        return self.search.best if self.z is None else self.search.point(self.z)
+
+
+class Subspace(Search):
+    """A search over some of the parameters, the others fixed; every point is one of the owner's."""
+
+    def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
+        super().__init__(owner.problem, owner.last_finite, owner.report, owner.tolerance)
+        self.scale, self.owner, self.fixed, self.free = owner.scale, owner, z, np.asarray(free)
+
+    def full(self, z: Any) -> np.ndarray:
+        """Return (P,) the point of the owner at z, values of the free parameters."""
+        found = self.fixed.copy()
+        found[self.free] = np.clip(z, 0.0, 1.0)
+        return found
+
+    def point(self, z: Any) -> Any:
+        """Return the Point at z, derivatives by the free parameters alone; cached."""
+        z = np.clip(z, 0.0, 1.0)
+        if z.tobytes() not in self.memory:
+            found, free = self.owner.point(self.full(z)), self.free
+            self.take(
+                found._replace(
+                    z=z,
+                    gradient=found.gradient[free],
+                    gauss_newton=found.gauss_newton[np.ix_(free, free)],
+                    margin_slopes=found.margin_slopes[:, free],
+                    run_slopes=found.run_slopes[:, free] if found.run_slopes.size else np.zeros(0),
+                )
+            )
+        return self.memory[z.tobytes()]
+
+
+def method_of(problem: Problem) -> str:
+    """Return the local method: Gauss-Newton where no limit is to be kept and the cost has squares.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> method_of(Problem(presets.find("cascaded/pi"), limits={}))
+    'trf'
+    """
+    if problem.model and not problem.limits:
+        return "trf"
+    return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
+
+
+def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Found) -> None:
+    """Search the problem from its start and from screened points, and keep in `found` the answer.
+
+    plan : {"starts", "iterations", "seed"}.
+    """
+    first = problem.start()
+    reference = problem.point(first)
+    search = found.search = Search(problem, reference, report, TOLERANCE)
+    search.take(reference)
+    zs = sobol(LINE, len(first), plan["seed"])
+    costs, margins = problem.screen(zs)
+    shortfall = np.maximum(0.0, -margins / search.limit_scale)
+    merits = costs / search.scale + 10.0 * shortfall.sum(axis=1)
+    for z in distinct_starts(zs, merits, plan["starts"], first):
+        search.start = len(found.starts)
+        _local_search(search, found, z, plan["iterations"])
+        found.agreed = _agree(found.starts)
+        if found.agreed:
+            break
+    if search.best is not None and search.violation(search.best) > 0:
+        restore(search, search.best.z, plan["iterations"])
+        METHODS["slsqp"](search, search.best.z, plan["iterations"])
+    if search.best is None:
+        return
+    found.idle = diagnostics.unexercised(problem, search, first)
+    found.z, found.kept = stay_put(search, first, plan["iterations"])
+
+
+def _local_search(search, found, z, iterations):
+    """Run one local search from z; its outcome is added to those found."""
+    count = len(search.history)
+    search.exhausted = False
+    converged = METHODS[method_of(search.problem)](search, z, iterations)
+    mine = search.history[count:] or [search.history[-1]]
+    reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]))
+    found.starts.append(
+        {
+            "from": search.problem.values(z),
+            "to": search.problem.values(reached[3]),
+            "cost": reached[1],
+            "violation": reached[2],
+            "evaluations": len(mine),
+            "converged": converged,
+            "exhausted": search.exhausted,
+        }
+    )
+
+
+def _agree(starts):
+    """Return True if the two best of the searches that keep the limits agree, and one converged."""
+    costs = sorted(s["cost"] for s in starts if s["violation"] == 0.0 and np.isfinite(s["cost"]))
+    converged = any(s["converged"] for s in starts)
+    return len(costs) > 1 and converged and costs[1] <= costs[0] * (1.0 + AGREE)
+
+
+def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more.
+
+    One gain after the other is set back to its value in `first` and the rest searched again. It
+    stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
+    point keeps is violated. A gain that cannot is moved back as far as it can.
+    """
+    best = search.best
+    kept, z = np.zeros(len(first), dtype=bool), best.z
+    ceiling = best.cost + WORTH * abs(best.cost)
+    allowed = search.violation(best)
+
+    def good(point):
+        return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
+
+    if good(search.point(first)):
+        return first.copy(), ~kept
+    # first those whose value costs least by the curvature at the best point
+    order = np.argsort(np.diag(best.gauss_newton) * (best.z - first) ** 2, kind="stable")
+    for i in order:
+        trial = kept.copy()
+        trial[i] = True
+        reached = _without(search, trial, first, z, iterations)
+        if reached is not None and good(search.point(reached)):
+            kept, z = trial, reached
+        else:
+            z = _towards(search, i, first, z, ceiling, allowed, good)
+    return z, kept
+
+
+def _without(search, trial, first, z, iterations):
+    """Return the best point with the gains of `trial` at their first values; None if there is none.
+    """
+    begin = np.where(trial, first, z)
+    if trial.all():
+        return begin
+    free = np.flatnonzero(~trial)
+    inner = Subspace(search, begin, free)
+    METHODS[method_of(search.problem)](inner, begin[free], iterations)
+    return None if inner.best is None else inner.full(inner.best.z)
+
+
+def _towards(search, i, first, z, ceiling, allowed, good):
+    """Return z with gain i moved towards its first value as far as the cost stays below `ceiling`.
+
+    All LINE values are run at once: the program of the screening, without derivatives.
+    """
+    shares = np.arange(1, LINE + 1) / (LINE + 1)
+    line = np.repeat(z[None], LINE, axis=0)
+    line[:, i] = z[i] + shares * (first[i] - z[i])
+    costs, margins = search.problem.screen(line)
+    shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+    fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
+    count = LINE if fits.all() else int(np.argmin(fits))  # all before the first that does not fit
+    for k in range(count - 1, -1, -1):
+        if good(search.point(line[k])):
+            return line[k]
+    return z

@@ -1,0 +1,157 @@
+"""The default answer of `tune` as text and JSON; imported by the report of a tuning result."""
+
+import textwrap
+
+import numpy as np
+
+from jaxtank import measures as ms
+from tuning.answer.setting import limited_levels
+from tuning.report.tables import number, table
+from tuning.report.tuning_tables import parts_of as all_parts
+
+WIDTH = 80
+
+
+def lines_of(result):
+    """Return what is printed of a result with a default answer: about 25 lines of 80 columns."""
+    found = [_wrapped(_headline(result)), "", *of_answer(result.answer, result)]
+    return [*found, "", *(_wrapped(m.text, "- ") for m in result.messages)]
+
+
+def parts_of(result):
+    """Return the parts of its page: the summary, and every table of a tuning result."""
+    return [_headline(result), *of_answer(result.answer, result), "", *all_parts(result)[1:]]
+
+
+def of_answer(answer, result=None):
+    """Return lines and Tables on an Answer; with the values to set of its result, where given."""
+    found = []
+    if answer.feasibility is not None and answer.feasibility.matters:
+        found += [str(answer.feasibility), ""]
+    if result is not None:
+        found += [_values(result, answer), ""]
+    return [*found, _effects(answer)]
+
+
+def json_parts(result):
+    """Return {"holds", "feasibility", "answer"} of the JSON, null without a default answer."""
+    answer = result.answer
+    if answer is None:
+        return dict.fromkeys(("holds", "feasibility", "answer"))
+    feasibility = None if answer.feasibility is None else answer.feasibility.to_json()
+    return {"holds": answer.holds(), "feasibility": feasibility, "answer": answer.to_json()}
+
+
+def _headline(result):
+    """One sentence on the outcome."""
+    answer, status = result.answer, str(result.status).replace("_", " ")
+    start = f"{result.tuned.name}: {status}"
+    if answer.after is None:
+        return f"{start}; not judged on other plants ({result.wall_s:.1f} s)"
+    held, samples = int(answer.after.held.sum()), answer.after.samples
+    limited = f"; limits hold on {held} of {samples} new plants" if answer.after.limits else ""
+    tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
+    proved = f", proved for tank {_listed(tanks)}" if tanks and limited else ""
+    changed = sum(not stays for stays in answer.kept.values())
+    gains = f"; {changed} of {len(answer.kept)} gains changed" if answer.kept else ""
+    return f"{start}{limited}{proved}{gains} ({result.wall_s:.1f} s)"
+
+
+def _listed(numbers):
+    """1, 2, 3 as text; a range where they follow each other."""
+    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return f"{numbers[0]} to {numbers[-1]}"
+    return ", ".join(map(str, numbers))
+
+
+def _wrapped(text, first=""):
+    return textwrap.fill(
+        text,
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=" " * len(first),
+        break_on_hyphens=False,
+        break_long_words=False,
+    )
+
+
+def _values(result, answer):
+    """The table of what to set."""
+    rows = []
+    for name, p in result.parameters.items():
+        stays = answer.kept.get(name, False)
+        remark = "kept: a change is worth less than 1 %" if stays else ""
+        remark = remark if p["exercised"] else "without effect, kept"
+        remark = f"at its {p['at_bound']} bound" if p["at_bound"] and not remark else remark
+        digits = [number(p[side], 4) for side in ("before", "after")]
+        rows.append([f"{name} [{p['unit']}]", *digits, remark])
+    rows.append(_filter_row(answer, result.case.loop))
+    return table(rows, ["what to set", "was", "now", ""])
+
+
+def _filter_row(answer, before):
+    """The row of the safety filter."""
+    was = "on" if before.safety_filter is not None else "off"
+    if answer.setting.filter is None:
+        return ["safety filter", was, "off", ""]
+    found, unit = answer.setting.searched.loop.safety_filter, before.units[0]
+    rate, band = float(np.max(found.rate)), float(np.max(found.band))
+    return ["safety filter", was, "on", f"{rate:.3g} 1/s, noise band {band:.3g} {unit}"]
+
+
+def _effects(answer):
+    """The table of what the answer gives, before and after, on the plants that judged it."""
+    unit, after = answer.setting.case.loop.units[0], answer.after
+    sides = [answer.before] if after is None else [answer.before, after]
+    n = answer.before.samples
+    rows = [
+        [f"error, mean of {n} plants [{unit}]", *(_mean(s.error, s) for s in sides)],
+        *_able(answer, sides, unit),
+        [f"error, nominal plant [{unit}]", *(number(e, 3) for e in answer.nominal.values())],
+    ]
+    if answer.setting.own_objective:
+        rows.insert(0, [f"objective, mean of {n} plants", *(_mean(s.cost, s) for s in sides)])
+    if answer.before.limits:
+        broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
+        rows.append(["plants that violate a limit", *broken])
+    rows += _levels(answer, sides, unit)
+    rows.append(
+        ["input, sample to sample [% of range]", *(_mean(100 * s.travel, s, 2) for s in sides)]
+    )
+    heads = ["what it gives", "before", "now"]
+    return table(rows, heads[: 1 + len(sides)])
+
+
+def _mean(values, judged, digits=3):
+    good = ~judged.failed
+    return number(values[good].mean() if good.any() else np.nan, digits)
+
+
+def _able(answer, sides, unit):
+    """The error where the setpoints can be held, if some plants cannot hold them."""
+    cannot = answer.before.infeasible
+    if cannot is None or not cannot.any() or cannot.all():
+        return []
+    able = [s.error[~cannot & ~s.failed] if s is not sides[0] else None for s in sides]
+    first = sides[0].error[~cannot & ~sides[0].failed]
+    cells = [number(v.mean() if v.size else np.nan, 3) for v in (first, *able[1:])]
+    return [[f"  on those that can follow ({100 * np.mean(~cannot):.0f} %)", *cells]]
+
+
+def _levels(answer, sides, unit):
+    """The row of the highest level, of the tanks that have a limit."""
+    limited = np.isfinite(limited_levels(answer.setting.case))
+    if not limited.any():
+        return []
+    cells = []
+    for s in sides:
+        good = ~s.failed
+        cells.append(number(s.level[good][:, limited].max() if good.any() else np.nan, 4))
+    return [[f"highest level [{unit}]", *cells]]
+
+
+def objective_words(answer):
+    """Return the cost in words, with its unit."""
+    terms = " + ".join(f"{w:.3g} {m}" for m, w in answer.setting.objective.items())
+    unit = ms.unit(next(iter(answer.setting.objective)), answer.setting.case.loop.units)
+    return f"mean of {terms} [{unit}]"
