@@ -40,6 +40,7 @@ RANKS = [
     "tuning.problem tuning.storage",
     "tuning.uncertainty tuning.identification tuning.optimal_input",
     "tuning.search",
+    "tuning.answer",
     "tuning.report",
     "tuning.bench",
     "tuning.cli",

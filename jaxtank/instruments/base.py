@@ -78,7 +78,7 @@ class Sensor(abc.ABC):
 
         Parameters
         ----------
-        key : random key of jax, or None
+        key : random key of jax, or None; or (n, samples) deviates that were drawn before
         samples : number of samples [-]
         piece : number of the chunk of a long run to which the samples belong. Each chunk has a key
             of its own, and the deviates of a run are those of its chunks, end to end.
@@ -90,6 +90,8 @@ class Sensor(abc.ABC):
         if key is None or np.ndim(self.noise) == 0:
             return None
         tanks = np.shape(self.noise)[-1]
+        if jnp.issubdtype(key.dtype, jnp.floating):
+            return tuple(key[i] for i in range(tanks))
         drawn = lambda key, count: jax.random.normal(
             key, (tanks, count), dtype=jnp.result_type(float)
         )

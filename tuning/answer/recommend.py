@@ -21,7 +21,7 @@ from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, setting
 from tuning.answer.stay_put import Found, search_from
 from tuning.problem.problem import Problem
 from tuning.problem.reported import run_measures
-from tuning.problem.scenarios import noisy
+from tuning.problem.scenarios import noisy, with_noise_drawn
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
 from tuning.storage.evaluation_log import EvaluationLog
@@ -56,6 +56,7 @@ class _Task:
         seed = self.plan["seed"]
         plants = setting.plants(case, PLANTS, seed)
         found = Problem(case, self.free, setting.objective, limits, plants, seed)
+        found.groups = [with_noise_drawn(group) for group in found.groups]
         if self.cache is not None:
             found.cache, self.cache = self.cache, None
         return found
@@ -101,6 +102,8 @@ def recommend(
 ) -> TuningResult:
     """Return the default answer; parameters and errors as `tuning.tune`."""
     began = time.perf_counter()
+    if safety_filter and not case.safety:  # asked for here: the case as given has none
+        case = case.without_safety_filter()
     setting = setting_of(case, objective, limits, distributions)
     if safety_filter is False:
         setting = setting.without_filter()
@@ -115,7 +118,10 @@ def recommend(
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter()
-    setting, found, problem, after, tightened = _attempts(task, setting, near)
+    setting, found, problem, after, tightened, attempt = _attempts(task, setting, near)
+    if attempt:  # the plants that asked for another search do not judge it
+        as_given = setting.replace(searched=_as_given(setting))
+        before = judge(as_given, task.samples, seed, round_=attempt)
     values = _values(problem, found)
     answer = _answer(setting, before, after, found, problem, values, tightened)
     result = result_of(answer, found, problem, values, validation)
@@ -141,21 +147,23 @@ def _attempts(task, setting, near):
     """Search until the answer holds on fresh plants, or nothing is left to try.
 
     Returns the setting, the Found and the Problem of the last search, its Judged (None where the
-    search was interrupted), and the share by which limits were tightened.
+    search was interrupted), the share by which limits were tightened, and its number, from 0: every
+    search is judged on plants of its own.
     """
     coarse, tightened, limits = True, 0.0, _searched_limits(setting, near)
+    after = attempt = None
     for attempt in range(ATTEMPTS):
         case = setting.coarse() if coarse else setting.searched
         problem, found = task.problem(setting, case, _tightened(limits, tightened)), Found()
         try:
             search_from(problem, task.plan, task.report(problem), found)
             if found.point is None:
-                return setting, found, problem, None, tightened
+                return setting, found, problem, None, tightened, 0
             tuned = _at(setting, _values(problem, found))
-            after = judge(tuned, task.samples, task.plan["seed"], round_=1 + attempt)
+            after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
         except KeyboardInterrupt:
             found.interrupted = True
-            return setting, found, problem, None, tightened
+            return setting, found, problem, None, tightened, 0
         if coarse and case is not setting.searched and _misled(found.point.cost, after):
             coarse = False
         elif after.held.all():
@@ -168,7 +176,7 @@ def _attempts(task, setting, near):
             tightened = TIGHTER * _violation(after, setting) + tightened
         else:
             break
-    return setting, found, problem, after, tightened
+    return setting, found, problem, after, tightened, attempt
 
 
 def _searched_limits(setting, near):

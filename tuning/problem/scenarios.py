@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxtank import rig
 from jaxtank.case import Case, Scenario
-from jaxtank.core.clock import Clock
+from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
@@ -35,6 +35,9 @@ COARSE = 10
 
 FEWEST = 200
 """Samples that a first local search needs at least."""
+
+LARGEST_NOISE = 2**24
+"""Numbers of sensor noise that are kept, at most: 128 MiB."""
 
 Measures = dict[str, Any]
 """{name: array}."""
@@ -194,6 +197,20 @@ def take(group: Group, picked: Any) -> Group:
     leaves = tuple(v[picked] if a else v for v, a in zip(group.leaves, group.apart))
     keys = None if group.keys is None else group.keys[picked]
     return group._replace(runs=tuple(group.runs[i] for i in picked), leaves=leaves, keys=keys)
+
+
+def with_noise_drawn(group: Group) -> Group:
+    """Return the group with its noise drawn once, for runs that are repeated many times.
+
+    The group itself where it has none, where its runs are long, or the noise takes more than
+    LARGEST_NOISE numbers.
+    """
+    samples, sensor = group.clock.samples, jax.tree.unflatten(group.structure, group.leaves).sensor
+    count = len(group.runs) * samples * int(np.size(np.asarray(sensor.noise)))
+    if group.keys is None or samples > CHUNK or count > LARGEST_NOISE:
+        return group
+    drawn = jax.jit(jax.vmap(lambda key: jnp.stack(sensor.draw(key, samples))))(group.keys)
+    return group._replace(keys=drawn)
 
 
 def values_of(

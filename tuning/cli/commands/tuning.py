@@ -51,8 +51,15 @@ def _add_problem(one):
     )
     text = "a static number or text to try the values of"
     repeatable(one, "--choose", "NAME=V1,V2", text)
-    text = "validation runs of the tuned gains (default 64, 0 for none)"
-    option(one, "--validation", "N", text, "64")
+    text = "plants that judge the answer (default 256; --nominal: 64 runs, 0 for none)"
+    option(one, "--validation", "N", text)
+    one.add_argument(
+        "--nominal",
+        action="store_true",
+        help="the optimum of the case as it is, with its own objective: its own run or scenarios,"
+        " without noise, other plants or a safety filter that it does not have; so too with"
+        " --scenario, --method, --screening, --batch, --choose, --tradeoff, --bound",
+    )
     text = "also: the best objective for N (6) values of one limit"
     option(one, "--tradeoff", "MEASURE=LOW:HIGH[:N]", text)
     one.add_argument(
@@ -66,9 +73,11 @@ def _add_search(one):
     """Options on how the search runs."""
     text = "auto (default), trf, coarse-trf, slsqp, lbfgs or adam"
     option(one, "--method", "NAME", text, "auto")
-    option(one, "--starts", "N", "local searches (default 8)", "8")
-    option(one, "--screening", "N", "Sobol points before them (default 64)", "64")
-    option(one, "--iterations", "N", "iterations of each local search (default 60)", "60")
+    text = "local searches (default 4 at most, until two agree; --nominal: 8)"
+    option(one, "--starts", "N", text)
+    option(one, "--screening", "N", "Sobol points before them (default 64)")
+    text = "iterations of each local search (default 40; --nominal: 60)"
+    option(one, "--iterations", "N", text)
     option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
     text = "go on where a killed run with --out DIR ended, to the same answer"
     option(one, "--resume", "DIR", text)
@@ -108,14 +117,9 @@ def _tune(args):
         case,
         **{k: v for k, v in task.items() if k != "scenarios"},
         **own,
-        method=args.method,
-        batch=None if args.batch is None else whole("--batch", args.batch, 1, 100_000),
-        validation=whole("--validation", args.validation, 0, 100_000),
+        **_numbers(args),
         log=folder,
         resume=args.resume is not None,
-        starts=whole("--starts", args.starts, 1, 1000),
-        screening=whole("--screening", args.screening, 1, 65536),
-        iterations=whole("--iterations", args.iterations, 1, 100_000),
         progress=progress,
     )
     progress.line.end()
@@ -156,14 +160,11 @@ def _finder(args, case, task):
     """(function that tunes, case, its own keywords): `tune`, or `tune_robust` under --robust."""
     choices, varied = choices_of(args), distributions_of(args, case)
     if args.robust is None:
-        only = (varied, args.samples, args.fresh, args.back_off)
-        if any(value is not None for value in only):
-            raise InputError(
-                "--samples, --fresh, --back-off, --spread and --vary of tune belong to --robust"
-            )
-        from tuning.search.tuner import tune as finder
-
-        return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
+        if any(value is not None for value in (args.samples, args.fresh, args.back_off)):
+            raise InputError("--samples, --fresh and --back-off of tune belong to --robust")
+        return _not_robust(args, case, task, choices, varied)
+    if args.nominal:
+        raise InputError("--nominal and --robust: give one of them")
     if choices or task["scenarios"]:
         raise InputError(
             "--robust makes scenarios of its own: no --choose and no --scenario but none beside it"
@@ -186,13 +187,63 @@ def _finder(args, case, task):
     )
 
 
+def _not_robust(args, case, task, choices, varied):
+    """`_finder` without --robust: the default answer, or the optimum of the case as it is."""
+    if not _is_nominal(args):
+        from tuning.answer.default import tune as finder
+
+        return finder, case, {"distributions": varied, "safety_filter": args.safety_filter}
+    if varied is not None:
+        raise InputError("--spread and --vary of tune belong to the default answer and to --robust")
+    from tuning.search.tuner import tune as finder
+
+    return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
+
+
+def _is_nominal(args):
+    """Whether --nominal, or an option that goes with it alone, is given; the latter is noted."""
+    given = {
+        "--scenario": args.scenario,
+        "--method": args.method != "auto",
+        "--screening": args.screening is not None,
+        "--batch": args.batch is not None,
+        "--choose": args.choose,
+        "--tradeoff": args.tradeoff is not None,
+        "--bound": args.bound,
+    }
+    first = next((name for name, value in given.items() if value), None)
+    if first and not args.nominal and not args.quiet:
+        print(
+            f"jaxtank: note: {first} goes with --nominal: the optimum of the case as it is",
+            file=sys.stderr,
+        )
+    return args.nominal or first is not None
+
+
+def _numbers(args):
+    """Method and numbers of the search: keywords of the finder, those that are not given left out."""
+    given = {
+        "batch": (args.batch, 1, 100_000),
+        "validation": (args.validation, 0, 100_000),
+        "starts": (args.starts, 1, 1000),
+        "screening": (args.screening, 1, 65536),
+        "iterations": (args.iterations, 1, 100_000),
+    }
+    read = {
+        name: whole(f"--{name}", text, low, high)
+        for name, (text, low, high) in given.items()
+        if text is not None
+    }
+    return read | ({} if args.method == "auto" else {"method": args.method})
+
+
 def _besides(args, case, result, task, sweep, progress):
     """`result` with the trade-off and the bound, where asked for and not interrupted."""
     if sweep and not progress.stop and result.status != "interrupted":
         from tuning.search.pareto import tradeoff
 
         start = {n: p["after"] for n, p in result.parameters.items()}
-        screening = whole("--screening", args.screening, 1, 65536)
+        screening = whole("--screening", args.screening or "64", 1, 65536)
         with contextlib.suppress(KeyboardInterrupt):  # the answer is given without it
             found = tradeoff(
                 case, *sweep, start=start, screening=screening, progress=progress.check, **task
