@@ -1,1 +1,1 @@
-"""The default answer of `tune`: gains for many plants at once, with noise, priced inputs, a filter."""
+"""The default answer of `tune`: many plants, noise, priced inputs and a safety filter."""

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.answer.setting import Setting, input_range, limited_levels, measured
+from tuning.answer.setting import Setting, limited_levels, measured
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson
 from tuning.uncertainty.study import ensemble
@@ -95,7 +95,7 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
     rows = {m: v.reshape(samples, -1) for m, v in by.items()}
     cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
     past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in found.limits]
-    changes = np.sqrt(rows["mean_square_travel"]) / input_range(case)
+    changes = np.sqrt(rows["mean_square_travel"]) / setting.span
     return Judged(
         cost=np.asarray(cost),
         error=rows["rms_error_total"][:, 0],

@@ -56,6 +56,7 @@ class Setting:
     own_objective : True where the objective is the user's.
     distributions : what varies from plant to plant; stated : True if the case says so.
     noise : standard deviation of the sensor noise [unit of length]; assumed : not of the case.
+    span : (pumps,) range of each input.
     filter : settings of the safety filter, None where there is none.
     certificates : a TankCertificate of each tank with a filter, else ().
     """
@@ -68,6 +69,7 @@ class Setting:
     stated: bool
     noise: float
     assumed: bool
+    span: np.ndarray
     filter: Mapping[str, Any] | None = None
     certificates: tuple = ()
 
@@ -142,17 +144,18 @@ def setting_of(
     if distributions is not None:
         distributions = stated_of(distributions)
         case = _with_box(case, distributions)
-    size, (noise, assumed) = height(case), _noise(case)
+    size, (noise, assumed), span = height(case), _noise(case), input_range(case)
     stated = bool(case.uncertain) or case.covariance is not None
     found = Setting(
         case=case,
         searched=_noisy(case, noise) if assumed or noise else case,
-        objective=_price(case, size) if objective is None else rig.check_objective(objective),
+        objective=_price(case, size, span) if objective is None else rig.check_objective(objective),
         own_objective=objective is not None,
         distributions=distributions or (spread_of(case) if stated else _default_box(case)),
         stated=stated or distributions is not None,
         noise=noise,
         assumed=assumed,
+        span=span,
     )
     if objective is None and _has_own_objective(case):
         found = found.replace(objective=dict(case.objective), own_objective=True)
@@ -179,15 +182,26 @@ def height(case: Case) -> float:
 
 
 def input_range(case: Case) -> np.ndarray:
-    """Return the (pumps,) range of each pump's input; of a pump, only what is not negative."""
+    """Return the (pumps,) range of each pump's input.
+
+    Limits below 0 or without end are those of a model, not of a pump: its range is then taken as
+    twice the rms input of the case's own run.
+    """
     actuator = case.loop.actuator
-    low, high = (np.asarray(v, dtype=float) for v in (actuator.low, actuator.high))
-    return np.broadcast_to(high - np.maximum(low, 0.0), (case.loop.plant.pumps,))
+    shape = (case.loop.plant.pumps,)
+    low, high = (
+        np.broadcast_to(np.asarray(v, float), shape) for v in (actuator.low, actuator.high)
+    )
+    if np.all(low >= 0.0) and np.all(np.isfinite(high)):
+        return high - low
+    quiet = dataclasses.replace(case.loop, sensor=case.loop.sensor.without_noise())
+    used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
+    return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
 
 
-def _price(case, size):
+def _price(case, size, span):
     """The default cost: the mean square error, and the priced mean square change of the input."""
-    pumps, span = case.loop.plant.pumps, float(np.mean(input_range(case)))
+    pumps, span = case.loop.plant.pumps, float(np.mean(span))
     weight = (PRICE[0] * size) ** 2 / (pumps * (PRICE[1] * span) ** 2)
     return {COST[0]: 1.0, COST[1]: weight}
 

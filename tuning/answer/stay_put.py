@@ -186,8 +186,7 @@ def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.nda
 
 
 def _without(search, trial, first, z, iterations):
-    """Return the best point with the gains of `trial` at their first values; None if there is none.
-    """
+    """Return the best point with the gains of `trial` at their first values, if there is one."""
     begin = np.where(trial, first, z)
     if trial.all():
         return begin

@@ -221,7 +221,7 @@ def _is_nominal(args):
 
 
 def _numbers(args):
-    """Method and numbers of the search: keywords of the finder, those that are not given left out."""
+    """Method and numbers of the search that are given: keywords of the finder."""
     given = {
         "batch": (args.batch, 1, 100_000),
         "validation": (args.validation, 0, 100_000),
