@@ -17,7 +17,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
-from jaxtank.core.clock import CHUNK, Chunk, Clock
+from jaxtank.core.clock import CHUNK, Chunk, Clock, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.instruments.base import Actuator, Sensor
@@ -26,6 +26,10 @@ from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.signals.base import Signal
+
+AWAY = 0.01
+"""Distance of the first level from a constant setpoint above which it counts as a change, as a
+share of the setpoint [-]."""
 
 Group = tuple[Any, ...]
 """Numbers or arrays, one per tank, pump or output."""
@@ -139,7 +143,7 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     """What the measures `names` refer to besides the sample, for setpoints `r`."""
     wanted, window = ms.refers_to(names), None
     if "window" in wanted:
-        window = loop.reference.windows(times)
+        window = windows(loop, times)
         if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
@@ -156,6 +160,38 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
         )
     steady = _steady_inputs(loop, r) if "steady" in wanted else None
     return ms.Context(window=window, since=since, steady=steady)
+
+
+def windows(loop: ClosedLoop, times: Any) -> Group | None:
+    """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
+
+    A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has none
+    of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY of the
+    setpoint.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = presets.load("cascaded/pi")
+    >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
+    [1, -4.0]
+    """
+    found, reference = loop.reference.windows(times), loop.reference
+    band = getattr(reference, "band", None)
+    if found is None or band is None:
+        return found
+    moved, t = {channel for _, channel in reference.changes}, sample_times(times)
+    return tuple(
+        window if i in moved else _from_start(window, t, loop.x0[output], band)
+        for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
+    )
+
+
+def _from_start(window: Group, t: Any, level: Any, band: float) -> Group:
+    """Return the window at times t of an output with a constant setpoint that starts at `level`."""
+    target, none, _, _ = window
+    step = jnp.where(jnp.abs(target - level) > AWAY * jnp.abs(target), target - level, none)
+    return target, step, t, band * jnp.abs(step)
 
 
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:

@@ -6,10 +6,10 @@ from tuning.answer.answer import Answer
 from tuning.answer.judged import Judged
 from tuning.answer.stay_put import Found
 from tuning.problem.problem import Problem
+from tuning.problem.provenance import provenance
 from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.kkt import optimality
-from tuning.search.provenance import provenance
 from tuning.search.result import ConstraintRow, TuningResult, row_of
 from tuning.uncertainty.validation import summary_of
 

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from tuning.problem.provenance import provenance
 from tuning.problem.scenarios import noisy
 from tuning.report import tables
-from tuning.search.provenance import provenance
 
 MEASURES = ("rms_error_total", "max_level")
 CASES = (

@@ -8,7 +8,7 @@ Imported by `problem`, `search` and `uncertainty`.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.closed_loop import ClosedLoop, windows
 from jaxtank.rig import check_limits
 from tuning.problem.scenarios import ScenarioRun
 
@@ -177,7 +177,8 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     """Return (reason and remedy, (entries,) True where `measure` has no value on the case's run).
 
     Whatever the gains, overshoot, rise and settling are undefined for an output whose setpoint has
-    no step within the run, and recovery where there is no inflow disturbance.
+    no step within the run and that starts at its setpoint (`windows`), and recovery where there is
+    no inflow disturbance.
 
     Examples
     --------
@@ -191,9 +192,12 @@ def undefined(measure: str, case: Case) -> tuple[str, list[bool]]:
     if "since" in wanted and onset is not None:
         why = f"no inflow disturbance begins within its {clock.duration:g} s; add one ([[pour]])"
         return why, [not np.any(since >= 0.0)] * ms.entries(measure, loop.plant)
-    windows = cast(Any, loop.reference).windows(clock) if "window" in wanted else None
-    if windows is not None:
-        steps = [np.asarray(window[1]) for window in windows]
-        why = f"no setpoint has a step within its {clock.duration:g} s; add one (reference.changes)"
+    found = windows(loop, clock) if "window" in wanted else None
+    if found is not None:
+        steps = [np.asarray(window[1]) for window in found]
+        why = (
+            f"no setpoint has a step within its {clock.duration:g} s, and no level starts away from"
+            " a constant setpoint; add one (reference.changes, or x0)"
+        )
         return why, [not np.any((step != 0.0) & (since < 0.0)) for step in steps]
     return "", [False] * ms.entries(measure, loop.plant)

@@ -52,3 +52,8 @@ class Point(NamedTuple):
             bool(np.all(np.abs(v) < DIVERGED))
             for v in (self.cost, self.gradient, self.margins, self.margin_slopes)
         )
+
+    @property
+    def valued(self) -> bool:
+        """True if cost and margins are numbers that one can compare, whatever the derivatives."""
+        return all(bool(np.all(np.abs(v) < DIVERGED)) for v in (self.cost, self.margins))

@@ -59,10 +59,10 @@ def _unstable_step(loop, clock, key):
     return None
 
 
-def sensitivities(problem, z):
-    """Return the change of the objective [%] for 10 % of each parameter, up or down, at z (P,).
+def neighbours(problem, z):
+    """Return (2 P + 1, P) z (P,) itself, and with 10 % less and 10 % more of each parameter.
 
-    10 % of the range where a parameter is linear. None where the objective is not finite.
+    10 % of the range where a parameter is linear.
     """
     trials = [z]
     for i, b in enumerate(problem.bounds):
@@ -70,7 +70,19 @@ def sensitivities(problem, z):
         for factor in (-0.1, 0.1):
             moved = b.to_unit(value * (1 + factor)) if b.scale == "log" else z[i] + factor
             trials.append(np.where(np.arange(len(z)) == i, np.clip(moved, 0.0, 1.0), z))
-    costs, _ = problem.screen(np.array(trials))
+    return np.array(trials)
+
+
+def sensitivities(costs):
+    """Return the larger change [%] by each parameter, of the costs of `neighbours`.
+
+    None where the objective is not finite.
+
+    Examples
+    --------
+    >>> sensitivities(np.array([2.0, 2.5, 3.0, np.nan, 2.0]))
+    [50.0, None]
+    """
     with np.errstate(divide="ignore", invalid="ignore"):  # a cost of 0 has no percent
         change = 100 * np.abs(costs[1:] / costs[0] - 1).reshape(-1, 2).max(axis=1)
     return [float(c) if np.isfinite(c) else None for c in change]
@@ -131,7 +143,7 @@ def curvature(problem, search, point, idle=None):
     # nothing is a share of an objective of 0
     if count < 2 or count > LARGEST_CURVATURE or point.cost == 0.0:
         return None
-    matrix = _second_derivative(problem, search, z)
+    matrix = _second_derivative(search, z)
     basis = _free_directions(search, point, idle)
     if matrix is None or not basis.shape[1]:
         return None
@@ -141,7 +153,9 @@ def curvature(problem, search, point, idle=None):
     factors, rounded = _short_factors(
         problem.bounds, z, there, point.gradient / search.scale, matrix
     )
-    costs, _ = problem.screen(np.array([z, rounded]))
+    costs, margins = problem.screen(np.array([z, rounded]))
+    if np.all(margins[1] >= 0) and costs[1] < costs[0]:
+        search.point(rounded)
     return {
         "eigenvalues": values.tolist(),
         "directions": [dict(zip(problem.names, map(float, d))) for d in directions],
@@ -152,12 +166,12 @@ def curvature(problem, search, point, idle=None):
     }
 
 
-def _second_derivative(problem, search, z):
+def _second_derivative(search, z):
     """Return the (P, P) symmetric second derivative of the scaled cost; None where not finite."""
     columns = []
     for i in range(len(z)):
         e = np.eye(len(z))[i] * STEP
-        up, down = problem.point(np.clip(z + e, 0, 1)), problem.point(np.clip(z - e, 0, 1))
+        up, down = search.point(z + e), search.point(z - e)
         if not (up.finite and down.finite):
             return None
         columns.append((up.gradient - down.gradient) / (up.z - down.z)[i] / search.scale)

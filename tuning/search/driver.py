@@ -41,6 +41,7 @@ class Search:
         tolerance: float = 1e-8,
     ):
         self.problem, self.report, self.tolerance = problem, report, tolerance
+        self.reference = reference
         # a cost can be a scale where its slopes are not to be used
         self.scale = reference.cost if 0 < reference.cost < DIVERGED else 1.0
         self.limit_scale = problem.limit_scales
@@ -79,6 +80,20 @@ class Search:
     def violation(self, point: Point) -> float:
         """Return the largest violation as a share of its `limit_scale` [-]; 0 where all hold."""
         return float(max(0.0, *(-point.margins / self.limit_scale))) if len(point.margins) else 0.0
+
+    def return_to_start(self) -> bool:
+        """Return True if the best point is now the start, whose derivatives are not finite.
+
+        No search can go on from there, but nothing that was found is better. Any other point of
+        this kind, of an unstable or chaotic run, is no answer.
+        """
+        start = self.reference
+        if start.finite or not start.valued:
+            return False
+        if self.best is not None and not self.better(start, self.best):
+            return False
+        self.best, self.best_start = start, None
+        return True
 
     def better(self, a: Point, b: Point) -> bool:
         """Return True if a is to be preferred: smaller violation first, then lower cost."""

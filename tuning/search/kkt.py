@@ -29,8 +29,11 @@ def optimality(search, point):
     """Return (gradient norm, KKT residual, multipliers of the limits) at a point.
 
     All of the scaled cost per unit of z. The residual is what is left of the gradient after the
-    best non-negative combination of the slopes of active limits and bounds.
+    best non-negative combination of the slopes of active limits and bounds. Infinite where a
+    derivative is not finite.
     """
+    if not point.finite:
+        return np.inf, np.inf, np.zeros(len(point.margins))
     residual, multipliers = _residual(search, point)
     return (
         float(np.linalg.norm(point.gradient / search.scale)),
@@ -71,6 +74,8 @@ def downhill(search, point):
     Lower by more than the cost can be trusted to. None where there is none: the point is an
     optimum, or at a kink.
     """
+    if not point.finite:
+        return None
     residual, _ = _residual(search, point)
     if np.linalg.norm(residual) <= SLOPING:
         return None

@@ -6,6 +6,7 @@ Imported by `tuner`. The codes are stable: programs filter by them, and texts ma
 code                             reported when
 ===============================  =============================================================
 step-too-long                    the integration step is too long for the answer
+no-longer-follows                the answer leaves a setpoint that the start held
 no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
@@ -22,6 +23,7 @@ parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
 parameter-insensitive            10 % of the value hardly changes the objective
 least-sensitive-direction        the smallest eigenvalue of the second derivative
+nothing-better-found             differential evolution found nothing better than the answer
 starts-agree                     how many searches ended at the answer
 permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on the validation set or on new plants
@@ -36,17 +38,14 @@ no-rig-file                      no rig file describes the case (`save`)
 ===============================  =============================================================
 """
 
-from collections.abc import Callable, Iterable, Iterator
-
-import numpy as np
+from collections.abc import Callable, Iterable
 
 from jaxtank import measures as ms
-from tuning.problem.point import DIVERGED
-from tuning.problem.status import Status
 from tuning.problem.wording import count
 from tuning.search.diagnostics import direction_words, symmetry_words
-from tuning.search.kkt import SLOPING, UNSTABLE
-from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
+from tuning.search.result import Message, TuningResult, constraint_rows
+from tuning.search.stages import AGREE
+from tuning.search.verdicts import ENDINGS, Found, first_of, violated
 
 INSENSITIVE = 0.5
 """Change of the objective [%] for 10 % of a parameter, below which the objective is called
@@ -55,15 +54,6 @@ insensitive to the parameter.
 
 CHATTER = 20.0
 """Growth of the total variation of the input above which it is reported [-]."""
-
-LISTED = 4
-"""Limits that one message names at most."""
-
-AGREE = 1.001
-"""Two searches whose objectives differ by less than this factor agree [-]."""
-
-Found = Iterator[Message]
-ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
 
 
 def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
@@ -75,121 +65,6 @@ def messages_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Messag
     return (*first, *(message for rule in RULES for message in rule(result)))
 
 
-def _violated(result: TuningResult) -> list[ConstraintRow]:
-    return [c for c in result.constraints if c.margin < 0]
-
-
-def _first(parts: list[str], joint: str = ", ") -> str:
-    """Return the first LISTED parts, and how many more there are."""
-    more = len(parts) - LISTED
-    return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
-
-
-def _no_feasible_point(result: TuningResult) -> Found:
-    violated = _violated(result)
-    if result.status == Status.NOT_CONVERGED and violated:
-        c = violated[0]
-        yield Message(
-            "no-feasible-point-found",
-            "no point that meets every limit was found before the search ended"
-            f" ({c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}): more --iterations,"
-            " --starts or --screening may find one",
-        )
-
-
-def _infeasible(result: TuningResult) -> Found:
-    if result.status != Status.INFEASIBLE:
-        return
-    scales = result.problem.limit_scales
-    shares = [c.margin / scale for c, scale in zip(result.constraints, scales)]
-    order = [i for i in np.argsort(shares, kind="stable") if shares[i] < 0]
-    worst = [result.constraints[i] for i in order]
-    missed = [
-        f"{c.name} is {c.amount()}, limit {c.limit:.6g} {c.unit}"
-        + ("" if c.reason else f", missed by {-c.margin:.3g} {c.unit}")
-        for c in worst
-    ]
-    least = (
-        ""
-        if worst[0].reason
-        else f"; the largest violation, {-100 * shares[order[0]]:.3g} % of its limit, is the least"
-        " that was found"
-    )
-    yield Message(
-        "infeasible", f"no point was found that meets every limit: {_first(missed)}{least}"
-    )
-
-
-def _interrupted(result: TuningResult) -> Found:
-    if result.status == Status.INTERRUPTED:
-        yield Message("interrupted", "interrupted: this is the best point so far")
-
-
-def _flat(result: TuningResult) -> bool:
-    """Return True if the gradient is exactly zero at an objective that is not."""
-    return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
-
-
-def _without_slope(result: TuningResult) -> Found:
-    if result.status != Status.INFEASIBLE and _flat(result):
-        yield Message(
-            "objective-without-slope",
-            "the gradient of the objective is zero here: the objective changes in steps, as times"
-            " and counts do, and a search by gradients cannot show that this is its minimum; add a"
-            " smooth measure to the objective",
-        )
-
-
-def _gradient_left(result: TuningResult) -> Found:
-    residual = result.optimality["kkt_residual"]
-    if _flat(result) or result.status not in ENDED or _violated(result):
-        return
-    if residual is not None and residual > SLOPING:
-        kink = result.status == Status.CONVERGED
-        yield Message(
-            "kink" if kink else "gradient-not-zero",
-            "a gradient is left that no active limit balances (KKT residual"
-            f" {residual:.2g} of the objective per range of a parameter): "
-            + (
-                "a kink, because steps along it find nothing lower within the limits"
-                if kink
-                else "not yet an optimum"
-            ),
-        )
-
-
-def _not_converged(result: TuningResult) -> Found:
-    zero = result.optimality["gradient_norm"] == 0.0
-    if result.status == Status.NOT_CONVERGED and not _violated(result) and not zero:
-        yield Message("not-converged", _why_not_converged(result))
-
-
-def _why_not_converged(result: TuningResult) -> str:
-    """Return why a search that violates no limit did not converge, and the remedy."""
-    if all(not np.isfinite(violation) for _, _, violation, _ in result.history):
-        return (
-            f"no search could begin: the objective, a limit or a derivative exceeds {DIVERGED:.0e}"
-            " at every point that was tried, as where noise and delay make the loop unstable;"
-            " start from other values (--set) or narrow the ranges (--free)"
-        )
-    if (result.optimality["kkt_residual"] or 0.0) >= UNSTABLE:
-        return (
-            "the gradient at this point is that of an unstable or chaotic run (noise and delay at"
-            " a high gain give one), and points along it are not lower; try more --starts, or"
-            " other ranges (--free)"
-        )
-    if any(o["exhausted"] for o in result.starts):
-        return (
-            "no search met the conditions of an optimum before its iterations were used up: raise"
-            " --iterations, or try other starts"
-        )
-    return (
-        "the searches stopped before their iterations were used up, at a kink or in the noise of"
-        " the objective: no line search found a lower point, and the conditions of an optimum do"
-        " not hold there; try more --starts or other starting values"
-    )
-
-
 def _start_violates(result: TuningResult) -> Found:
     over = constraint_rows(result.problem, result.tables["before"])
     parts = [
@@ -199,10 +74,10 @@ def _start_violates(result: TuningResult) -> Found:
         for c in over
         if c.margin < 0
     ]
-    if parts and not _violated(result):
+    if parts and not violated(result):
         yield Message(
             "start-violates-limit",
-            f"the starting values violate a limit ({_first(parts)}), so the"
+            f"the starting values violate a limit ({first_of(parts)}), so the"
             " objectives before and after do not compare",
         )
 
@@ -329,12 +204,7 @@ def _non_finite(result: TuningResult) -> Found:
 
 
 RULES: tuple[Callable[[TuningResult], Found], ...] = (
-    _no_feasible_point,
-    _infeasible,
-    _interrupted,
-    _without_slope,
-    _gradient_left,
-    _not_converged,
+    *ENDINGS,
     _start_violates,
     _not_applicable,
     _active,

@@ -11,6 +11,7 @@ from tuning.problem.problem import ROOT
 from tuning.search.driver import CoarseSearch
 from tuning.search.first_order import adam, lbfgs
 from tuning.search.kkt import LOWER_BY
+from tuning.search.screening import distinct_starts, evolution_size, evolve, sobol
 
 PROGRESS, PATIENCE = 1e-9, 25
 """Share by which the best cost must fall within PATIENCE evaluations for a search to go on: at a
@@ -23,6 +24,9 @@ ITERATION_LIMIT = 9
 COARSE_TOLERANCE = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
+
+RESTORED = 5
+"""Points from which the least violation is searched for, where no search met the limits."""
 
 NEAR, HALVINGS = 0.1, 10
 """Largest violation of a point that `approach` moves towards [-], and number of halvings."""
@@ -257,6 +261,32 @@ def approach(search):
             inside = middle.z
         else:
             out = middle.z
+
+
+def find_feasible(search, screened, iterations, seed):
+    """Return True if the searches for the least violation of the limits came to their end.
+
+    Where no search met the limits: from the best point so far, from the screened points of least
+    violation, a distance apart, and from what differential evolution makes of those.
+    """
+    short = np.maximum(0.0, -screened.margins / search.limit_scale).max(axis=1, initial=0.0)
+    starts = distinct_starts(screened.zs, short, RESTORED, search.best.z)
+    ended = []
+    for z in starts:
+        ended.append(restore(search, z, iterations))
+        if search.violation(search.best) == 0:
+            slsqp(search, search.best.z, iterations)
+            return True
+    count, generations = evolution_size(search, screened)
+    more = sobol(count, len(search.best.z), seed + 1)
+    order = np.argsort(np.where(np.isfinite(short), short, np.inf), kind="stable")
+    members = np.concatenate([search.best.z[None], screened.zs[order[: count // 2]], more])[:count]
+    now, _ = evolve(search, members, generations, seed)
+    z = now.zs[np.argmin(now.merits(search))]
+    ended.append(restore(search, z, iterations))
+    if search.violation(search.best) == 0:
+        slsqp(search, search.best.z, iterations)
+    return any(ended)
 
 
 METHODS = {

@@ -14,8 +14,8 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
-from tuning.search.methods import approach, restore, slsqp
-from tuning.search.screening import best_screened, screen
+from tuning.search.methods import approach, find_feasible, restore, slsqp
+from tuning.search.screening import Population, best_screened, screen
 
 MANY = 50
 """Values of the limit at most."""
@@ -139,9 +139,14 @@ class _Sweep:
                 self.found[k] = _better(self.found[k], nearby)
             self.problem.limit(self.steps[k])
             search = self.found[k].search
-            other = best_screened(search, *self._candidates(screening, seed))
+            screened = self._candidates(screening, seed)
+            other = best_screened(search, screened)
             if other is not None:
                 self.found[k] = _Answer(search, slsqp(search, other, self.iterations))
+            if self.found[k].violation and search.best is not None:
+                find_feasible(search, screened, self.iterations, seed)
+                done = slsqp(search, search.best.z, self.iterations)
+                self.found[k] = _Answer(search, done)
             approach(search)
             self.known.update(search.memory)
 
@@ -158,11 +163,11 @@ class _Sweep:
         return _Answer(search, converged)
 
     def _candidates(self, screening, seed):
-        """Return (zs, costs, margins under the present limits) of screened and of known points."""
+        """Return the Population of screened and of known points, under the present limits."""
         zs, costs, margins, _ = screen(self.problem, screening, seed)
         points = [p for p in self.known.values() if p.finite]
         old = [self.problem.margins(p.measures) for p in points]
-        return (
+        return Population(
             np.concatenate([zs, [p.z for p in points]]),
             np.concatenate([costs, [p.cost for p in points]]),
             np.concatenate([margins, np.reshape(old, (len(points), margins.shape[1]))]),

@@ -133,6 +133,30 @@ class ConstraintRow:
         return dataclasses.asdict(self)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Lost:
+    """An output that follows its setpoint before tuning, and no longer afterwards.
+
+    Parameters
+    ----------
+    output : its number, from 1.
+    before, after : its largest distance from the setpoint at the end of a plateau [unit].
+    share : `after` as a share of the change that led to the plateau [-].
+    unit : unit of level.
+
+    Examples
+    --------
+    >>> Lost(output=1, before=0.0, after=2.5, share=0.5, unit="cm").share
+    0.5
+    """
+
+    output: int
+    before: float
+    after: float
+    share: float
+    unit: str
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
 class TuningResult(Result):
     """What `tune` found: print it for tables, `.plot()` for pictures, `.save(dir)` for files.
@@ -161,6 +185,10 @@ class TuningResult(Result):
     choices : one dict for each combination of discrete choices.
     bound : perfect-information open-loop optimum (`tuning.bound`), where asked.
     tradeoff : objective over one limit (`tuning.tradeoff`), where asked.
+    lost : outputs that no longer follow their setpoints, as `Lost`.
+    probe : {"runs", "searches", "lower"}: runs of differential evolution around the answer and
+        over the ranges, searches from what it found, and how many of those ended lower; None where
+        two searches agree and none was needed.
     certificate : violation probability on new plants (`tune_robust`), where asked.
     answer : the `tuning.Answer` of a default answer: its plants, noise and safety filter.
 
@@ -199,6 +227,8 @@ class TuningResult(Result):
     tradeoff: Any = None
     certificate: Any = None
     answer: Any = None
+    lost: tuple[Lost, ...] = ()
+    probe: dict[str, int] | None = None
     cloud: dict[str, Any] | None = None
 
     @property

@@ -4,6 +4,7 @@ Imported by `stages` and `pareto`.
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +20,17 @@ from jaxtank.loop.closed_loop import Inputs, initial
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
-TRIED = 3
-"""Screened points that are run again at the true step, at most, to find one that is better than the
-best: the coarse step may rate many too low."""
+FEWEST, MEMBERS = 16, 64
+"""Members of a differential evolution, at least and at most: else as many as were screened."""
+
+GENERATIONS, RUNS = 16, 100_000
+"""Its generations, and its coarse runs, at most."""
+
+MUCH = 1e12
+"""Merit of a point that violates a limit: above every cost (see `DIVERGED`) [-]."""
+
+CROSSED = 0.9
+"""Share of the parameters that a member of the differential evolution takes from its move [-]."""
 
 LARGEST_STATE = 60
 """Numbers in the loop's state above which its stability is not computed: eigenvalues cost their
@@ -163,25 +172,95 @@ def distinct_starts(zs, merits, count, first):
     return taken
 
 
-def best_screened(search, zs, costs, margins):
+def best_screened(search, screened):
     """Return the screened point (P,) that keeps the limits and is better than the best of a Search.
 
-    None where none is, at the true step. zs (points, P), costs (points,) and margins (points,
-    limits) as `screen` returns them. A point that is run again enters the Search.
+    None where none is, at the true step. Every point that the coarse step rates better is run again
+    at the true step, and enters the Search.
     """
+    zs, costs, margins = screened
     held = np.isfinite(costs) & np.all(margins >= 0, axis=1)
-    new = [
-        i
-        for i in np.argsort(costs, kind="stable")
-        if held[i] and zs[i].tobytes() not in search.memory
-    ]
-    for i in new[:TRIED]:
-        if (
-            search.best is not None
-            and search.violation(search.best) == 0
-            and costs[i] >= search.best.cost
-        ):
+    for i in np.argsort(costs, kind="stable"):
+        if not held[i] or zs[i].tobytes() in search.memory:
+            continue
+        held_now = search.best is not None and search.violation(search.best) == 0
+        if held_now and costs[i] >= search.best.cost:
             return None
         if search.point(zs[i]) is search.best:
             return zs[i]
     return None
+
+
+class Population(NamedTuple):
+    """Points and what was measured there."""
+
+    zs: np.ndarray  # (points, P) in the unit cube
+    costs: np.ndarray  # (points,)
+    margins: np.ndarray  # (points, limits)
+
+    def merits(self, search):
+        """Return (points,) what ranks them: costs where the limits hold, else far above, violation.
+
+        Infinite where a point is not finite.
+        """
+        short = np.maximum(0.0, -self.margins / search.limit_scale).max(axis=1, initial=0.0)
+        merits = np.where(short > 0, MUCH * (1.0 + short), self.costs)
+        return np.where(np.isfinite(self.costs) & np.isfinite(merits), merits, np.inf)
+
+
+def evolution_size(search, screened):
+    """Return (members, generations) of a differential evolution, within RUNS coarse runs."""
+    members = min(max(len(screened.zs), FEWEST), MEMBERS)
+    few = RUNS // (members * len(search.problem.runs))
+    return members, max(2, min(GENERATIONS, few))
+
+
+def evolve(search, zs, generations, seed, coarse=True):
+    """Return the Population after differential evolution of points zs, and that of zs itself.
+
+    Storn and Price, J. Global Optimization 11 (1997): members move by the scaled difference of two
+    others, from themselves towards the best (one half) or from a third (the other), and are kept
+    where they are better. A generation is one batch of runs: with as many points as the screening
+    it compiles nothing.
+
+    Parameters
+    ----------
+    zs : (points, P), four at least.
+    generations : number of batches.
+    seed : of the moves.
+    coarse : with the clock of the screening.
+    """
+    rng, count = np.random.default_rng([seed, 1997]), len(zs)
+    first = now = Population(zs, *search.problem.screen(zs, coarse))
+    merits = now.merits(search)
+    for _ in range(generations):
+        a, b, c = (rng.permutation(count) for _ in range(3))
+        factor = rng.uniform(0.4, 0.9, (count, 1))
+        towards = now.zs + factor * (now.zs[np.argmin(merits)] - now.zs)
+        base = np.where(rng.random((count, 1)) < 0.5, towards, now.zs[a])
+        moved = np.clip(base + factor * (now.zs[b] - now.zs[c]), 0.0, 1.0)
+        trial = np.where(rng.random(moved.shape) < CROSSED, moved, now.zs)
+        new = Population(trial, *search.problem.screen(trial, coarse))
+        ranks = new.merits(search)
+        better = ranks < merits
+        merits = np.where(better, ranks, merits)
+        now = Population(
+            np.where(better[:, None], new.zs, now.zs),
+            np.where(better, new.costs, now.costs),
+            np.where(better[:, None], new.margins, now.margins),
+        )
+        search.report(search)
+    return now, first
+
+
+def around(z, count, seed):
+    """Return (count, P) points about z in the unit cube, at distances from 0.002 to 0.2.
+
+    Examples
+    --------
+    >>> around(np.array([0.5, 1.0]), 3, seed=0).shape
+    (3, 2)
+    """
+    rng = np.random.default_rng([seed, 2])
+    radius = np.exp(rng.uniform(np.log(0.002), np.log(0.2), (count, 1)))
+    return np.clip(z + radius * rng.standard_normal((count, len(z))), 0.0, 1.0)

@@ -10,16 +10,36 @@ from typing import Any
 import numpy as np
 
 from tuning.problem.problem import Problem
-from tuning.problem.status import Status
 from tuning.search import diagnostics
 from tuning.search.driver import SETTLED, Search
 from tuning.search.first_order import minibatches
-from tuning.search.kkt import UNSTABLE, downhill, optimality
-from tuning.search.methods import METHODS, UNCONSTRAINED, approach, restore, slsqp
-from tuning.search.screening import best_screened, distinct_starts, screen
+from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
+from tuning.search.methods import METHODS, UNCONSTRAINED, approach, find_feasible, slsqp
+from tuning.search.screening import (
+    Population,
+    around,
+    best_screened,
+    distinct_starts,
+    evolution_size,
+    evolve,
+    screen,
+    sobol,
+)
 
 RENEWED = 3
 """How often a search is begun again from where it stopped before conditions of an optimum hold."""
+
+AGREE = 1.001
+"""Two searches whose objectives differ by less than this factor agree [-]."""
+
+SAME = 1e-9
+"""Share of the cost by which two programs that compute it may differ, by rounding [-]."""
+
+TRIED = 8
+"""Members of a differential evolution of which the first that is no chaotic run is a start."""
+
+MISLED = 0.1
+"""Share by which the cost of a coarse run may differ from the true one to be searched with [-]."""
 
 POLISHED = 1e-12
 """Tolerance of the last search, from the best point [-]."""
@@ -47,8 +67,10 @@ class Outcome:
     interrupted: bool = False
     redone: int = 0  # screening points that were run again at the true step
     least: bool = False  # whether the search for the least violation came to its end
-    polished: bool = False  # whether the last search converged
-    settled: bool = False  # whether nothing lower lies along a gradient that is left
+    ended: bool = False  # whether the search that gave the answer converged, and so it stayed
+    confirmed: bool = False  # whether two searches agree, or evolution found nothing better
+    probe: dict[str, int] | None = None  # what evolution found, see TuningResult
+    change: Any = None  # (P,) percent of the cost by 10 % of each parameter
     idle: Any = None  # (P,) True for parameters that no run exercises
     curvature: dict[str, Any] | None = None
 
@@ -74,29 +96,133 @@ def _run_stages(problem, first, plan, found, report):
     tolerance = {} if plan.tolerance is None else {"tolerance": plan.tolerance}
     search = found.search = Search(problem, reference, report, **tolerance)
     search.take(reference)
-    zs, costs, margins, found.redone = screen(problem, plan.screening, plan.seed)
-    shortfall = np.maximum(0.0, -margins / search.limit_scale)
-    merits = costs / search.scale + 10.0 * shortfall.sum(axis=1)
-    for z in distinct_starts(zs, merits, plan.starts, first):
+    *measured, found.redone = screen(problem, plan.screening, plan.seed)
+    screened = Population(*measured)
+    shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
+    merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
+    for z in distinct_starts(screened.zs, merits, plan.starts, first):
         search.start = len(found.starts)
         _local_search(search, found, plan, z, len(search.history))
-    search.start, count = len(found.starts), len(search.history)
-    z = best_screened(search, zs, costs, margins)
-    if z is not None:
-        _local_search(search, found, plan, z, count)
-    search.start = len(found.starts)
-    infeasible = search.best is not None and search.violation(search.best) > 0
-    if infeasible and plan.method not in UNCONSTRAINED:
-        found.least = _find_feasible(search, zs, shortfall.max(axis=1), plan.iterations)
+    _search_screened(search, found, plan, screened)
+    if _violated(search) and plan.method not in UNCONSTRAINED:
+        found.least = find_feasible(search, screened, plan.iterations, plan.seed)
     approach(search)
-    if search.best is None:
-        return
-    found.polished = _last_search(search, found, plan)
-    feasible = search.violation(search.best) == 0
-    found.settled = feasible and _nothing_lower(search, plan.iterations)
-    found.idle = diagnostics.unexercised(problem, search, first)
-    if feasible:
-        found.curvature = diagnostics.curvature(problem, search, search.best, found.idle)
+    if search.best is not None:
+        _finish(search, found, plan)
+        _confirm(search, found, plan, screened)
+        found.idle = diagnostics.unexercised(problem, search, first)
+        if not _violated(search):
+            found.curvature = diagnostics.curvature(problem, search, search.best, found.idle)
+    if search.return_to_start():
+        found.confirmed, found.curvature = False, None
+
+
+def _violated(search):
+    """Return True if the best point violates a limit."""
+    return search.best is not None and search.violation(search.best) > 0
+
+
+def _search_screened(search, found, plan, screened):
+    """Search on from each screened point that is better than all searches, until none is."""
+    while True:
+        search.start, count = len(found.starts), len(search.history)
+        z = best_screened(search, screened)
+        if z is None:
+            return
+        _local_search(search, found, plan, z, count)
+
+
+def _finish(search, found, plan):
+    """Search a last time from the best point, and find out whether it is an optimum."""
+    search.start = len(found.starts)
+    polished = _last_search(search, found, plan)
+    settled = not _violated(search) and _nothing_lower(search, plan.iterations)
+    found.ended = settled and (polished or _converged(search, found.starts))
+
+
+def _confirm(search, found, plan, screened):
+    """Look for points that are better than the answer, and search on from them, a few times.
+
+    Its neighbours, which are run for its sensitivity, always; where no two searches agree on an
+    answer that has converged, by differential evolution too.
+    """
+    for k in range(RENEWED):
+        mark = search.best
+        lower = _lower_neighbour(search, found)
+        if lower is None and found.ended and not _agreed(search, found):
+            lower = _probe(search, found, screened, plan.seed + k)
+        if lower is not None:
+            search.start, count = len(found.starts), len(search.history)
+            _local_search(search, found, plan, lower, count)
+            _finish(search, found, plan)
+        if not _is_lower(search, search.best, mark):
+            found.confirmed = found.ended
+            return
+        if found.probe:
+            found.probe["lower"] += 1
+    found.confirmed = found.ended and _agreed(search, found)
+
+
+def _is_lower(search, point, other):
+    """Return True if a point is better than another by more than the cost can be trusted to."""
+    if search.violation(other) > 0 or search.violation(point) > 0:
+        return search.better(point, other)
+    return point.cost < other.cost - LOWER_BY * abs(other.cost)
+
+
+def _agreed(search, found):
+    """Return True if two searches ended at the answer, or in its value."""
+    most = search.best.cost + (AGREE - 1.0) * abs(search.best.cost)
+    return sum(o["violation"] == 0.0 and o["cost"] <= most for o in found.starts) > 1
+
+
+def _lower_neighbour(search, found):
+    """Return z of a neighbour of the best point that is lower; None where none is."""
+    best = search.best
+    near = diagnostics.neighbours(search.problem, best.z)
+    costs, margins = search.problem.screen(near)
+    found.change = diagnostics.sensitivities(costs)
+    merits = Population(near, costs, margins).merits(search)
+    i = int(np.argmin(merits))
+    if merits[i] >= merits[0] - SAME * abs(merits[0]):
+        return None
+    return near[i] if _is_lower(search, search.point(near[i]), best) else None
+
+
+def _probe(search, found, screened, seed):
+    """Return z of a point that may be better than the answer, by differential evolution.
+
+    Half of its members are the best screened points, the others new Sobol points, the answer and
+    points around it. On coarse runs, unless they mislead: then a search decides at the true step.
+    """
+    problem, best, mark = search.problem, search.best, search.problem.simulations
+    count, generations = evolution_size(search, screened)
+    order = np.argsort(screened.merits(search), kind="stable")
+    members = np.concatenate(
+        [
+            best.z[None],
+            around(best.z, count // 4, seed),
+            screened.zs[order[: count // 2]],
+            sobol(count, len(best.z), seed + 1)[: count - 1],
+        ]
+    )[:count]
+    now, began = evolve(search, members, generations, seed)
+    here = began.merits(search)[0]
+    if not np.isclose(here, best.cost, rtol=MISLED) and len(problem.runs) == 1:
+        now, began = evolve(search, members, max(2, generations // 8), seed, coarse=False)
+        here = began.merits(search)[0]
+    runs = problem.simulations - mark
+    found.probe = found.probe or {"runs": 0, "searches": 0, "lower": 0}
+    found.probe["runs"] += runs
+    merits = now.merits(search)
+    for i in np.argsort(merits, kind="stable")[:TRIED]:
+        if merits[i] >= here - LOWER_BY * abs(here):
+            search.point(now.zs[i])  # nothing lower, but it may be, by a little
+            return None
+        if search.point(now.zs[i]).finite:
+            found.probe["searches"] += 1
+            return now.zs[i]
+    return None
 
 
 def _local_search(search, found, plan, z, count):
@@ -126,22 +252,6 @@ def _local_search(search, found, plan, z, count):
             "exhausted": search.exhausted,
         }
     )
-
-
-def _find_feasible(search, zs, shortfall, iterations):
-    """Return True if a search for the least violation of the limits came to its end.
-
-    Where no search met the limits: from the best point so far, and from the two screened points
-    of least `shortfall` (points,).
-    """
-    order = np.argsort(np.where(np.isfinite(shortfall), shortfall, np.inf), kind="stable")
-    ended = []
-    for z in (search.best.z, *(zs[i] for i in order[:2])):
-        ended.append(restore(search, z, iterations))
-        if search.violation(search.best) == 0:
-            slsqp(search, search.best.z, iterations)
-            break
-    return any(ended)
 
 
 def _last_search(search, found, plan):
@@ -180,31 +290,12 @@ def _nothing_lower(search, iterations):
 def _converged(search, starts):
     """Return True if the local search that gave the best point converged, not on a step."""
     mine = search.best_start < len(starts) and starts[search.best_start]["converged"]
-    return bool(mine) and not _without_slope(search)
+    return bool(mine) and not without_slope(search)
 
 
-def _without_slope(search):
+def without_slope(search):
     """Return True if the gradient is exactly zero at a cost that is not: the cost has steps."""
     return not np.any(search.best.gradient) and search.best.cost != 0.0
-
-
-def status_of(found: Outcome, feasible: bool) -> Status:
-    """Return how the stages ended; feasible : whether every limit holds at the answer.
-
-    Converged: the search that gave the answer converged, or the last one did, and nothing lower
-    lies along a gradient that is left. Infeasible: the search for the least violation came to its
-    end, and some was left.
-    """
-    if found.interrupted:
-        return Status.INTERRUPTED
-    if found.search is None or found.best is None:
-        return Status.NOT_CONVERGED
-    if not feasible:
-        return Status.INFEASIBLE if found.least else Status.NOT_CONVERGED
-    done = found.polished and not _without_slope(found.search)
-    if found.settled and (done or _converged(found.search, found.starts)):
-        return Status.CONVERGED
-    return Status.NOT_CONVERGED
 
 
 def _reporter(progress, problem, starts):

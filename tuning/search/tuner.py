@@ -17,6 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from tuning.problem.problem import Problem
+from tuning.problem.provenance import provenance
 from tuning.problem.reported import run_measures, table_of
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
@@ -25,9 +26,9 @@ from tuning.search.kkt import optimality
 from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
 from tuning.search.options import Solver, check_options, check_precision, spelled_out
-from tuning.search.provenance import provenance
 from tuning.search.result import TuningResult, constraint_rows
-from tuning.search.stages import Outcome, Plan, solve, status_of
+from tuning.search.stages import Outcome, Plan, solve
+from tuning.search.verdicts import lost_outputs, status_of
 from tuning.storage.checkpoint import checkpoint_folder
 from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
@@ -200,19 +201,20 @@ def _result(problem, plan, found: Outcome, first, before, key):
         values = dict(own)
     values |= {n: v for (n, v), idle in zip(own.items(), found.idle) if idle}
     complete = best is not None and not found.interrupted
-    change = diagnostics.sensitivities(problem, z) if complete else [None] * len(z)
+    change = found.change if complete and found.change else [None] * len(z)
     tuned = case.replace(loop=with_values(case.loop, values))
     after = run_measures(tuned.loop, tuned.clock, key)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
+    lost = lost_outputs(problem, tables, values) if complete else ()
     optimum = _optimality(found.search, best)
     rows = constraint_rows(problem, tables["after"], tables["before"], optimum["multipliers"])
     return TuningResult(
         case=case,
         tuned=tuned,
         method=plan.method,
-        status=status_of(found, all(row.margin >= 0 for row in rows)),
+        status=status_of(found, all(row.margin >= 0 for row in rows), lost),
         parameters=_parameters(problem, z, values, change, found.idle.tolist()),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
@@ -234,6 +236,8 @@ def _result(problem, plan, found: Outcome, first, before, key):
         validation=None,
         provenance=provenance(case, plan.seed),
         problem=problem,
+        lost=lost,
+        probe=found.probe,
     )
 
 

@@ -2,17 +2,19 @@
 
 import os
 import platform
+from typing import Any
 
 import jax
 import jaxlib.version
 import numpy as np
 
 import jaxtank
+from jaxtank.case import Case
 from jaxtank.xla.flags import KEY
 from tuning.problem.scenarios import screening_clock
 
 
-def provenance(case, seed):
+def provenance(case: Case, seed: int) -> dict[str, Any]:
     """Return the versions and settings that a result depends on.
 
     Examples
