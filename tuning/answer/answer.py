@@ -26,8 +26,8 @@ class Answer(Shown):
     before, after : the published and the tuned case on the same plants, none used by the search.
     nominal : {"before", "after": total rms error of the case's own run, without noise}.
     kept : {parameter: True where it stays at its first value}.
-    agreed : True if two searches ended at the same cost; followed : False where the tuned loop no
-        longer follows its setpoints.
+    agreed : True if two searches ended at the same cost, or nothing better was found.
+    lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
     idle : numbers of the tanks, from 1, whose limit no plant comes near.
     tightened : share by which the limits were tightened for the search [-].
     coarse_dt : step of the search [s].
@@ -49,7 +49,7 @@ class Answer(Shown):
     nominal: Mapping[str, float]
     kept: Mapping[str, bool]
     agreed: bool
-    followed: bool
+    lost: tuple
     idle: tuple[int, ...]
     tightened: float
     coarse_dt: float

@@ -59,12 +59,11 @@ def _words(result, row):
 
 
 def _lost(result, answer) -> Found:
-    if answer.after is not None and not answer.followed:
-        unit = result.tuned.loop.units[0]
+    for row in answer.lost:
         yield Message(
             "no-longer-follows",
-            "the tuned loop no longer follows its setpoints: total rms error of the case's own run"
-            f" {answer.nominal['after']:.3g} {unit}, {answer.nominal['before']:.3g} {unit} before",
+            f"output {row.output} no longer follows its setpoint: at the end of a plateau it is"
+            f" {row.after:.3g} {row.unit} off, {row.before:.3g} {row.unit} before",
         )
 
 
@@ -72,8 +71,9 @@ def _not_agreed(result, answer) -> Found:
     if result.status != Status.INTERRUPTED and not answer.agreed:
         yield Message(
             "not-converged",
-            "no two of the local searches ended within 1 % of each other: raise --starts or"
-            " --iterations, or narrow the ranges (--free)",
+            "no two of the local searches ended within 1 % of each other, and a search without"
+            " derivatives found lower points: raise --starts or --iterations, or narrow the ranges"
+            " (--free)",
         )
 
 

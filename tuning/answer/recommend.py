@@ -24,6 +24,7 @@ from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import noisy, with_noise_drawn
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
+from tuning.search.verdicts import lost_outputs
 from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
 
@@ -32,10 +33,6 @@ ATTEMPTS = 4
 
 MISLED = 1.5
 """Ratio of the costs at the true and at the coarse step above which the coarse one misleads [-]."""
-
-LOST = 2.0
-"""Growth of the error, on the nominal plant and in the mean, above which a loop counts as not
-following its setpoints any more [-]."""
 
 TIGHTER = 1.2
 """Factor on the largest violation by which limits are tightened for the next search [-]."""
@@ -256,7 +253,7 @@ def _answer(setting, before, after, found, problem, values, tightened):
         nominal=errors,
         kept=stays or dict.fromkeys(own, False),
         agreed=found.agreed,
-        followed=_follows(before, after, errors),
+        lost=_lost(setting, problem, nominal, values),
         idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
         tightened=tightened,
         coarse_dt=problem.case.clock.dt,
@@ -264,17 +261,16 @@ def _answer(setting, before, after, found, problem, values, tightened):
     )
 
 
+def _lost(setting, problem, nominal, values):
+    """Return the outputs of the case's own run that no longer follow their setpoints."""
+    case = setting.tuned(problem.own_values())
+    own = Problem(case, problem.given["free"], setting.objective, {}, ())
+    return lost_outputs(own, {side: [table] for side, table in nominal.items()}, values)
+
+
 def _nominal(case):
     """Return the measures of the case's own run, without noise unless it has some."""
     return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
-
-
-def _follows(before, after, errors):
-    """Return False where the error has grown by LOST, on the nominal plant and in the mean."""
-    if after is None or after.failed.all():
-        return False
-    mean = np.mean(after.error[~after.failed]) / np.mean(before.error[~before.failed])
-    return not (errors["after"] > LOST * errors["before"] and mean > LOST)
 
 
 def _idle(setting, before, after):

@@ -57,6 +57,7 @@ def result_of(
         cloud=cloud,
         provenance=provenance(setting.case, problem.seed),
         problem=problem,
+        lost=answer.lost,
         answer=answer,
     )
 
@@ -76,7 +77,7 @@ def _status(answer, found):
         return Status.NOT_CONVERGED
     if not answer.held:
         return Status.INFEASIBLE
-    return Status.CONVERGED if found.agreed and answer.followed else Status.NOT_CONVERGED
+    return Status.CONVERGED if found.agreed and not answer.lost else Status.NOT_CONVERGED
 
 
 def _optimality(search, point):

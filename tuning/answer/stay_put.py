@@ -12,7 +12,14 @@ from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import Search
 from tuning.search.methods import METHODS, restore
-from tuning.search.screening import distinct_starts, sobol
+from tuning.search.screening import (
+    Population,
+    around,
+    distinct_starts,
+    evolution_size,
+    evolve,
+    sobol,
+)
 
 WORTH = 0.01
 """A gain is changed only where that lowers the cost by this share [-]."""
@@ -23,6 +30,9 @@ to a few percent."""
 
 TOLERANCE = 1e-4
 """Change of the cost, as a share of its first value, at which a search has converged [-]."""
+
+PROBES = 3
+"""Differential evolutions that are tried, at most, until one finds nothing better."""
 
 LINE = 32
 """Values that are tried between a gain's best and its first value; also the screened points, so
@@ -37,7 +47,7 @@ class Found:
     """What the search found so far; Ctrl-C leaves it as it is.
 
     z : (P,) the answer.  kept : (P,) True for gains at their first value.  agreed : True if two
-    searches ended within AGREE.  starts : as in `TuningResult`.
+    searches ended within AGREE, or evolution found nothing better.  starts : as in `TuningResult`.
     """
 
     search: Search | None = None
@@ -124,6 +134,8 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
         METHODS["slsqp"](search, search.best.z, plan["iterations"])
     if search.best is None:
         return
+    if not found.agreed:
+        found.agreed = _confirmed(search, found, Population(zs, costs, margins), plan)
     found.idle = diagnostics.unexercised(problem, search, first)
     found.z, found.kept = stay_put(search, first, plan["iterations"])
 
@@ -146,6 +158,35 @@ def _local_search(search, found, z, iterations):
             "exhausted": search.exhausted,
         }
     )
+
+
+def _confirmed(search, found, screened, plan):
+    """Return True if differential evolution finds nothing that is better by AGREE than the best.
+
+    From the best point, points around it and the best screened ones. Where it does, a local search
+    goes on from there, PROBES times at most.
+    """
+    _, generations = evolution_size(search, screened)
+    order = np.argsort(screened.merits(search), kind="stable")
+    for k in range(PROBES):
+        near = around(search.best.z, LINE // 4, plan["seed"] + k)
+        members = np.concatenate([search.best.z[None], near, screened.zs[order]])[:LINE]
+        last, _ = evolve(search, members, generations, plan["seed"] + k, coarse=False)
+        merits, mark = last.merits(search), search.best
+        i = int(np.argmin(merits))
+        if merits[i] < mark.cost * (1.0 - AGREE) or search.violation(mark) > 0:
+            search.start = len(found.starts)
+            _local_search(search, found, last.zs[i], plan["iterations"])
+        if not _clearly_better(search, search.best, mark):
+            return search.violation(search.best) == 0
+    return False
+
+
+def _clearly_better(search, point, other):
+    """Return True if a point is better than another by AGREE, or violates the limits by less."""
+    if max(search.violation(point), search.violation(other)) > 0:
+        return search.better(point, other)
+    return point.cost < other.cost * (1.0 - AGREE)
 
 
 def _agree(starts):

@@ -16,7 +16,7 @@ from tuning.identification.confidence import at_search_bounds
 from tuning.report import artifacts, html, tables
 from tuning.report import figures as pictures
 from tuning.report.identification_figures import CAPTIONS, figures
-from tuning.search import provenance
+from tuning.problem import provenance
 
 __all__ = ["figures", "json_of", "lines", "message", "save"]
 

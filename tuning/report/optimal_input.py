@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
+from tuning.problem import provenance
 
 NOTE = (
     "a numerical optimum of a problem with more than one, on a grid of inputs, for a run known in"

@@ -116,7 +116,7 @@ def simulate(args):
     from tuning.problem.scenarios import noisy
     from tuning.report import artifacts, tables
     from tuning.report import case as manual
-    from tuning.search import provenance
+    from tuning.problem import provenance
 
     key = jax.random.key(seed) if noisy(case) else None
     if step_size.step_warnings(case.loop, case.clock):

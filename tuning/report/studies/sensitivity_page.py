@@ -17,7 +17,7 @@ from tuning.report.studies.sensitivity_tables import (
     parts_of,
     table_csv,
 )
-from tuning.search import provenance
+from tuning.problem import provenance
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
 

@@ -11,7 +11,7 @@ from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
+from tuning.problem import provenance
 from tuning.storage.batch_store import remove_batches
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
