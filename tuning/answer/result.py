@@ -4,7 +4,7 @@ import numpy as np
 
 from tuning.answer.answer import Answer
 from tuning.answer.judged import Judged
-from tuning.answer.stay_put import Found
+from tuning.answer.stay_put import LINE, Found
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.status import Status
@@ -92,7 +92,7 @@ def _parameters(problem, found, values):
     """Return {name: values before and after, range, sensitivity} of the parameters."""
     own, point = problem.own_values(), found.point
     whole = point is not None and not found.interrupted
-    change = diagnostics.sensitivities(problem, point.z) if whole else [None] * len(own)
+    change = _sensitivities(problem, point.z) if whole else [None] * len(own)
     idle = np.zeros(len(own), dtype=bool) if found.idle is None else found.idle
     rows = {}
     for i, b in enumerate(problem.bounds):
@@ -108,6 +108,14 @@ def _parameters(problem, found, values):
             "exercised": not idle[i],
         }
     return rows
+
+
+def _sensitivities(problem, z):
+    """Return the change of the cost [%] for 10 % of each parameter, by the program of the search."""
+    near = diagnostics.neighbours(problem, z)
+    filled = np.concatenate([near, np.repeat(near[:1], -len(near) % LINE, axis=0)])
+    blocks = [problem.screen(zs)[0] for zs in filled.reshape(-1, LINE, len(z))]
+    return diagnostics.sensitivities(np.concatenate(blocks)[: len(near)])
 
 
 def _rows(answer: Answer, problem: Problem) -> list[ConstraintRow]:
