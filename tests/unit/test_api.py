@@ -111,7 +111,7 @@ def test_a_registered_controller_and_observer_are_read_and_written(own):
 
 
 def test_save_writes_the_rig_file_of_a_registered_controller(tuned, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuning.report.tuning.figures", lambda *_: {})
+    monkeypatch.setattr("tuning.report.tuned.report.figures", lambda *_: {})
     tuned.save(tmp_path)
     controller = rig.load(tmp_path / "rig.toml").loop.controller
     assert isinstance(controller, Proportional)

@@ -62,7 +62,7 @@ class Answer(Shown):
         return self.after is not None and bool(self.after.held.all())
 
     def _lines(self) -> list[Any]:
-        return importlib.import_module("tuning.report.answer").of_answer(self)
+        return importlib.import_module("tuning.report.tuned.answer").of_answer(self)
 
     def __str__(self) -> str:
         return "\n".join(map(str, self._lines()))

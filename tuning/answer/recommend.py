@@ -169,7 +169,7 @@ def _attempts(task, setting, near):
             filtered = setting.with_filter()
             limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
             setting = filtered
-        elif limits and not found.search.violation(found.point) > 0:
+        elif limits and found.search and found.search.violation(found.point) == 0:
             tightened = TIGHTER * _violation(after, setting) + tightened
         else:
             break

@@ -91,8 +91,9 @@ def _optimality(search, point):
 def _parameters(problem, found, values):
     """Return {name: values before and after, range, sensitivity} of the parameters."""
     own, point = problem.own_values(), found.point
-    whole = point is not None and not found.interrupted
-    change = _sensitivities(problem, point.z) if whole else [None] * len(own)
+    change: list[float | None] = [None] * len(own)
+    if point is not None and not found.interrupted:
+        change = _sensitivities(problem, point.z)
     idle = np.zeros(len(own), dtype=bool) if found.idle is None else found.idle
     rows = {}
     for i, b in enumerate(problem.bounds):
@@ -140,8 +141,10 @@ def _validation(answer, problem):
     if answer.after is None:
         return None, None
     sides, setting = (answer.before, answer.after), answer.setting
-    columns = [np.stack([getattr(s, n) for s in sides], axis=1) for n in ("cost", "held", "level")]
+    cost, held, level = (
+        np.stack([getattr(s, n) for s in sides], axis=1) for n in ("cost", "held", "level")
+    )
     failed = sides[0].failed | sides[1].failed
     spread = {n: getattr(d, "relative", None) for n, d in setting.distributions.items()}
     judged = Problem(setting.case, problem.given["free"], setting.objective, None, ())
-    return summary_of(judged, *columns, failed, spread, True)
+    return summary_of(judged, cost, held, level, failed, spread, True)

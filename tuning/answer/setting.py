@@ -108,8 +108,8 @@ class Setting:
             searched = self.searched.without_safety_filter().with_safety_filter(**given)
         except InputError:
             return self
-        band = np.asarray(searched.loop.safety_filter.band).tolist()
-        rows = searched.safety_design(**given)[1]
+        found, rows = searched.safety_design(**given)
+        band = np.asarray(found.band).tolist()
         return self.replace(searched=searched, filter={"band": band} | given, certificates=rows)
 
     def without_filter(self) -> "Setting":

@@ -200,7 +200,7 @@ class TuningResult(Result):
     >>> result["controller.Kc[0]"].after, result.status  # doctest: +SKIP
     """
 
-    REPORT = "tuning.report.tuning"
+    REPORT = "tuning.report.tuned.report"
 
     case: Any
     tuned: Any

@@ -1,13 +1,14 @@
 """The default answer of `tune` as text and JSON; imported by the report of a tuning result."""
 
 import textwrap
+from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
 from tuning.answer.setting import limited_levels
 from tuning.report.tables import number, table
-from tuning.report.tuning_tables import parts_of as all_parts
+from tuning.report.tuned.tables import parts_of as all_parts
 
 WIDTH = 80
 
@@ -33,7 +34,7 @@ def of_answer(answer, result=None):
     return [*found, _effects(answer)]
 
 
-def json_parts(result):
+def json_parts(result) -> dict[str, Any]:
     """Return {"holds", "feasibility", "answer"} of the JSON, null without a default answer."""
     answer = result.answer
     if answer is None:
@@ -132,9 +133,8 @@ def _able(answer, sides, unit):
     cannot = answer.before.infeasible
     if cannot is None or not cannot.any() or cannot.all():
         return []
-    able = [s.error[~cannot & ~s.failed] if s is not sides[0] else None for s in sides]
-    first = sides[0].error[~cannot & ~sides[0].failed]
-    cells = [number(v.mean() if v.size else np.nan, 3) for v in (first, *able[1:])]
+    able = [s.error[~cannot & ~s.failed] for s in sides]
+    cells = [number(v.mean() if v.size else np.nan, 3) for v in able]
     return [[f"  on those that can follow ({100 * np.mean(~cannot):.0f} %)", *cells]]
 
 

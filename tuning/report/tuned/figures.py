@@ -5,7 +5,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.report.artifacts import run_for_people
 from tuning.report.tables import number, objective_unit
-from tuning.report.tuning_tables import worst_of_scenarios
+from tuning.report.tuned.tables import worst_of_scenarios
 
 
 def result_key(result):

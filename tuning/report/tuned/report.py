@@ -7,11 +7,12 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.loop.trajectory import csv
-from tuning.report import answer, html
+from tuning.report import html
 from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
 from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
-from tuning.report.tuning_figures import CAPTIONS, figures, result_key
-from tuning.report.tuning_tables import parts_of, scenario_rows
+from tuning.report.tuned import answer
+from tuning.report.tuned.figures import CAPTIONS, figures, result_key
+from tuning.report.tuned.tables import parts_of, scenario_rows
 from tuning.search.result import Message
 
 
