@@ -112,7 +112,7 @@ def _parameters(problem, found, values):
 
 
 def _sensitivities(problem, z):
-    """Return the change of the cost [%] for 10 % of each parameter, by the program of the search."""
+    """Return the change of the cost [%] for 10 % of each parameter, compiling nothing."""
     near = diagnostics.neighbours(problem, z)
     filled = np.concatenate([near, np.repeat(near[:1], -len(near) % LINE, axis=0)])
     blocks = [problem.screen(zs)[0] for zs in filled.reshape(-1, LINE, len(z))]

@@ -21,7 +21,7 @@ from jaxtank.loop import step_size
 from jaxtank.plants.faults import faults
 from jaxtank.signals.inflows import pours
 from tuning.cli import main
-from tuning.report import tuning as report
+from tuning.report.tuned import report
 
 ONE = """
 [[tank]]

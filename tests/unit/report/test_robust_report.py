@@ -9,7 +9,7 @@ import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.presets import Scenario
-from tuning.report import tuning as report
+from tuning.report.tuned import report
 from tuning.search.robust import Certificate, certificate_messages
 
 SEARCH = {"starts": 1, "screening": 1, "iterations": 2, "limits": {}}

@@ -33,7 +33,7 @@ SAME = (
 
 
 def told(result):
-    from tuning.report import tuning as report
+    from tuning.report.tuned import report
 
     page = report.json_of(result)
     return json.dumps({k: page[k] for k in SAME}, sort_keys=True)
