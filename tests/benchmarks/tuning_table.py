@@ -24,7 +24,7 @@ from tuning_rows import BOUNDS, ROWS, case_of
 import jaxtank  # noqa: F401  (before jax starts)
 import tuning
 from jaxtank.core.files import write_atomic
-from tuning.search import provenance
+from tuning.problem import provenance
 from tuning.search.result import constraint_rows
 
 HERE = Path(__file__).parent

@@ -13,10 +13,10 @@ from jaxtank import rig as rigs
 from jaxtank.core.files import check_folder
 from jaxtank.core.units import local
 from tuning.identification.confidence import at_search_bounds
+from tuning.problem import provenance
 from tuning.report import artifacts, html, tables
 from tuning.report import figures as pictures
 from tuning.report.identification_figures import CAPTIONS, figures
-from tuning.search import provenance
 
 __all__ = ["figures", "json_of", "lines", "message", "save"]
 

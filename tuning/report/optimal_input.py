@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxtank.core.files import check_folder
+from tuning.problem import provenance
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
 
 NOTE = (
     "a numerical optimum of a problem with more than one, on a grid of inputs, for a run known in"

@@ -112,11 +112,10 @@ def simulate(args):
     import jax
 
     from jaxtank.loop import run, step_size
-    from tuning.problem import reported
+    from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
     from tuning.report import artifacts, tables
     from tuning.report import case as manual
-    from tuning.search import provenance
 
     key = jax.random.key(seed) if noisy(case) else None
     if step_size.step_warnings(case.loop, case.clock):

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
+from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
 from tuning.report.studies.sensitivity_tables import (
@@ -17,7 +18,6 @@ from tuning.report.studies.sensitivity_tables import (
     parts_of,
     table_csv,
 )
-from tuning.search import provenance
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.local import NORMAL_WIDTH
 

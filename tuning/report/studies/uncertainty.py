@@ -9,9 +9,9 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.files import check_folder
 from jaxtank.loop import step_size
+from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
 from tuning.storage.batch_store import remove_batches
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
