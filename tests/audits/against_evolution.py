@@ -113,7 +113,13 @@ def main(words=None):
         print(" | ".join(rows[-1]), flush=True)
         for seed in np.flatnonzero(~agree):
             print(f"  seed {seed}: {ours[seed]:.8g}, {results[seed].status}", flush=True)
-    heads = ["loop", "differential evolution", f"one start, {args.seeds} seeds", "within 0.1 %", "converged"]
+    heads = [
+        "loop",
+        "differential evolution",
+        f"one start, {args.seeds} seeds",
+        "within 0.1 %",
+        "converged",
+    ]
     heads += ["runs (median)"]
     if args.markdown:
         lines = ["|" + "|".join(f" {c} " for c in row) + "|" for row in (heads, *rows)]
