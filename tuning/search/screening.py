@@ -23,7 +23,7 @@ from tuning.problem.scenarios import screening_clock
 FEWEST, MEMBERS = 32, 64
 """Members of a differential evolution, at least and at most: else as many as were screened."""
 
-GENERATIONS, RUNS = 16, 100_000
+GENERATIONS, RUNS = 14, 100_000
 """Its generations, and its coarse runs, at most."""
 
 MUCH = 1e12
