@@ -174,7 +174,7 @@ def windows(loop: ClosedLoop, times: Any) -> Group | None:
     >>> from jaxtank import presets
     >>> case = presets.load("cascaded/pi")
     >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
-    [1, -4.0]
+    [1, 2.0]
     """
     found, reference = loop.reference.windows(times), loop.reference
     band = getattr(reference, "band", None)

@@ -11,7 +11,7 @@ from tuning.problem.problem import ROOT
 from tuning.search.driver import CoarseSearch
 from tuning.search.first_order import adam, lbfgs
 from tuning.search.kkt import LOWER_BY
-from tuning.search.screening import distinct_starts, evolution_size, evolve, sobol
+from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
 
 PROGRESS, PATIENCE = 1e-9, 25
 """Share by which the best cost must fall within PATIENCE evaluations for a search to go on: at a
@@ -278,7 +278,7 @@ def find_feasible(search, screened, iterations, seed):
             slsqp(search, search.best.z, iterations)
             return True
     count, generations = evolution_size(search, screened)
-    more = sobol(count, len(search.best.z), seed + 1)
+    more = sobol(MEMBERS, len(search.best.z), seed + 1)
     order = np.argsort(np.where(np.isfinite(short), short, np.inf), kind="stable")
     members = np.concatenate([search.best.z[None], screened.zs[order[: count // 2]], more])[:count]
     now, _ = evolve(search, members, generations, seed)

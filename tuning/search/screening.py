@@ -20,10 +20,10 @@ from jaxtank.loop.closed_loop import Inputs, initial
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
 
-FEWEST, MEMBERS = 16, 64
+FEWEST, MEMBERS = 32, 64
 """Members of a differential evolution, at least and at most: else as many as were screened."""
 
-GENERATIONS, RUNS = 16, 100_000
+GENERATIONS, RUNS = 14, 100_000
 """Its generations, and its coarse runs, at most."""
 
 MUCH = 1e12

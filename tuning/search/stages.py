@@ -16,6 +16,7 @@ from tuning.search.first_order import minibatches
 from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
 from tuning.search.methods import METHODS, UNCONSTRAINED, approach, find_feasible, slsqp
 from tuning.search.screening import (
+    MEMBERS,
     Population,
     around,
     best_screened,
@@ -34,6 +35,9 @@ AGREE = 1.001
 
 SAME = 1e-9
 """Share of the cost by which two programs that compute it may differ, by rounding [-]."""
+
+FRESH = 2
+"""New Sobol points, as multiples of the members of a differential evolution."""
 
 TRIED = 8
 """Members of a differential evolution of which the first that is no chaotic run is a start."""
@@ -192,20 +196,17 @@ def _lower_neighbour(search, found):
 def _probe(search, found, screened, seed):
     """Return z of a point that may be better than the answer, by differential evolution.
 
-    Half of its members are the best screened points, the others new Sobol points, the answer and
-    points around it. On coarse runs, unless they mislead: then a search decides at the true step.
+    Its members are the answer, points around it, and the best of the screened and of new Sobol
+    points. On coarse runs, unless they mislead: then a search decides at the true step.
     """
     problem, best, mark = search.problem, search.best, search.problem.simulations
     count, generations = evolution_size(search, screened)
-    order = np.argsort(screened.merits(search), kind="stable")
-    members = np.concatenate(
-        [
-            best.z[None],
-            around(best.z, count // 4, seed),
-            screened.zs[order[: count // 2]],
-            sobol(count, len(best.z), seed + 1)[: count - 1],
-        ]
-    )[:count]
+    new = np.split(sobol(FRESH * MEMBERS, len(best.z), seed + 1)[: FRESH * count], FRESH)
+    seen = [screened, *(Population(zs, *problem.screen(zs, coarse=True)) for zs in new)]
+    seen = Population(*(np.concatenate(parts) for parts in zip(*seen)))
+    order = np.argsort(seen.merits(search), kind="stable")
+    near = around(best.z, count // 4, seed)
+    members = np.concatenate([best.z[None], near, seen.zs[order]])[:count]
     now, began = evolve(search, members, generations, seed)
     here = began.merits(search)[0]
     if not np.isclose(here, best.cost, rtol=MISLED) and len(problem.runs) == 1:

@@ -261,13 +261,18 @@ def _why_not_converged(result: TuningResult) -> str:
 
 
 def _no_longer_follows(result: TuningResult) -> Found:
+    forced = any(c.active for c in result.constraints)
+    remedy = (
+        "the active limits force it: loosen them or change the setpoints (--limit, --set)"
+        if forced
+        else "weigh the error in the objective or narrow the ranges (--objective, --free)"
+    )
     for x in result.lost:
         yield Message(
             "no-longer-follows",
             f"output {x.output} no longer follows its setpoint: at the end of a plateau it is"
             f" {x.after:.3g} {x.unit} off ({100 * x.share:.3g} % of the change), {x.before:.3g}"
-            f" {x.unit} before tuning; weigh the error in the objective (--objective"
-            " rms_error_total=1), loosen the limits or narrow the ranges (--limit, --free)",
+            f" {x.unit} before tuning; {remedy}",
         )
 
 
