@@ -20,6 +20,7 @@ from jaxtank.safety.box import band_of, box_of, top_of
 from jaxtank.safety.conditions import failed_condition, gap_of, settle, theorem_of
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.limits import filled_levels, limits_for
+from jaxtank.safety.low_limits import check_low, failed_low
 from jaxtank.safety.setting import Setting
 from jaxtank.safety.worst_case import rates_of
 
@@ -41,7 +42,8 @@ class TankCertificate:
     reason : the condition that failed with both of its numbers, or the theorem.  rate, rate_bound :
     kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
     rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
-    passes [cm]; inf if unknown.
+    passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified, low_reason : of
+    the low limit, as above.
     """
 
     tank: int
@@ -52,6 +54,9 @@ class TankCertificate:
     rate_bound: float
     gap: float
     reach: float
+    low: float = 0.0
+    low_certified: bool = False
+    low_reason: str = ""
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -88,6 +93,9 @@ def design(
     rate: float | None = None,
     substeps: int = 1,
     start: ArrayLike | None = None,
+    low: ArrayLike = 0.0,
+    draw: ArrayLike = 0.0,
+    drawn: bool = False,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -107,6 +115,9 @@ def design(
     substeps : integration steps of a hold
     start : (n,) highest levels at t = 0 [cm]. Without it a certificate holds for starts at or below
         the limits, and no tank counts as one that full pumps cannot fill
+    low : (n,) levels below which no tank may fall [cm]; 0: none
+    draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]
+    drawn : whether volumes may leave besides, at any time (no low limit is then proved)
 
     Raises
     ------
@@ -116,10 +127,10 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (n,))
+    inflow, draw, low = (np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low))
     dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
     setting = Setting(
-        rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps)),
+        rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps, draw)),
         hold=float(hold),
         delay=float(actuator.delay),
         lag=_largest(getattr(actuator, "lag", None)),
@@ -129,6 +140,8 @@ def design(
         top=top_of(sensor, n),
         spare=np.broadcast_to(np.asarray(volume, dtype=float), (n,)) / np.asarray(least.area),
         pulse=_pulses(actuator),
+        dead=getattr(actuator, "dead_zone", None) is not None,
+        drawn=drawn,
     )
     bound = rate_bound(setting.hold, setting.delay, setting.lag)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
@@ -138,7 +151,17 @@ def design(
         raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
     found = _proved(setting, plant, wanted, kappa, bound, start)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
-    rows = tuple(_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n))
+    check_low(low, found.heights, wanted)
+    why, bottom = failed_low(setting, low, found, kappa, start)
+    rows = tuple(
+        dataclasses.replace(
+            _row(setting, nominal, found, i, wanted, kappa, bound),
+            low=float(low[i]),
+            low_certified=bool(low[i] > 0.0 and not why[i]),
+            low_reason=why[i] or ("Low limits" if low[i] > 0.0 else ""),
+        )
+        for i in range(n)
+    )
     return SafetyFilter(
         least=least,
         most=most,
@@ -153,6 +176,10 @@ def design(
         # of a lagged input every older reading is a part: neighbours count with their `reach`
         age=setting.delay if setting.lag == 0.0 else UNKNOWN,
         held=_held(setting, found),
+        low=np.array(low),
+        bottom=bottom,
+        draw=np.array(draw),
+        kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
     ), rows
 
 

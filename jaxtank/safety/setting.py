@@ -24,6 +24,8 @@ class Setting(NamedTuple):
     top: np.ndarray
     spare: np.ndarray
     pulse: bool
+    dead: bool = False  # whether a pump stands still for inputs above 0
+    drawn: bool = False  # whether inflow pulses draw liquid
 
     def phi(self, tank, level, others):
         """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
@@ -44,6 +46,21 @@ def phi(rates: Rates, tank: int, level: float, others: Any) -> float:
     for source, sink, _, most in rates.links:
         if sink == tank:
             rate += most * sqrt_of(max(others[source], 0.0), knee)
+    return rate
+
+
+def phi_min(rates: Rates, tank: int, level: float, others: Any) -> float:
+    """Phi_min(level) [cm/s] in plain numbers; see `worst_case.fall`."""
+    knee, h = rates.knee, max(level, 0.0)
+    rate = rates.draw[tank] - rates.out_most[tank] * sqrt_of(h, knee)
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            z = others[j] - h
+            s = z / (z * z + knee * knee) ** 0.25
+            rate += (0.0 if others[j] < rates.empty[j] else least * s) if s >= 0.0 else most * s
+    for source, sink, least, _ in rates.links:
+        if sink == tank and others[source] >= rates.empty[source]:
+            rate += least * sqrt_of(max(others[source], 0.0), knee)
     return rate
 
 
