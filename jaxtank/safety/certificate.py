@@ -5,6 +5,7 @@ Works on plain numbers, before a run. May be imported by the rig files, the comm
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -127,41 +128,28 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    inflow, draw, low = (np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low))
+    inflow, draw, low, volume = (
+        np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low, volume)
+    )
     dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
+    band = np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,))
     setting = Setting(
         rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps, draw)),
         hold=float(hold),
-        delay=float(actuator.delay),
-        lag=_largest(getattr(actuator, "lag", None)),
-        low=np.asarray(actuator.low, dtype=float),
-        high=np.asarray(actuator.high, dtype=float) - dead,
-        band=np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,)),
+        band=band,
         top=top_of(sensor, n),
-        spare=np.broadcast_to(np.asarray(volume, dtype=float), (n,)) / np.asarray(least.area),
-        pulse=_pulses(actuator),
-        dead=getattr(actuator, "dead_zone", None) is not None,
+        spare=volume / np.asarray(least.area),
         drawn=drawn,
+        **_of_pumps(actuator, dead),
     )
     bound = rate_bound(setting.hold, setting.delay, setting.lag)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
-    wanted = np.broadcast_to(np.asarray(plant.rim if limit is None else limit, dtype=float), (n,))
-    wanted = np.minimum(wanted, setting.top) - setting.spare
-    if np.any(wanted <= 0.0):
-        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
+    wanted = _wanted(setting, plant, limit)
+    check_low(low, wanted, plant.units[0])
     found = _proved(setting, plant, wanted, kappa, bound, start)
-    nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
-    check_low(low, found.heights, wanted)
     why, bottom = failed_low(setting, low, found, kappa, start)
-    rows = tuple(
-        dataclasses.replace(
-            _row(setting, nominal, found, i, wanted, kappa, bound),
-            low=float(low[i]),
-            low_certified=bool(low[i] > 0.0 and not why[i]),
-            low_reason=why[i] or ("Low limits" if low[i] > 0.0 else ""),
-        )
-        for i in range(n)
-    )
+    nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
+    rows = [_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n)]
     return SafetyFilter(
         least=least,
         most=most,
@@ -170,7 +158,7 @@ def design(
         spare=setting.spare,
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
-        band=np.array(setting.band),
+        band=np.array(band),
         inflow=np.array(inflow),
         slope=found.slopes,
         # of a lagged input every older reading is a part: neighbours count with their `reach`
@@ -180,7 +168,29 @@ def design(
         bottom=bottom,
         draw=np.array(draw),
         kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
-    ), rows
+    ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
+
+
+def _wanted(setting, plant, limit):
+    """(n,) limits to keep [cm], before volumes that enter besides."""
+    given = np.asarray(plant.rim if limit is None else limit, dtype=float)
+    wanted = np.minimum(np.broadcast_to(given, setting.top.shape), setting.top) - setting.spare
+    if np.any(wanted <= 0.0):
+        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
+    return wanted
+
+
+def _of_pumps(actuator, dead):
+    """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
+    return {
+        "delay": float(actuator.delay),
+        "lag": _largest(getattr(actuator, "lag", None)),
+        "low": np.asarray(actuator.low, dtype=float),
+        "high": np.asarray(actuator.high, dtype=float) - dead,
+        "pulse": _pulses(actuator),
+        "dead": getattr(actuator, "dead_zone", None) is not None,
+        "before": tuple(np.asarray(actuator.initial, dtype=float) - dead),
+    }
 
 
 class _Proved(NamedTuple):
@@ -231,6 +241,20 @@ def _row(setting, nominal, found, tank, wanted, kappa, bound):
         rate_bound=bound,
         gap=0.0 if idle else gap_of(setting, nominal, tank, kappa, limit, found.reach),
         reach=float(found.reach[tank] + spare),
+    )
+
+
+def _completed(row, low, why, length):
+    """A TankCertificate with its low limit [cm] and why that is not proved; reasons in the rig's
+    unit of length.
+    """
+    own = lambda text: re.sub(r"\bcm\b", length, text)
+    return dataclasses.replace(
+        row,
+        reason=own(row.reason),
+        low=float(low),
+        low_certified=bool(low > 0.0 and not why),
+        low_reason=own(why) or ("Low limits" if low > 0.0 else ""),
     )
 
 

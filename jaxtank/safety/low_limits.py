@@ -12,14 +12,16 @@ INTERVALS = 400
 """Intervals of readings on which floor and cap are compared."""
 
 
-def check_low(low, heights, limits):
-    """Raise InputError for a low limit that is not between 0 and the upper one (n,) [cm]."""
-    for i, value in enumerate(low):
-        top = min(heights[i], limits[i])
+def check_low(low, limits, length):
+    """Raise InputError for a low limit that is not between 0 and the upper one (n,) [cm].
+
+    length : unit of levels of the rig
+    """
+    for i, (value, top) in enumerate(zip(low, limits)):
         if not 0.0 <= value < top:
             raise InputError(
-                f"safety_filter.low[{i}] = {value:g} cm: must be from 0 to below the upper limit of"
-                f" the tank, {top:.6g} cm"
+                f"safety_filter.low[{i}] = {value:g} {length}: must be from 0 to below the upper"
+                f" limit of the tank, {top:.6g} {length}"
             )
 
 
@@ -29,7 +31,10 @@ def failed_low(setting, low, found, kappa, start):
 
     found : limits (n,) `heights` and `reach` [cm], and `slopes` of the second-order rows
     """
-    own = [_own_condition(setting, i, low, kappa, start) if low[i] > 0.0 else "" for i in _all(low)]
+    own = [
+        _own_condition(setting, i, low, found, kappa, start) if low[i] > 0.0 else ""
+        for i in _all(low)
+    ]
     while True:
         bottom = np.array([0.0 if own[i] else low[i] for i in _all(low)])
         reasons = [
@@ -45,8 +50,10 @@ def _all(values):
     return range(len(values))
 
 
-def _own_condition(setting, tank, low, kappa, start):
+def _own_condition(setting, tank, low, found, kappa, start):
     """What fails whatever the other tanks hold, or ""."""
+    if low[tank] >= found.heights[tank]:
+        return f"above the upper limit that can be kept, {found.heights[tank]:.4g} cm"
     if start is not None and np.asarray(start)[tank] < low[tank]:
         return f"start at {np.asarray(start)[tank]:.4g} cm, below the low limit"
     if setting.drawn:

@@ -26,6 +26,7 @@ class Setting(NamedTuple):
     pulse: bool
     dead: bool = False  # whether a pump stands still for inputs above 0
     drawn: bool = False  # whether inflow pulses draw liquid
+    before: tuple = ()  # (m) inputs at which the pumps ran before t = 0, less dead zones [V]
 
     def phi(self, tank, level, others):
         """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
@@ -77,6 +78,12 @@ def unstoppable(setting, tank):
 def full_pumps(setting, tank):
     """What full pumps bring at most [cm/s]."""
     return sum(b * max(setting.high[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def ran_before(setting, tank):
+    """What the pumps bring at most as they ran before t = 0 [cm/s]."""
+    gains = setting.rates.pumps[tank].items()
+    return sum(b * max(setting.before[j], 0.0) for j, (_, b) in gains if j < len(setting.before))
 
 
 def resting_level(setting, tank, others):
