@@ -31,6 +31,9 @@ FASTEST = 2.0
 """Default of kappa at most [1/s]: faster approaches gain less than they move the pumps."""
 SHARE_OF_HOLD = 0.5
 """kappa T of the default; proved up to 1."""
+QUIET = 0.01
+"""Standard deviation of the change of a capped pump's input that noise may cause from sample to
+sample, as a share of its range, at the default."""
 BELOW_BOUND = 0.9
 """Share of the largest rate that is proved, of the default."""
 
@@ -112,7 +115,8 @@ def design(
         lowered by it
     offset : (m,) least input that moves liquid [V]; the pumps' offset dead zone where left out
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
-    rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
+    rate : kappa [1/s]; where it is left out min(2, 0.5/hold, 0.9 of its bound), and with a noisy
+        sensor so small that the noise moves a capped pump by 1 % of its range from sample to sample
     substeps : integration steps of a hold
     start : (n,) highest levels at t = 0 [cm]. Without it a certificate holds for starts at or below
         the limits, and no tank counts as one that full pumps cannot fill
@@ -143,32 +147,41 @@ def design(
         **_of_pumps(actuator, dead),
     )
     bound = rate_bound(setting.hold, setting.delay, setting.lag)
-    kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
     wanted = _wanted(setting, plant, limit)
     check_low(low, wanted, plant.units[0])
-    found = _proved(setting, plant, wanted, kappa, bound, start)
+    prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
+    kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
+    found = prove(kappa)
+    if rate is None and np.any(np.asarray(sensor.noise) > 0.0):
+        kappa = _quiet_rate(setting, sensor, found.heights, kappa)
+        found = prove(kappa)
     why, bottom = failed_low(setting, low, found, kappa, start)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
     rows = [_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n)]
     return SafetyFilter(
         least=least,
         most=most,
-        limit=found.heights,
-        reach=np.minimum(found.reach + setting.spare, UNKNOWN),
-        spare=setting.spare,
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
-        band=np.array(band),
         inflow=np.array(inflow),
-        slope=found.slopes,
-        # of a lagged input every older reading is a part: neighbours count with their `reach`
-        age=setting.delay if setting.lag == 0.0 else UNKNOWN,
-        held=_held(setting, found),
         low=np.array(low),
         bottom=bottom,
         draw=np.array(draw),
         kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
+        **_upper(setting, found),
     ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
+
+
+def _quiet_rate(setting, sensor, heights, kappa):
+    """kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range."""
+    rates, noise, quiet, needed = setting.rates, np.asarray(sensor.noise, dtype=float), kappa, 0.0
+    for i in (i for i, gains in enumerate(rates.pumps) if gains):
+        needed = max(needed, rates.out[i] / math.sqrt(heights[i]))
+        for j, (_, b) in rates.pumps[i].items() if noise[i] > 0.0 else ():
+            # the cap M/b moves by kappa dy/b, and two readings differ by sqrt(2) sigma
+            span = b * (setting.high[j] - max(setting.low[j], 0.0))
+            quiet = min(quiet, QUIET * span / (math.sqrt(2.0) * noise[i]))
+    return float(min(kappa, max(quiet, needed)))
 
 
 def _wanted(setting, plant, limit):
@@ -178,6 +191,20 @@ def _wanted(setting, plant, limit):
     if np.any(wanted <= 0.0):
         raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
     return wanted
+
+
+def _upper(setting, found):
+    """The fields of SafetyFilter that hold the upper limits."""
+    return {
+        "limit": found.heights,
+        "reach": np.minimum(found.reach + setting.spare, UNKNOWN),
+        "spare": setting.spare,
+        "band": np.array(setting.band),
+        "slope": found.slopes,
+        # of a lagged input every older reading is a part: neighbours count with their `reach`
+        "age": setting.delay if setting.lag == 0.0 else UNKNOWN,
+        "held": _held(setting, found),
+    }
 
 
 def _of_pumps(actuator, dead):

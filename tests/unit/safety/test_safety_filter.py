@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from jaxtank import evaluate, presets, with_values
 from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
 from jaxtank.safety import design
 from jaxtank.safety.box import box_of
@@ -186,6 +187,25 @@ def test_inputs_under_way_at_the_start_can_pass_the_limit(delay):
         how = {"delay": delay, "start": np.array([29.0]), "before": before}
         assert passes(plant, pumps, found, 0.0, **how).any() != proved
     assert "4.8 cm/s under way" in row.reason
+
+
+def test_the_default_rate_follows_from_the_noise_of_the_readings():
+    """1 % of the range from sample to sample: 0.01 x 12 V x b_max/(sqrt(2) sigma), by hand; and the
+    spread of the caps of readings at one level is that. Never below c_min/sqrt(H).
+    """
+    plant, actuator = one_tank(drain=0.3)
+    b_max, sigma = 8.8 / 20.0, 0.03
+    rate = lambda noise, **given: design(
+        plant, actuator, LevelSensor(noise=[noise]), 0.1, widths=of(plant, 0.1), band=0.1, **given
+    )
+    assert rate(0.0)[1][0].rate == 2.0 and rate(sigma, rate=1.7)[1][0].rate == 1.7
+    found, (row,) = rate(sigma)
+    assert row.rate == pytest.approx(0.01 * 12.0 * b_max / (math.sqrt(2.0) * sigma), rel=1e-12)
+    y = 29.5 + sigma * np.random.default_rng(0).standard_normal(4000)
+    cap = jax.vmap(lambda y: found.limits((y,), 0.1, (0.0,), (12.0,))[0][0])(y)
+    assert np.std(np.diff(cap)) / 12.0 == pytest.approx(0.01, rel=0.06)
+    slowest = 0.27 * math.sqrt(2 * 981.0) / 20.0 / math.sqrt(30.0)
+    assert rate(100.0)[1][0].rate == pytest.approx(slowest, rel=1e-12)
 
 
 def rate_by_hand(c, area, pumped):
