@@ -119,10 +119,12 @@ def attack(
     varying=False,
     down=False,
     before=0.0,
+    pulses=None,
+    each=False,
 ):
-    """(highest, lowest) levels (n,) [cm] over plants of the box; a third with pumps full (off where
-    `down`), the rest switching at random; inflows at 0 or `inflow` (n,) [cm^3/s]; `before`: inputs
-    (m,) that are under way at the start [V].
+    """(highest, lowest) levels (n,) [cm] over plants of the box, (count, n) where `each`; a third
+    with pumps full (off where `down`), the rest switching at random. Inflows at 0 or `inflow` (n,),
+    or `pulses` (samples, n) [cm^3/s]. `before`: inputs (m,) that are under way at the start [V].
     """
     rng = np.random.default_rng(seed)
     n, m = plant.tanks, plant.pumps
@@ -131,7 +133,7 @@ def attack(
     x = begin(rng, found, start, count)
     turning, dead = np.zeros((count, m)) + before, np.asarray(found.offset)
     line = [turning] * delay
-    highest, lowest, d, h = x.max(0), x.min(0), 0.0, hold / substeps
+    highest, lowest, d, h = x, x, 0.0, hold / substeps
     for k in range(int(seconds / hold)):
         if k % max(1, int(2.0 / hold)) == 0:
             switched = np.where(rng.random((count, m)) < 0.5, low, high)
@@ -139,6 +141,7 @@ def attack(
             want = np.where((np.arange(count) % 3 == 0)[:, None], steady, switched)
             d = np.where(rng.random((count, n)) < 0.5, 0.0, inflow)
             p = corners(rng, plant, count, spread) if varying else p
+        d = d if pulses is None else pulses[k]
         u = filtered(x + eps * rng.choice([-1.0, 1.0], (count, n)), want)
         line.append(np.maximum(u - dead, 0.0))
         u = line.pop(0)
@@ -148,8 +151,8 @@ def attack(
                 v = u + lag / h * (1.0 - math.exp(-h / lag)) * (turning - u)
                 turning = u + (turning - u) * math.exp(-h / lag)
             x = runge_kutta(plant, p, x, v, d, h)
-            highest, lowest = np.maximum(highest, x.max(0)), np.minimum(lowest, x.min(0))
-    return highest, lowest
+            highest, lowest = np.maximum(highest, x), np.minimum(lowest, x)
+    return (highest, lowest) if each else (highest.max(0), lowest.min(0))
 
 
 def random_rig(rng):
