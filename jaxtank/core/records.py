@@ -81,3 +81,4 @@ class Sample(NamedTuple):
     spilled: Sequence[Any]  # overflow over each rim during [t_k, t_k + dt) [cm^3]
     # volume that a negative inflow could not take from each tank in that time [cm^3]
     shortfall: Sequence[Any] = ()
+    filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0

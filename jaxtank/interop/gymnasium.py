@@ -31,7 +31,11 @@ class TankEnv(gymnasium.Env):
     per 100 s). Reward [-]: -mean(e^2)/R^2 - 100 sum(max(h - rim, 0)^2)/R^2, R the highest rim.
     Truncated at the end of the clock; terminated where a level is not finite. info: {"t" [s],
     "x" (n,) levels, "y" (n,) readings, "u" (m,) inputs at the plant, "e" (outputs,) errors,
-    "spilled" (n,) volume that has overflowed each rim [cm^3]} in the rig's units.
+    "spilled" (n,) volume that has overflowed each rim [cm^3], "filtered" 0.0 or 1.0} in the rig's
+    units.
+
+    A safety filter of the case limits each action as it limits the command of a controller, by the
+    readings of the last observation; info["filtered"] is 1.0 where it changed the action.
 
     Pumps (dead zone, lag, delay), plant and its faults, disturbances, rims, sensors (noise, offset,
     ADC) and reference are the case's own: with the inputs of `jaxtank.simulate(case.loop,
@@ -87,7 +91,7 @@ class TankEnv(gymnasium.Env):
         y, self.state = _readings(loop, self.clock, self.inputs, self.state)
         self.y = _array(y)
         self.u = np.asarray(loop.actuator.initial, dtype=float)
-        self.spilled = np.zeros(len(self.x))
+        self.spilled, self.filtered = np.zeros(len(self.x)), 0.0
         return self._observation(), self._info()
 
     def step(self, action):
@@ -96,11 +100,11 @@ class TankEnv(gymnasium.Env):
         wanted = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
             self.high - self.low
         )
-        self.state, y, u, spilled = _advance(
-            loop, self.clock, self.inputs, self.state, tuple(wanted)
+        self.state, y, u, spilled, filtered = _advance(
+            loop, self.clock, self.inputs, self.state, tuple(wanted), tuple(self.y)
         )
         self.x, self.y, self.u = map(_array, (self.state.x, y, u))
-        self.spilled = self.spilled + _array(spilled)
+        self.spilled, self.filtered = self.spilled + _array(spilled), float(filtered)
         self.k = min(self.k + 1, self.clock.samples - 1)
         error = self._error() / self.size
         past = np.maximum(self.x - np.asarray(loop.plant.rim), 0.0) / self.size
@@ -116,7 +120,7 @@ class TankEnv(gymnasium.Env):
 
     def _info(self):
         found = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
-        return {"t": self.k * self.clock.dt, "e": self._error(), **found}
+        return {"t": self.k * self.clock.dt, "e": self._error(), "filtered": self.filtered, **found}
 
 
 def _array(values):
@@ -136,12 +140,18 @@ def _readings(loop, clock, samples, state):
 
 
 @functools.partial(jax.jit, static_argnums=1)
-def _advance(loop, clock, samples, state, wanted):
-    """(state, readings, inputs at the plant, volumes that overflowed) a sample later."""
-    applied = tuple(jnp.asarray(v, dtype=state.x[0].dtype) for v in wanted)
+def _advance(loop, clock, samples, state, wanted, y):
+    """(state, readings, inputs at the plant, volumes that overflowed, 1.0 where the safety filter
+    changed the inputs `wanted`) a sample after the readings `y`.
+    """
+    kind, filtered = state.x[0].dtype, 0.0
+    applied = tuple(jnp.asarray(v, dtype=kind) for v in wanted)
+    if loop.safety_filter is not None:
+        y = tuple(jnp.asarray(v, dtype=kind) for v in y)
+        applied, filtered = loop.safety_filter.apply(loop.actuator, applied, None, y, clock.dt)
     state, u, spilled, _ = move(loop, clock, state, applied, _now(samples, state))
     y, state = _readings(loop, clock, samples, state)
-    return state, y, u, spilled
+    return state, y, u, spilled, filtered
 
 
 def _now(samples, state):

@@ -29,6 +29,7 @@ class Decision(NamedTuple):
     applied: Group  # (m) inputs within them [V]
     observer: Any  # its state after the sample
     controller: Any  # its state after the sample
+    filtered: Any = 0.0  # 1 where the safety filter changed an input, else 0
 
 
 def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[State, Sample]:
@@ -53,6 +54,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
         u=u,
         spilled=spilled,
         shortfall=shortfall,
+        filtered=made.filtered,
     )
     moved = moved._replace(observer=made.observer, controller=made.controller, sensor=sensor)
     return moved, sample
@@ -86,12 +88,12 @@ def decide(
     allocates = loop.actuator.allocates or guard is not None
     metric = loop.controller.input_metric(estimate) if allocates else None
     if guard is None:
-        applied = loop.actuator.limit(command, metric)
+        applied, filtered = loop.actuator.limit(command, metric), 0.0
     else:
-        applied = guard.apply(loop.actuator, command, metric, y, tick.dt)
+        applied, filtered = guard.apply(loop.actuator, command, metric, y, tick.dt)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
-    return Decision(estimate, command, applied, observer, controller)
+    return Decision(estimate, command, applied, observer, controller, filtered)
 
 
 def move(

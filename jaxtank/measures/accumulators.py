@@ -273,6 +273,10 @@ ACCUMULATORS: dict[str, Accumulator] = {
     "estimate2": _sum("tanks", _estimation_error),
     "outside": _sum("pumps", _outside),
     "saturation_excess": _sum("pumps", _saturation_excess),
+    "filtered": Accumulator(
+        lambda run: nothing(run.zero),
+        lambda run, state, sample, context: plus(state, sample.filtered),
+    ),
     "over_rim2": _sum_of_squares("tanks", _over_rim),
     "spilled": _sum("tanks", lambda run, s: s.spilled),
     "shortfall": _sum("tanks", lambda run, s: s.shortfall),

@@ -208,6 +208,16 @@ MEASURES: dict[str, Measure] = {
         shown=100,
         summary=110,
     ),
+    "filter_active_fraction": Measure(
+        "-",
+        "run",
+        ("filtered",),
+        lambda run, acc: acc["filtered"] / run.samples,
+        "share of samples in which the safety filter changed an input",
+        high=1.0,
+        counts=True,
+        unserved="the safety filter is off",
+    ),
     "saturation_excess": Measure(
         "-",
         "run",

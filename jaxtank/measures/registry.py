@@ -208,7 +208,7 @@ def of_loop(loop: Any) -> tuple[str, ...]:
 def serves(name: str, loop: Any) -> bool:
     """Return whether the measure `name` means something for this loop: its reference changes, its
     tanks have inflow pulses, its steady inputs are known in closed form, its levels have a lower
-    clip.
+    clip, it has a safety filter.
     """
     wanted, plant = refers_to([name]), loop.plant
     if "steady" in wanted and (
@@ -216,6 +216,8 @@ def serves(name: str, loop: Any) -> bool:
     ):
         return False
     if "shortfall" in MEASURES[name].needs and not plant.bottom:
+        return False
+    if "filtered" in MEASURES[name].needs and loop.safety_filter is None:
         return False
     return not wanted & _missing(loop)
 

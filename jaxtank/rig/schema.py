@@ -153,6 +153,12 @@ SAFETY_FILTER = (
         "cm",
     ),
     _optional(
+        "low",
+        "(n,) level below which no tank may fall, 0: none; left out: [limits] min_level, else none",
+        "list",
+        "cm",
+    ),
+    _optional(
         "band",
         "(n,) largest difference of reading and level; left out: 6 standard deviations of the"
         " noise, half an ADC step and the offset",

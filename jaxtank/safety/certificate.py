@@ -5,6 +5,7 @@ Works on plain numbers, before a run. May be imported by the rig files, the comm
 
 import dataclasses
 import math
+import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from jaxtank.safety.box import band_of, box_of, top_of
 from jaxtank.safety.conditions import failed_condition, gap_of, settle, theorem_of
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.limits import filled_levels, limits_for
+from jaxtank.safety.low_limits import check_low, failed_low
 from jaxtank.safety.setting import Setting
 from jaxtank.safety.worst_case import rates_of
 
@@ -29,6 +31,9 @@ FASTEST = 2.0
 """Default of kappa at most [1/s]: faster approaches gain less than they move the pumps."""
 SHARE_OF_HOLD = 0.5
 """kappa T of the default; proved up to 1."""
+QUIET = 0.01
+"""Standard deviation of the change of a capped pump's input that noise may cause from sample to
+sample, as a share of its range, at the default."""
 BELOW_BOUND = 0.9
 """Share of the largest rate that is proved, of the default."""
 
@@ -41,7 +46,8 @@ class TankCertificate:
     reason : the condition that failed with both of its numbers, or the theorem.  rate, rate_bound :
     kappa and the largest that is proved [1/s].  gap : how far below the limit the nominal plant
     rests with its pumps full [cm], nan where they cannot reach it.  reach : what the level never
-    passes [cm]; inf if unknown.
+    passes [cm]; inf if unknown.  low : low limit [cm], 0 for none.  low_certified, low_reason : of
+    the low limit, as above.
     """
 
     tank: int
@@ -52,6 +58,9 @@ class TankCertificate:
     rate_bound: float
     gap: float
     reach: float
+    low: float = 0.0
+    low_certified: bool = False
+    low_reason: str = ""
 
 
 def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
@@ -88,6 +97,9 @@ def design(
     rate: float | None = None,
     substeps: int = 1,
     start: ArrayLike | None = None,
+    low: ArrayLike = 0.0,
+    draw: ArrayLike = 0.0,
+    drawn: bool = False,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -103,10 +115,14 @@ def design(
         lowered by it
     offset : (m,) least input that moves liquid [V]; the pumps' offset dead zone where left out
     band : (n,) largest difference of reading and level [cm]; from the sensor where it is left out
-    rate : kappa [1/s]; min(2, 0.5/hold, 0.9 of its bound) where it is left out
+    rate : kappa [1/s]; where it is left out min(2, 0.5/hold, 0.9 of its bound), and with a noisy
+        sensor so small that the noise moves a capped pump by 1 % of its range from sample to sample
     substeps : integration steps of a hold
     start : (n,) highest levels at t = 0 [cm]. Without it a certificate holds for starts at or below
         the limits, and no tank counts as one that full pumps cannot fill
+    low : (n,) levels below which no tank may fall [cm]; 0: none
+    draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]
+    drawn : whether volumes may leave besides, at any time (no low limit is then proved)
 
     Raises
     ------
@@ -116,44 +132,92 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (n,))
+    inflow, draw, low, volume = (
+        np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low, volume)
+    )
     dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
+    band = np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,))
     setting = Setting(
-        rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps)),
+        rates=jax.tree.map(_plain, rates_of(least, most, inflow, hold / substeps, draw)),
         hold=float(hold),
-        delay=float(actuator.delay),
-        lag=_largest(getattr(actuator, "lag", None)),
-        low=np.asarray(actuator.low, dtype=float),
-        high=np.asarray(actuator.high, dtype=float) - dead,
-        band=np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,)),
+        band=band,
         top=top_of(sensor, n),
-        spare=np.broadcast_to(np.asarray(volume, dtype=float), (n,)) / np.asarray(least.area),
-        pulse=_pulses(actuator),
+        spare=volume / np.asarray(least.area),
+        drawn=drawn,
+        **_of_pumps(actuator, dead),
     )
     bound = rate_bound(setting.hold, setting.delay, setting.lag)
+    wanted = _wanted(setting, plant, limit)
+    check_low(low, wanted, plant.units[0])
+    prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
-    wanted = np.broadcast_to(np.asarray(plant.rim if limit is None else limit, dtype=float), (n,))
-    wanted = np.minimum(wanted, setting.top) - setting.spare
-    if np.any(wanted <= 0.0):
-        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
-    found = _proved(setting, plant, wanted, kappa, bound, start)
+    found = prove(kappa)
+    if rate is None and np.any(np.asarray(sensor.noise) > 0.0):
+        kappa = _quiet_rate(setting, sensor, found.heights, kappa)
+        found = prove(kappa)
+    why, bottom = failed_low(setting, low, found, kappa, start)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
-    rows = tuple(_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n))
+    rows = [_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n)]
     return SafetyFilter(
         least=least,
         most=most,
-        limit=found.heights,
-        reach=np.minimum(found.reach + setting.spare, UNKNOWN),
-        spare=setting.spare,
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
-        band=np.array(setting.band),
         inflow=np.array(inflow),
-        slope=found.slopes,
+        low=np.array(low),
+        bottom=bottom,
+        draw=np.array(draw),
+        kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
+        **_upper(setting, found),
+    ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
+
+
+def _quiet_rate(setting, sensor, heights, kappa):
+    """kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range."""
+    rates, noise, quiet, needed = setting.rates, np.asarray(sensor.noise, dtype=float), kappa, 0.0
+    for i in (i for i, gains in enumerate(rates.pumps) if gains):
+        needed = max(needed, rates.out[i] / math.sqrt(heights[i]))
+        for j, (_, b) in rates.pumps[i].items() if noise[i] > 0.0 else ():
+            # the cap M/b moves by kappa dy/b, and two readings differ by sqrt(2) sigma
+            span = b * (setting.high[j] - max(setting.low[j], 0.0))
+            quiet = min(quiet, QUIET * span / (math.sqrt(2.0) * noise[i]))
+    return float(min(kappa, max(quiet, needed)))
+
+
+def _wanted(setting, plant, limit):
+    """(n,) limits to keep [cm], before volumes that enter besides."""
+    given = np.asarray(plant.rim if limit is None else limit, dtype=float)
+    wanted = np.minimum(np.broadcast_to(given, setting.top.shape), setting.top) - setting.spare
+    if np.any(wanted <= 0.0):
+        raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
+    return wanted
+
+
+def _upper(setting, found):
+    """The fields of SafetyFilter that hold the upper limits."""
+    return {
+        "limit": found.heights,
+        "reach": np.minimum(found.reach + setting.spare, UNKNOWN),
+        "spare": setting.spare,
+        "band": np.array(setting.band),
+        "slope": found.slopes,
         # of a lagged input every older reading is a part: neighbours count with their `reach`
-        age=setting.delay if setting.lag == 0.0 else UNKNOWN,
-        held=_held(setting, found),
-    ), rows
+        "age": setting.delay if setting.lag == 0.0 else UNKNOWN,
+        "held": _held(setting, found),
+    }
+
+
+def _of_pumps(actuator, dead):
+    """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
+    return {
+        "delay": float(actuator.delay),
+        "lag": _largest(getattr(actuator, "lag", None)),
+        "low": np.asarray(actuator.low, dtype=float),
+        "high": np.asarray(actuator.high, dtype=float) - dead,
+        "pulse": _pulses(actuator),
+        "dead": getattr(actuator, "dead_zone", None) is not None,
+        "before": tuple(np.asarray(actuator.initial, dtype=float) - dead),
+    }
 
 
 class _Proved(NamedTuple):
@@ -204,6 +268,20 @@ def _row(setting, nominal, found, tank, wanted, kappa, bound):
         rate_bound=bound,
         gap=0.0 if idle else gap_of(setting, nominal, tank, kappa, limit, found.reach),
         reach=float(found.reach[tank] + spare),
+    )
+
+
+def _completed(row, low, why, length):
+    """A TankCertificate with its low limit [cm] and why that is not proved; reasons in the rig's
+    unit of length.
+    """
+    own = lambda text: re.sub(r"\bcm\b", length, text)
+    return dataclasses.replace(
+        row,
+        reason=own(row.reason),
+        low=float(low),
+        low_certified=bool(low > 0.0 and not why),
+        low_reason=own(why) or ("Low limits" if low > 0.0 else ""),
     )
 
 

@@ -12,6 +12,7 @@ from jaxtank.safety.setting import (
     full_pumps,
     highest_level,
     phi,
+    ran_before,
     resting_level,
     sqrt_of,
     unstoppable,
@@ -52,7 +53,20 @@ def failed_condition(setting, tank, heights, slopes, idle, kappa, bound, start):
         filled = brought * (2.0 * setting.lag + setting.delay + setting.hold)
         if filled > 0.75 * heights[tank]:
             return f"(F) {filled:.3g} cm may be filled within the lag: above 3/4 of the limit"
-    return ""
+    return "" if start is None else _under_way(setting, tank, heights, kappa, np.asarray(start))
+
+
+def _under_way(setting, tank, heights, kappa, start):
+    """Why (S) fails, the inputs under way obey the row of the levels `start`, or ""."""
+    age, others = setting.delay + setting.hold, np.array(heights)
+    for k in range(len(heights)) if setting.lag == 0.0 else ():
+        fastest = full_pumps(setting, k) + max(setting.phi(k, 0.0, heights), 0.0)
+        others[k] = min(heights[k], start[k] + age * fastest)
+    brought = ran_before(setting, tank)
+    allowed = kappa * (heights[tank] - start[tank]) - setting.phi(tank, start[tank], others)
+    if brought <= allowed * (1.0 + 1e-9):
+        return ""
+    return f"(S) start: {brought:.3g} cm/s under way, {max(allowed, 0.0):.3g} allowed"
 
 
 def _too_high_above(setting, tank, heights, slopes, start):

@@ -4,6 +4,8 @@ A robust sampled-data control barrier function in closed form (a "safety filter"
 conditions: README.md of this folder; what is proved for a rig: `certificate.design`.
 """
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +17,7 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.instruments.actuators import allocate
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.safety.floors import floor_rows, floors_of, raised
 from jaxtank.safety.worst_case import rates_of, rise
 
 FLOOR = 0.05
@@ -33,6 +36,8 @@ class SafetyFilter:
     without a pump whose inflow alone can pass its limit is held by a row on the pumps of the tanks
     above it (`slope` > 0; second order, see `_row_above`). u = 0 serves every row, and lowering an
     input never breaks one.
+
+    Low limits (`low`, tanks `kept`) raise the inputs instead, as far as the caps allow (`floors`).
     """
 
     least: TankNetwork
@@ -64,7 +69,25 @@ class SafetyFilter:
         "(m,) least input that moves liquid, of pumps with an offset dead zone",
         default=lambda own: np.zeros(own["least"].pumps),
     )
+    low: np.ndarray = leaf(
+        "cm",
+        "(n,) level below which no tank may fall; 0: none",
+        low=0.0,
+        default=lambda own: np.zeros(np.shape(own["limit"])),
+    )
+    bottom: np.ndarray = leaf(
+        "cm",
+        "(n,) level below which no tank falls for certain",
+        low=0.0,
+        default=lambda own: np.zeros(np.shape(own["limit"])),
+    )
+    draw: np.ndarray = leaf(
+        "cm^3/s",
+        "(n,) least inflow disturbance, 0 or negative",
+        default=lambda own: np.zeros(np.shape(own["limit"])),
+    )
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
+    kept: tuple = static(doc="tanks whose low limits are kept, counted from 0", default=())
     allocate: bool = static(
         doc="give the other of two pumps what serves the outputs best where one meets its cap",
         choices=(False, True),
@@ -78,8 +101,9 @@ class SafetyFilter:
         metric: tuple[Any, ...] | None,
         y: Sequence[Any],
         hold: Any,
-    ) -> tuple[Any, ...]:
-        """Return the (m) inputs within the pumps' limits and the caps [V] for a command (m) [V].
+    ) -> tuple[tuple[Any, ...], Any]:
+        """Return ((m) inputs within the pumps' limits, the caps and the floors [V] for a command
+        (m) [V], 1.0 where a cap or a floor changed the command, else 0.0).
 
         Parameters
         ----------
@@ -94,15 +118,23 @@ class SafetyFilter:
         low, dead = [actuator.low[j] for j in pumps], [self.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
         caps, shared = self.limits(y, hold, low, high)
-        caps = tuple(cap + zone for cap, zone in zip(caps, dead))
+        floors, together = self.floors(y, hold, low, caps)
+        least = tuple(low)
+        if self.kept:
+            least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(floors, low, dead))
+        most = tuple(cap + zone for cap, zone in zip(caps, dead))
         if self.allocate and actuator.pumps == 2:
-            u = allocate(command, metric or self._metric(y), actuator.low, caps)
+            u = allocate(command, metric or self._metric(y), least, most)
         else:
-            u = tuple(clip(command[j], low[j], caps[j]) for j in pumps)
-        if not shared:
-            return u
+            u = tuple(clip(command[j], least[j], most[j]) for j in pumps)
+        free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
+        acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
+        if not shared and not together:
+            return u, jnp.where(acts, 1.0, 0.0)
         moving = tuple(v - zone for v, zone in zip(u, dead))
-        return tuple(v + zone for v, zone in zip(self.scaled(moving, shared), dead))
+        held = self.scaled(raised(moving, together, caps), shared)
+        acts = acts | _any(a != b for a, b in zip(held, moving))
+        return tuple(v + zone for v, zone in zip(held, dead)), jnp.where(acts, 1.0, 0.0)
 
     def _metric(self, y):
         """(g11, g12, g22) of G = J'J, J_oj the effect of pump j on output o: on its rate, or on its
@@ -199,6 +231,15 @@ class SafetyFilter:
                 shared.append((row, m))
         return tuple(caps), shared
 
+    def floors(self, y: Sequence, hold: Any, low: Sequence, caps: Sequence) -> tuple:
+        """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b}, f)]
+        of tanks with two pumps or more: sum b u >= f [cm/s]) that keep the low limits.
+        """
+        if not self.kept:
+            return tuple(low), []
+        r = rates_of(self.least, self.most, self.inflow, hold, self.draw)
+        return floors_of(r, floor_rows(self, r, y, hold, low), low, caps)
+
     def scaled(self, u: Sequence, shared: list) -> tuple:
         """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion."""
         u = list(u)
@@ -208,3 +249,8 @@ class SafetyFilter:
             for j in row:
                 u[j] = jnp.where(u[j] > 0.0, u[j] * share, u[j])
         return tuple(u)
+
+
+def _any(flags):
+    """Whether one of the flags is set."""
+    return functools.reduce(operator.or_, flags)

@@ -32,6 +32,7 @@ def design_for(
     limit: ArrayLike | None = None,
     band: ArrayLike | None = None,
     rate: float | None = None,
+    low: ArrayLike | None = None,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a case, and the certificate of each tank.
 
@@ -44,6 +45,8 @@ def design_for(
     band : (n,) largest difference of reading and level [cm]; left out: 6 standard deviations of the
         noise, half an ADC step and the offset
     rate : kappa, how fast a level may approach its limit [1/s]
+    low : (n,) levels below which no tank may fall [cm], 0: none; left out: the limit on min_level,
+        else none
 
     Returns
     -------
@@ -65,6 +68,7 @@ def design_for(
     if not isinstance(loop.plant, TankNetwork) or not isinstance(loop.sensor, LevelSensor):
         raise InputError("safety_filter: needs a TankNetwork as the plant and a LevelSensor")
     inflow, volume = _disturbances(loop, case.clock)
+    draw, drawn = _withdrawn(loop, case.clock)
     share = max((s for n, s in case.uncertain.items() if n == "actuator.dead_zone"), default=0.0)
     return design(
         loop.plant,
@@ -80,6 +84,9 @@ def design_for(
         rate=rate,
         substeps=case.clock.substeps,
         start=loop.x0,
+        low=case.limits.get("min_level", 0.0) if low is None else low,
+        draw=draw,
+        drawn=drawn,
     )
 
 
@@ -114,3 +121,14 @@ def _disturbances(loop, clock):
         return none, volume
     flows = loop.disturbance.sample(clock)[0]
     return np.array([max(float(np.max(flow)), 0.0) for flow in flows]), none
+
+
+def _withdrawn(loop, clock):
+    """((n,) least inflow, 0 or negative [cm^3/s], whether inflow pulses draw liquid)."""
+    none = np.zeros(loop.plant.tanks)
+    if loop.disturbance is None:
+        return none, False
+    if isinstance(loop.disturbance, InflowPulses):
+        return none, bool(np.any(np.asarray(loop.disturbance.volume) < 0.0))
+    flows = loop.disturbance.sample(clock)[0]
+    return np.array([min(float(np.min(flow)), 0.0) for flow in flows]), False

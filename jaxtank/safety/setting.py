@@ -24,6 +24,9 @@ class Setting(NamedTuple):
     top: np.ndarray
     spare: np.ndarray
     pulse: bool
+    dead: bool = False  # whether a pump stands still for inputs above 0
+    drawn: bool = False  # whether inflow pulses draw liquid
+    before: tuple = ()  # (m) inputs at which the pumps ran before t = 0, less dead zones [V]
 
     def phi(self, tank, level, others):
         """Phi_max(level) [cm/s]; others: limits of all tanks, before volumes that enter besides."""
@@ -47,6 +50,21 @@ def phi(rates: Rates, tank: int, level: float, others: Any) -> float:
     return rate
 
 
+def phi_min(rates: Rates, tank: int, level: float, others: Any) -> float:
+    """Phi_min(level) [cm/s] in plain numbers; see `worst_case.fall`."""
+    knee, h = rates.knee, max(level, 0.0)
+    rate = rates.draw[tank] - rates.out_most[tank] * sqrt_of(h, knee)
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            z = others[j] - h
+            s = z / (z * z + knee * knee) ** 0.25
+            rate += (0.0 if others[j] < rates.empty[j] else least * s) if s >= 0.0 else most * s
+    for source, sink, least, _ in rates.links:
+        if sink == tank and others[source] >= rates.empty[source]:
+            rate += least * sqrt_of(max(others[source], 0.0), knee)
+    return rate
+
+
 def sqrt_of(h, knee):
     """The root of the plant's flows (`numerics.root`) of a level h >= 0 in plain numbers."""
     return math.sqrt(h) if h >= knee else math.sqrt(knee) * (1.5 * h / knee - 0.5 * (h / knee) ** 2)
@@ -60,6 +78,12 @@ def unstoppable(setting, tank):
 def full_pumps(setting, tank):
     """What full pumps bring at most [cm/s]."""
     return sum(b * max(setting.high[j], 0.0) for j, (_, b) in setting.rates.pumps[tank].items())
+
+
+def ran_before(setting, tank):
+    """What the pumps bring at most as they ran before t = 0 [cm/s]."""
+    gains = setting.rates.pumps[tank].items()
+    return sum(b * max(setting.before[j], 0.0) for j, (_, b) in gains if j < len(setting.before))
 
 
 def resting_level(setting, tank, others):

@@ -18,7 +18,8 @@ class Rates(NamedTuple):
     [cm^0.5/s].  `links` : [(source, sink, least, largest)] per orifice between tanks.  `pipes` :
     [(tank, other, least, largest)], each pipe once from either end.  `pumps` : (n) {pump: (least,
     largest)} [cm/(s V)].  `inflow` : (n) largest inflow disturbance [cm/s].  `knee` : laminar
-    threshold [cm].  `empty` : (n) level below which outflow counts as nothing [cm].
+    threshold [cm].  `empty` : (n) level below which outflow counts as nothing [cm].  `draw` : (n)
+    least inflow disturbance, 0 or negative [cm/s].
     """
 
     out: tuple
@@ -29,9 +30,12 @@ class Rates(NamedTuple):
     inflow: tuple
     knee: float
     empty: tuple
+    draw: tuple
 
 
-def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> Rates:
+def rates_of(
+    least: TankNetwork, most: TankNetwork, inflow: Any, step: Any, draw: Any = None
+) -> Rates:
     """Return the Rates of all plants whose parameters lie between those of two networks.
 
     Parameters
@@ -40,6 +44,7 @@ def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> R
         Lower and upper end of every parameter; the topology is that of `least`.
     inflow : (n,) largest inflow disturbance into each tank [cm^3/s]
     step : longest integration step [s], for plants with `bottom`
+    draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]; 0 where left out
     """
     n = least.tanks
     slow, fast = jnp.sqrt(2.0 * least.gravity), jnp.sqrt(2.0 * most.gravity)
@@ -71,6 +76,7 @@ def rates_of(least: TankNetwork, most: TankNetwork, inflow: Any, step: Any) -> R
         inflow=tuple(inflow[i] / least.area[i] for i in range(n)),
         knee=least.knee,
         empty=tuple(empty),
+        draw=tuple(0.0 if draw is None else draw[i] / least.area[i] for i in range(n)),
     )
 
 
@@ -132,4 +138,29 @@ def _inflows_only(rates, tank, h, others):
     for i, j, _, most in rates.pipes:
         if i == tank:
             rate = rate + most * lower_clip(smooth_signed_sqrt(others[j] - h, rates.knee), 0.0)
+    return rate
+
+
+def fall(rates: Rates, tank: int, level: Any, others: Any) -> Any:
+    """Return Phi_min [cm/s]: the least rate of a tank's level when its pumps stand still.
+
+        Phi_min(h) = -c_max s(h) + sum_in c_min s(h_k) + sum_pipes P(h_k - h) + d_min,
+        P(z) = p_min s(z) for z >= 0, p_max s(z) for z < 0
+
+    Parameters
+    ----------
+    level : (...) the most the level may be [cm]; Phi_min never rises with it
+    others : (n) the least the other levels may be [cm]
+    """
+    h = lower_clip(level, 0.0)
+    rate = rates.draw[tank] - rates.out_most[tank] * smooth_sqrt(h, rates.knee)
+    flow = lambda source, value: jnp.where(others[source] < rates.empty[source], 0.0, value)
+    for i, j, least, most in rates.pipes:
+        if i == tank:
+            s = smooth_signed_sqrt(others[j] - h, rates.knee)
+            rate = rate + jnp.where(s >= 0.0, flow(j, least * s), most * s)
+    for source, sink, least, _ in rates.links:
+        if sink == tank:
+            entering = least * smooth_sqrt(lower_clip(others[source], 0.0), rates.knee)
+            rate = rate + flow(source, entering)
     return rate

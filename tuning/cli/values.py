@@ -77,10 +77,15 @@ def _not_proved(case):
     if case.loop.safety_filter is None:
         return []
     rows = case.safety_design(**case.safety)[1]
-    return [
+    found = [
         f"safety filter: the limit of tank {row.tank + 1} is not proved: {row.reason}"
         for row in rows
         if not row.certified
+    ]
+    return found + [
+        f"safety filter: the low limit of tank {row.tank + 1} is not proved: {row.low_reason}"
+        for row in rows
+        if row.low > 0.0 and not row.low_certified
     ]
 
 

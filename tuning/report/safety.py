@@ -9,9 +9,9 @@ from tuning.report import tables
 
 
 def certificates(case):
-    """Return [{"tank", "limit", "certified", "why", "rate", "rate_bound", "gap", "reach"}], one for
-    each tank, of the safety filter that the case has or could have; tanks from 1; None where there
-    is no filter for its plant.
+    """Return [{"tank", "limit", "certified", "why", "rate", "rate_bound", "gap", "reach", "low"}],
+    one for each tank, of the safety filter that the case has or could have; tanks from 1; None
+    where there is no filter for its plant. low: {"limit", "certified", "why"}, None without one.
 
     Examples
     --------
@@ -33,6 +33,9 @@ def certificates(case):
             "rate_bound": row.rate_bound,
             "gap": tables.clean(row.gap),
             "reach": tables.clean(row.reach),
+            "low": {"limit": row.low, "certified": row.low_certified, "why": row.low_reason}
+            if row.low > 0.0
+            else None,
         }
         for row in rows
     ]
@@ -54,6 +57,19 @@ def rows_of(case, found):
             row["why"],
         ]
         for row in found
+    ]
+    rows += [
+        [
+            row["tank"],
+            f"low {low['limit']:.4g}",
+            "yes" if low["certified"] else "no",
+            f"{row['rate']:.3g}",
+            "-",
+            "-",
+            low["why"],
+        ]
+        for row in found
+        if (low := row["low"])
     ]
     return heads, rows
 

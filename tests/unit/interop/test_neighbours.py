@@ -10,8 +10,10 @@ import pytest
 
 import jaxtank
 from jaxtank import presets, rig
+from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.interop import python_control
+from jaxtank.signals.base import Constant
 
 
 def test_python_control_sees_the_linearised_rig():
@@ -212,6 +214,30 @@ def test_an_episode_is_the_run_of_the_rig(name, change):
         assert run.spilled.max() > 0.0
     if change is pumps_and_sensors:
         assert np.abs(run.y - run.x).max() > 0.01 * size
+
+
+def test_a_safety_filter_limits_the_actions_as_the_inputs_of_a_controller():
+    """Pumps of gouta2015 at full by actions, and by an open-loop controller: the same run."""
+    pytest.importorskip("gymnasium")
+    from jaxtank.interop.gymnasium import TankEnv
+
+    case = rig.set_values(
+        presets.find("gouta2015/ngpc"),
+        {"clock.dt": 0.5, "clock.duration": 90.0, "sensor.noise": 0.05},
+    ).with_safety_filter()
+    full = OpenLoop(signal=Constant(level=[12.0, 11.0]))
+    loop = dataclasses.replace(case.loop, controller=full)
+    key = jax.random.key(3)
+    run = jax.tree.map(np.asarray, jaxtank.simulate(loop, case.clock, key))
+    env, rows = TankEnv(case), []
+    env.reset(seed=3)
+    for _ in range(case.clock.samples - 1):
+        rows.append(env.step([1.0, 2.0 * 11.0 / 12.0 - 1.0])[-1])
+    np.testing.assert_allclose([row["x"] for row in rows], run.x[1:], atol=1e-9)
+    np.testing.assert_allclose([row["u"] for row in rows], run.u[:-1], atol=1e-9)
+    acts = np.any(run.applied != [12.0, 11.0], axis=1)[:-1]
+    assert 0.1 < acts.mean() < 1.0 and [row["filtered"] for row in rows] == acts.tolist()
+    assert run.x.max() < 30.0
 
 
 def test_noise_of_the_environment_follows_its_seed():

@@ -34,6 +34,7 @@ def test_simulate_says_that_the_filter_is_on():
     for words, on in (([], False), (["--safety-filter"], True)):
         code, out, _ = command("simulate", "cascaded/pi", *words)
         assert code == 0 and ("The safety filter is on" in out) == on
+        assert ("filter_active_fraction" in out) == on
 
 
 def test_a_rig_file_turns_the_filter_on_and_an_option_turns_it_off(tmp_path):
