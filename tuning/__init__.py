@@ -13,6 +13,8 @@ import importlib
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
 TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
+    from tuning.falsification.result import Attack as Attack
+    from tuning.falsification.study import attack as attack
     from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "Adam": "tuning.search.options",
+    "Attack": "tuning.falsification.result",
     "Bound": "tuning.problem.bounds",
     "LBFGS": "tuning.search.options",
     "SQP": "tuning.search.options",
@@ -69,6 +72,7 @@ _NAMES = {
     "LogUniform": "tuning.uncertainty.distributions",
     "Normal": "tuning.uncertainty.distributions",
     "Uniform": "tuning.uncertainty.distributions",
+    "attack": "tuning.falsification.study",
     "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",
