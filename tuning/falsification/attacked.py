@@ -310,7 +310,8 @@ def programs(attacked: Attacked) -> tuple[Any, Any]:
     ((level of each one's tank, Levels), its slopes by the variables).
     """
     slopes = jax.value_and_grad(attacked.objective, has_aux=True)
-    return tuple(jax.jit(jax.vmap(f), compiler_options=WIDE) for f in (attacked.levels, slopes))
+    run = jax.jit(jax.vmap(attacked.levels), compiler_options=WIDE)
+    return run, jax.jit(jax.vmap(slopes), compiler_options=WIDE)
 
 
 def batch_size(attacked: Attacked, runs: int) -> int:

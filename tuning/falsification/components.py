@@ -34,7 +34,7 @@ class GivenErrors(Sensor):
     3.1
     """
 
-    error: np.ndarray = leaf("cm", "error of each tank's reading at each sample")
+    error: Any = leaf("cm", "error of each tank's reading at each sample")
     top: tuple = static("cm", "(n,) highest level that can be read, None without an ADC")
 
     def draw(
@@ -65,8 +65,8 @@ class PumpPlan(Controller):
     [0.0, 0.0, 12.0, 12.0]
     """
 
-    command: np.ndarray = leaf("V", "command of each window and pump")
-    length: np.ndarray = leaf("s", "length of a window", low=0.0, strict=True)
+    command: Any = leaf("V", "command of each window and pump")
+    length: Any = leaf("s", "length of a window", low=0.0, strict=True)
 
     @pointwise
     def inputs(self, clock: Clock) -> Any:
@@ -95,8 +95,8 @@ class Course:
     [0.1, 0.1, 0.2, 0.2]
     """
 
-    value: np.ndarray = leaf("-", "value of each entry in each window, in its own unit")
-    length: np.ndarray = leaf("s", "length of a window", low=0.0, strict=True)
+    value: Any = leaf("-", "value of each entry in each window, in its own unit")
+    length: Any = leaf("s", "length of a window", low=0.0, strict=True)
     names: tuple[str, ...] = static(doc="entries of the plant, as drain[1]")
     then: Faults | None = None
 

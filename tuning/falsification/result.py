@@ -80,7 +80,7 @@ class Attack(Result):
         [s].
     """
 
-    REPORT = "tuning.report.falsification"
+    REPORT = "tuning.report.studies.falsification"
 
     attacked: Attacked
     found: tuple[Found, ...]
@@ -132,7 +132,7 @@ class Attack(Result):
         case, values = self.case, one.values
         if self.attacked.pumps != "own":
             case = self.attacked.original
-        loop = case.loop
+        loop: Any = case.loop
         constant = zip(self.attacked.coefficients, _rows(one))
         loop = with_values(loop, {c.name: v[0] for c, v in constant if not of_plant(c)})
         changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(one)}

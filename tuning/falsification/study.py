@@ -95,17 +95,8 @@ def attack(
     [0, 1]
     """
     began = time.perf_counter()
-    for name, value, low, high in (
-        ("starts", starts, 1, 10**4),
-        ("iterations", iterations, 0, 10**4),
-        ("seed", seed, 0, 2**31 - 1),
-        ("windows", windows, 1, 1000),
-        ("draws", draws, 1, 10**6),
-    ):
-        check_whole(name, value, low, high)
-    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
-        if value not in allowed:
-            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
+    counts = {"starts": starts, "iterations": iterations, "windows": windows, "draws": draws}
+    _check_arguments({**counts, "seed": seed}, pumps, start)
     check(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
     limits = limits_of(case)
     attacked = Attacked(
@@ -119,9 +110,32 @@ def attack(
     )
     search = _Search(attacked, draws, starts, iterations, seed, progress)
     drawn, levels = search.screen()
-    values, highest, times, history = search.climb(drawn, levels)
-    rises = _rises(case, np.maximum(limits.limit, highest))
-    rows = tuple(
+    climbed = search.climb(drawn, levels)
+    return Attack(
+        attacked=attacked,
+        found=_found(case, limits, levels, climbed),
+        history=climbed.history,
+        starts=starts,
+        draws=draws,
+        seed=seed,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def _check_arguments(counts, pumps, start):
+    """Raise InputError for a number or a word that is none of those allowed."""
+    for name, value in counts.items():
+        low = 0 if name in ("seed", "iterations") else 1
+        check_whole(name, value, low, 2**31 - 1 if name == "seed" else 10**6)
+    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
+        if value not in allowed:
+            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
+
+
+def _found(case, limits, levels, climbed):
+    """The Found of each tank. levels: (draws + 1, n), first those of the case as it is."""
+    rises = _rises(case, np.maximum(limits.limit, climbed.level))
+    return tuple(
         Found(
             tank=i,
             limit=float(limits.limit[i]),
@@ -129,21 +143,12 @@ def attack(
             reason="" if limits.rows is None else limits.rows[i].reason,
             nominal=float(levels[0, i]),
             drawn=float(levels[1:, i].max()),
-            level=float(highest[i]),
-            time_s=float(times[i]),
+            level=float(climbed.level[i]),
+            time_s=float(climbed.time[i]),
             rise=float(rises[i]),
-            values=values[i],
+            values=climbed.values[i],
         )
         for i in range(case.loop.plant.tanks)
-    )
-    return Attack(
-        attacked=attacked,
-        found=rows,
-        history=history,
-        starts=starts,
-        draws=draws,
-        seed=seed,
-        wall_s=time.perf_counter() - began,
     )
 
 
@@ -198,6 +203,16 @@ def _rises(case, reach):
     return np.array(found)
 
 
+class _Climbed(NamedTuple):
+    """The highest run of each tank: its values, level and time; highest level of each tank by step
+    of the ascent (steps + 1, n)."""
+
+    values: list[dict[str, np.ndarray]]
+    level: np.ndarray
+    time: np.ndarray
+    history: np.ndarray
+
+
 class _Search:
     """Draws and ascents of one attack, in batches of one size each."""
 
@@ -233,7 +248,7 @@ class _Search:
         return drawn, levels
 
     def climb(self, drawn, levels):
-        """([values of the worst run] of each tank, its level (n,) and time (n,), history)."""
+        """Return the _Climbed of ascents from the best of the draws."""
         starts, n = min(self.starts, self.draws), self.tanks
         order = np.argsort(-levels[1:], axis=0, kind="stable")[:starts].T  # (n, starts)
         z = {k: v[order.ravel()] for k, v in drawn.items()}
@@ -248,7 +263,8 @@ class _Search:
         chosen = [{k: v[own[i]] for k, v in values.items()} for i in range(n)]
         self.report(self.total)
         at = (own, np.arange(n))
-        return chosen, found[at], times[at], history.reshape(-1, n, starts).max(axis=2)
+        history = history.reshape(-1, n, starts).max(axis=2)
+        return _Climbed(chosen, found[at], times[at], history)
 
     def _stepped(self, done):
         self.report(done + 2)
