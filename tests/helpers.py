@@ -39,7 +39,7 @@ RANKS = [
     "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
     "tuning.problem tuning.storage",
     "tuning.uncertainty tuning.identification tuning.optimal_input",
-    "tuning.search",
+    "tuning.search tuning.falsification",
     "tuning.answer",
     "tuning.report",
     "tuning.bench",

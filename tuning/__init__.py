@@ -15,6 +15,8 @@ TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --he
 if TYPE_CHECKING:
     from tuning.answer.answer import Answer as Answer
     from tuning.answer.default import tune as tune
+    from tuning.falsification.result import Attack as Attack
+    from tuning.falsification.study import attack as attack
     from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "Adam": "tuning.search.options",
+    "Attack": "tuning.falsification.result",
     "Bound": "tuning.problem.bounds",
     "LBFGS": "tuning.search.options",
     "SQP": "tuning.search.options",
@@ -70,6 +73,7 @@ _NAMES = {
     "LogUniform": "tuning.uncertainty.distributions",
     "Normal": "tuning.uncertainty.distributions",
     "Uniform": "tuning.uncertainty.distributions",
+    "attack": "tuning.falsification.study",
     "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",

@@ -15,6 +15,7 @@ from tuning.cli.parser import parser
 
 COMMANDS = {
     *("list", "show", "simulate", "tune", "uncertainty", "merge", "sensitivity", "identify"),
+    "attack",
     *("init", "export", "compare", "completion", "bench"),
 }
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}

@@ -19,7 +19,7 @@ NAMED = {presets: ("load", "find", "names"), rig: ("load", "dump", "register", "
 SECTIONS = {"Parameters", "Returns", "Examples"}
 # Objects that functions return: the example is that of the function.
 RESULTS = {
-    *("Trajectory", "Bound", "Certificate", "Ensemble", "Estimation", "Identification"),
+    *("Attack", "Trajectory", "Bound", "Certificate", "Ensemble", "Estimation", "Identification"),
     *("Identifications", "Log", "ParameterChange", "TuningResult"),
 }
 

@@ -40,6 +40,8 @@ FEW = {
     ("sensitivity", "--method"): ("local", "morris", "sobol"),
     ("uncertainty", "--draws"): ("random", "latin", "sobol"),
     ("merge", "--draws"): ("random", "latin", "sobol"),
+    ("attack", "--pumps"): ("own", "full", "random"),
+    ("attack", "--start"): ("any", "own"),
     ("identify", "--loss"): ("linear", "soft_l1", "huber"),
     ("identify", "--start"): ("free", "measured", "case"),
     ("export", "--lang"): ("c", "m"),

@@ -1,0 +1,237 @@
+"""Attacks against closed forms of one tank, central differences, and filters broken on purpose."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from helpers import RIGS
+from scipy.optimize import brentq
+
+import tuning
+from jaxtank import presets, rig, simulate
+from jaxtank.controllers import PID
+from jaxtank.core.errors import InputError
+from jaxtank.safety.box import widths_of
+from jaxtank.safety.worst_case import rates_of
+from tuning.falsification.ascent import ascend
+from tuning.falsification.attacked import Attacked, programs
+from tuning.falsification.coefficients import coefficients_of
+
+TANK = RIGS / "watertank.toml"  # A h' = b u - a sqrt(h), A = 20 cm^2, b = 5, a = 2 (g = 0.5)
+SPREAD = {"plant.drain": 0.1, "plant.pump_gain": 0.1}
+
+
+def tank(gain=None, **values):
+    """The water tank; with `gain` under u = gain (1 - y) + 0.4 alone."""
+    case = rig.set_values(rig.load(TANK), {"clock.dt": 0.2, "clock.duration": 60.0, **values})
+    if gain is None:
+        return case
+    law = case.loop.controller
+    assert isinstance(law, PID)
+    law = dataclasses.replace(law, Kc=np.array([gain]), Ti=np.array([1e12]), bias=np.array([0.4]))
+    case = rig.set_values(case, {"reference.targets": [1.0]})
+    return case.replace(loop=dataclasses.replace(case.loop, controller=law))
+
+
+def steady(b, a, gain, error):
+    """Level at which b u = a sqrt(h) under u = gain (1 - h - error) + 0.4."""
+    return brentq(lambda h: b * (gain * (1.0 - h - error) + 0.4) - a * math.sqrt(h), 1e-9, 20.0)
+
+
+def test_the_worst_plant_and_reading_error_of_one_tank_are_those_of_its_closed_form():
+    """The steady level rises with b and falls with a and with the error of the reading: the worst
+    is a corner, for a proportional controller brentq's root there."""
+    values = {"sensor.noise": [0.01], "clock.dt": 0.5, "clock.duration": 200.0}
+    case = tank(gain=0.3, **values)
+    found = tuning.attack(case, SPREAD, starts=2, draws=4, iterations=6, windows=2, start="own")
+    (one,) = found.found
+    assert one.level == pytest.approx(steady(5.5, 1.8, 0.3, -0.06), rel=1e-7)
+    assert one.level > one.drawn > one.nominal
+    assert one.nominal == pytest.approx(steady(5.0, 2.0, 0.3, 0.0), rel=1e-6)
+    worst = found.parameters(one)
+    assert worst["plant.drain[0]"] == pytest.approx(1.8)  # in both windows
+    assert worst["plant.pump_gain[0]"] == pytest.approx(5.5)
+    assert np.min(one.values["error"]) == pytest.approx(-0.06)
+
+
+def test_slopes_of_the_objective_are_those_of_central_differences():
+    """By each kind of variable: coefficients constant and in windows, start, bias, one reading."""
+    case = rig.set_values(
+        presets.find("cascaded/pi"),
+        {"clock.duration": 160.0, "clock.substeps": 1, "sensor.noise": 0.02},
+    ).with_safety_filter()
+    spread = {"plant.drain": 0.05, "plant.pump_gain": 0.05, "plant.area": 0.05}
+    attacked = Attacked(
+        case=case,
+        coefficients=coefficients_of(case, spread),
+        windows=2,
+        pumps="own",
+        start="any",
+        noise=True,
+        ceiling=np.asarray(case.loop.safety_filter.limit),
+    )
+    rng = np.random.default_rng(3)
+    z = {k: rng.uniform(0.4, 0.6, s) for k, s in attacked.shapes.items()}
+    z["start"] = np.array([0.5, 0.3])
+    run, slopes = programs(attacked)
+    tanks = np.arange(2)
+    (level, _), slope = slopes({k: np.stack([v, v]) for k, v in z.items()}, tanks)
+    assert level == pytest.approx(np.asarray(run(_stack(attacked, [z])).highest)[0], rel=1e-12)
+    step, moved, at = 1e-6, [], []
+    for name, v in z.items():
+        for index in [*np.ndindex(v.shape)][:6]:
+            for sign in (1.0, -1.0):
+                other = {**z, name: v.copy()}
+                other[name][index] += sign * step
+                moved.append(other)
+            at.append((name, index))
+    levels = np.asarray(run(_stack(attacked, moved)).highest)
+    differences = (levels[::2] - levels[1::2]) / (2.0 * step)
+    for (name, index), own in zip(at, differences):
+        exact = [slope[name][(i, *index)] for i in tanks]
+        assert exact == pytest.approx(own, rel=1e-5, abs=1e-7), (name, index)
+    assert np.any(np.abs(differences) > 0.01, axis=0).all()
+
+
+def _stack(attacked, points):
+    rows = [attacked.values(z) for z in points]
+    return {k: np.stack([np.asarray(row[k]) for row in rows]) for k in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    """What an attack finds of the water tank with full pumps, by the settings of its filter."""
+    kept = {}
+
+    def found(*, noise=0.0, **settings):
+        key = (noise, *settings.items())
+        if key not in kept:
+            case = tank(**{"sensor.noise": [noise]})
+            case = case.with_safety_filter(widths=widths_of(case.loop.plant, SPREAD), **settings)
+            kept[key] = tuning.attack(
+                case, starts=2, draws=16, iterations=3, windows=2, pumps="full"
+            )
+        return kept[key]
+
+    return found
+
+
+def test_a_proved_limit_holds_and_is_nearly_reached(filtered):
+    (one,) = filtered().found
+    assert one.certified and not one.passed
+    assert 0.999 * 40.0 < one.level <= 40.0 * (1.0 + 1e-9)
+
+
+def test_a_rate_above_its_bound_is_found_out(filtered):
+    """kappa T = 10, where 1 is proved."""
+    (one,) = filtered(rate=50.0).found
+    assert one.certified is False and "above its bound" in one.reason
+    assert one.passed and one.margin < -0.1
+
+
+def test_a_band_of_0_with_noise_is_found_out(filtered):
+    """The limit is passed by the band that the noise needs, 0.06 cm, and no more."""
+    (one,) = filtered(noise=0.01, band=0.0).found
+    assert one.passed and one.margin == pytest.approx(-0.06, rel=0.3)
+    (one,) = filtered(noise=0.01).found
+    assert not one.passed
+
+
+def test_between_two_samples_a_level_rises_by_at_most_what_full_pumps_bring(filtered):
+    (one,) = filtered().found
+    assert one.rise == pytest.approx(5.5 / 20.0 * 50.0 * 0.2)  # b_max u_max dt
+
+
+def test_without_a_filter_gouta2015_passes_its_rims(gouta):
+    case = gouta("backstepping", {"clock.dt": 0.2, "clock.duration": 400.0})
+    found = tuning.attack(case, starts=1, draws=32, iterations=0, start="own")
+    assert max(one.level for one in found.found) > 40.0  # of 30 cm; 33.1 cm nominal
+    assert found.worst.tank in (2, 3) and found.worst.certified is None
+
+
+@pytest.mark.slow
+def test_ascent_finds_more_than_draws_and_the_filter_holds_all_of_it(gouta):
+    case = gouta("backstepping-ff", {"clock.dt": 0.1})
+    free = tuning.attack(case)
+    assert free.worst.level > 50.0 and free.worst.level > free.worst.drawn + 1.0
+    held = tuning.attack(case.with_safety_filter())
+    assert held.passed == [] and held.worst.level > 0.9999 * 30.0
+
+
+def test_rims_that_are_physics_do_not_hide_what_passes_them():
+    case = rig.set_values(presets.find("cascaded/pi"), {"clock.substeps": 1})
+    found = tuning.attack(case, starts=1, draws=4, iterations=0, windows=1)
+    assert np.asarray(simulate(case.loop, case.clock).x).max() == 10.0
+    assert found.found[0].nominal > 10.5
+    assert "without overflow" in " ".join(found.to_json()["remarks"])
+
+
+def test_starts_are_those_that_a_second_order_row_can_hold():
+    """g >= 0 at t = 0 for the lower tanks of gouta2015, whatever the variables."""
+    case = presets.find("gouta2015/backstepping").with_safety_filter()
+    guard = case.loop.safety_filter
+    attacked = Attacked(
+        case=case,
+        coefficients=coefficients_of(case),
+        windows=1,
+        pumps="own",
+        start="any",
+        noise=False,
+        ceiling=np.asarray(guard.limit),
+    )
+    rates = rates_of(guard.least, guard.most, guard.inflow, 0.0)
+    rng, lowered = np.random.default_rng(0), 0
+    for _ in range(100):
+        z = {k: np.round(rng.random(s), 1) for k, s in attacked.shapes.items()}
+        x = np.asarray(attacked.values(z)["x0"])
+        lowered += np.any(x < z["start"] * guard.limit - 1e-3)
+        for i in (0, 1):
+            above = sum(
+                c * max(math.sqrt(x[j]), 0.05 * math.sqrt(30.0))
+                for j, to, _, c in rates.links
+                if to == i
+            )
+            assert rates.out[i] * math.sqrt(x[i]) + guard.slope[i] * (30.0 - x[i]) >= above
+    assert 0 < lowered < 100
+
+
+def test_coefficients_are_the_filters_box_or_the_ranges_of_distributions():
+    case = presets.find("cascaded/pi").with_safety_filter(widths={"plant.drain[1]": 0.01})
+    (one,) = coefficients_of(case)
+    own = float(case.loop.plant.drain[1])
+    assert (one.name, one.low, one.high) == ("plant.drain[1]", own - 0.01, own + 0.01)
+    given = {
+        "plant.pump_gain": tuning.Normal(relative=0.1, cut=2.0),
+        "pair": tuning.Correlated(names=("plant.area[0]",), covariance=((1e-4,),), cut=3.0),
+    }
+    found = {c.name: c for c in coefficients_of(presets.find("cascaded/pi"), given)}
+    gain, area = found["plant.pump_gain[0]"], found["plant.area[0]"]
+    assert gain.low == pytest.approx(0.8 * gain.nominal) and gain.varies
+    assert area.high == pytest.approx(area.nominal + 0.03) and not area.varies
+
+
+def test_ascent_finds_the_corner_of_a_linear_function_and_the_top_of_a_hill():
+    weights = np.array([1.0, -2.0, 0.5])
+    linear = lambda z: (z["a"] @ weights, {"a": np.broadcast_to(weights, z["a"].shape)})
+    found = ascend(linear, {"a": np.full((2, 3), 0.3)}, 5)
+    assert found.z["a"].tolist() == [[1.0, 0.0, 1.0]] * 2
+    top = np.array([0.3, 0.7])
+    hill = lambda z: (-np.sum((z["a"] - top) ** 2, axis=1), {"a": 2.0 * (top - z["a"])})
+    found = ascend(hill, {"a": np.array([[0.0, 0.0], [1.0, 0.2]])}, 60)
+    assert found.z["a"] == pytest.approx(np.stack([top, top]), abs=0.05)
+    assert np.all(np.diff(found.history, axis=0) >= 0.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"pumps": "ful"}, "pumps = 'ful': must be one of own, full, random"),
+        ({"starts": 0}, "starts = 0"),
+        ({"distributions": {"plant.drain": tuning.Discrete(values=(1.0, 2.0))}}, "is discrete"),
+        ({"distributions": {"plant.drian": 0.1}}, "plant.drain"),
+    ],
+)
+def test_what_cannot_be_attacked_is_refused(given, words):
+    with pytest.raises(InputError, match=words.replace(".", r"\.")):
+        tuning.attack(presets.find("cascaded/pi"), **given)

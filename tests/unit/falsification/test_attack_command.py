@@ -1,0 +1,76 @@
+"""`jaxtank attack`: exit codes, JSON, and the files of the worst run."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import RIGS, command
+
+CASE = [str(RIGS / "watertank.toml"), "--dt", "0.2", "--set", "reference.targets=[30.0]"]
+FEW = ["--starts", "1", "--iterations", "0", "--windows", "2", "--quiet"]
+
+
+@pytest.fixture(scope="module")
+def passing(tmp_path_factory):
+    """(output of an attack whose limit is passed, its folder)."""
+    folder = tmp_path_factory.mktemp("attack") / "out"
+    words = ["--vary", "plant.drain=uniform:10%", "--set", "sensor.noise=[0.02]"]
+    words += ["--constant-errors", "--set", "plant.rim=[31.0]"]
+    return command("attack", *CASE, *words, *FEW, "--json", "--out", str(folder)), folder
+
+
+def test_a_passed_limit_is_exit_code_4_and_the_json_has_the_worst_of_each_tank(passing):
+    found, _ = passing
+    assert found.code == 4 and found.json["passed"]
+    (row,) = found.json["worst"]
+    assert row["tank"] == 1 and row["limit"] == 31.0 and row["level"] > 31.0
+    assert 0.0 < row["time_s"] <= 40.0 and row["rise_between_samples"] > 0.0
+    assert {"plant.drain[0]", "x0[0]", "sensor.offset[0]"} == set(row["parameters"])
+    assert abs(row["parameters"]["sensor.offset[0]"]) <= 0.12
+
+
+def test_the_rig_file_of_the_worst_run_gives_its_level_again(passing):
+    found, folder = passing
+    names = {p.name for p in folder.iterdir()}
+    assert names >= {"result.json", "worst.toml", "trajectory.csv", "worst.png", "report.html"}
+    level = found.json["worst"][0]["level"]
+    again = command("simulate", str(folder / "worst.toml"), "--json", "--quiet")
+    assert again.json["measures"]["max_level"] == [pytest.approx(level, rel=1e-9)]
+    checked = json.loads((folder / "result.json").read_text())["rig"]
+    assert checked["same"] and checked["missing"] == []
+    rows = np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1)
+    assert rows[:, 1].max() == pytest.approx(level, rel=1e-9)
+
+
+def test_a_limit_that_holds_is_exit_code_0_and_the_rig_file_keeps_the_filter(tmp_path):
+    words = ["--safety-filter", "--set", "sensor.noise=[0.02]", "--constant-errors"]
+    found = command("attack", *CASE, *words, *FEW, "--out", str(tmp_path / "out"))
+    assert found.code == 0 and "No limit was passed" in found.out
+    assert "between two samples a level can rise by at most" in found.out
+    assert "--set 'plant.drain[0]=" in found.out
+    assert json.loads((tmp_path / "out/result.json").read_text())["rig"]["same"]
+
+
+def test_errors_that_change_in_time_are_named_where_the_rig_file_lacks_them(tmp_path):
+    words = ["--safety-filter", "--set", "sensor.noise=[0.2]", "--draws", "4", "--starts", "1"]
+    found = command("attack", *CASE, *words, "--iterations", "1", "--out", str(tmp_path / "out"))
+    assert found.code == 0
+    checked = json.loads((tmp_path / "out/result.json").read_text())["rig"]
+    assert not checked["same"] and "change from sample to sample" in checked["missing"][0]
+    head = (tmp_path / "out/worst.toml").read_text().splitlines()[0]
+    assert "it lacks reading errors that change" in head
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--pumps", "ful"], "pumps = 'ful'"),
+        (["--starts", "0"], "--starts '0'"),
+        (["--spread", "2"], "--spread '2'"),
+        (["--vary", "plant.drian=uniform:5%"], "plant.drain"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(words, message, tmp_path):
+    found = command("attack", *CASE, *words, "--out", str(tmp_path / "out"))
+    assert found.code == 2 and message in found.err and found.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,67 @@
+"""`jaxtank attack`: the plant, start and reading errors that drive levels highest."""
+
+from tuning.cli.arguments import option, uncertain
+from tuning.cli.options import distributions_of, report_written
+from tuning.cli.terminal import Line
+from tuning.cli.values import open_case, whole
+from tuning.cli.values import seed as seed_of
+
+PASSED = 4
+"""Exit code where a limit is passed."""
+
+
+def add(commands, parents):
+    """Add the command of this module to the parser's `commands`."""
+    common, case, run = parents
+    one = commands.add_parser(
+        "attack",
+        parents=[common, case, run, uncertain()],
+        help="the worst plant, start and reading errors in the box: can a level pass its limit?",
+        epilog="Exit code 4: a limit is passed.",
+    )
+    one.set_defaults(run=attack)
+    option(one, "--starts", "N", "ascents for each tank, from the best draws (default 8)", "8")
+    option(one, "--iterations", "N", "steps of the ascent at most (default 12)", "12")
+    option(one, "--draws", "N", "random draws, half of them corners (default 64)", "64")
+    text = "windows of time in each of which a flow coefficient has its own value (default 4)"
+    option(one, "--windows", "N", text, "4")
+    text = "who commands the pumps: own (default: the controller), full, or random switching"
+    option(one, "--pumps", "KIND", text, "own")
+    text = "levels at t = 0: any (default) up to the limits, or own: those of the case"
+    option(one, "--start", "KIND", text, "any")
+    one.add_argument(
+        "--constant-errors",
+        action="store_true",
+        help="reading errors that do not change in time (default: any sequence in the band)",
+    )
+
+
+def attack(args):
+    """Print the highest levels found; returns 4 where a limit is passed."""
+    seed, case = seed_of(args), open_case(args)
+    distributions = distributions_of(args, case)
+    from tuning.falsification import study
+    from tuning.report import tables
+
+    line = Line(args.quiet)
+    line.compiling("the simulation and its derivatives", 15)
+    found = study.attack(
+        case,
+        distributions,
+        starts=whole("--starts", args.starts, 1, 10**4),
+        iterations=whole("--iterations", args.iterations, 0, 10**4),
+        seed=seed,
+        windows=whole("--windows", args.windows, 1, 1000),
+        draws=whole("--draws", args.draws, 1, 10**6),
+        pumps=args.pumps,
+        start=args.start,
+        noise=not args.constant_errors,
+        progress=lambda done, total: line.show(f"step {done}/{total}"),
+    )
+    line.end()
+    try:
+        written = found.save(args.out, args.line) if args.out else []
+    finally:  # a full disk costs the files, not the printed result
+        print(tables.dumps(found.to_json()) if args.json else str(found))
+    report_written(written, args)
+    return PASSED if found.passed else 0

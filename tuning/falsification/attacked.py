@@ -1,0 +1,322 @@
+"""A case whose coefficients, start and readings are variables of the unit cube.
+
+Imported by `tuning.falsification.study`.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import clip, lower_clip, smooth_sqrt
+from jaxtank.core.tree import split_index, with_values
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken
+from jaxtank.loop.step import step
+from jaxtank.safety.box import band_of, top_of
+from jaxtank.safety.filter import FLOOR
+from jaxtank.safety.worst_case import rates_of
+from jaxtank.xla.flags import WIDE
+from jaxtank.xla.hoist import scan
+from tuning.falsification.coefficients import Coefficient
+from tuning.falsification.components import Course, GivenErrors, PumpPlan
+
+SWITCHES = 64
+"""Windows of the commands in place of a controller's."""
+
+MEMORY = 1 << 29
+"""Bytes that the states of a batch of runs may take for reverse mode."""
+
+
+class Levels(NamedTuple):
+    """Of a run: the highest level to which each tank rose from one sample to the next (n,) [cm],
+    and when (n,) [s]; the last level of a tank that never rose. The start itself does not count.
+    """
+
+    highest: Any
+    time: Any
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Attacked:
+    """A case as a function of variables in the unit cube.
+
+    Parameters
+    ----------
+    case : Case
+    coefficients : list of Coefficient
+    windows : int
+        Windows of equal length in each of which a coefficient of the flows is constant.
+    pumps : {"own", "full", "random"}
+        Who commands: the case's controller, pumps at full command, or commands that are variables.
+    start : {"any", "own"}
+        Any levels up to the ceiling from which the case's filter can hold its limits, or the
+        case's own.
+    noise : bool
+        An error of its own for each sample, besides the constant one.
+    ceiling : (n,) array
+        Levels [cm] below which starts lie.
+
+    Attributes
+    ----------
+    band : (n,) array
+        Largest error of a reading [cm].
+    original : Case
+        `case` with its own controller.
+    physical_rims : bool
+        Whether the case has overflow, which the attacked one has not.
+    shapes : dict
+        {variable: shape}; all lie in [0, 1].
+    """
+
+    case: Case
+    coefficients: list[Coefficient]
+    windows: int
+    pumps: str
+    start: str
+    noise: bool
+    ceiling: np.ndarray
+    band: np.ndarray = dataclasses.field(init=False)
+    shapes: dict[str, tuple[int, ...]] = dataclasses.field(init=False)
+    original: Case = dataclasses.field(init=False)
+    physical_rims: bool = dataclasses.field(init=False)
+
+    def __post_init__(self):
+        case, loop = self.case, without_overflow(self.case.loop)
+        object.__setattr__(self, "original", case.replace(loop=loop))
+        object.__setattr__(self, "physical_rims", bool(case.loop.plant.overflow))
+        if self.pumps != "own":
+            loop = _without_controller(loop, case.clock)
+        band = reading_band(loop)
+        varying = [c for c in self.coefficients if c.varies]
+        shapes: dict[str, tuple[int, ...]] = {
+            "varying": (len(varying), self.windows),
+            "constant": (len(self.coefficients) - len(varying),),
+        }
+        if self.start == "any":
+            shapes["start"] = (loop.plant.tanks,)
+        if np.any(band > 0.0):
+            shapes["bias"] = (loop.plant.tanks,)
+            if self.noise:
+                shapes["noise"] = (loop.plant.tanks, case.clock.samples)
+        if self.pumps == "random":
+            shapes["command"] = (SWITCHES, loop.plant.pumps)
+        for name, value in {
+            "case": case.replace(loop=loop),
+            "coefficients": [*varying, *(c for c in self.coefficients if not c.varies)],
+            "band": band,
+            "shapes": shapes,
+        }.items():
+            object.__setattr__(self, name, value)
+
+    def nominal(self) -> dict[str, np.ndarray]:
+        """Return the values (see `values`) of the case as it is, without reading errors."""
+        own = np.array([c.nominal for c in self.coefficients])
+        varying = self.shapes["varying"][0]
+        loop, clock = self.case.loop, self.case.clock
+        found = {
+            "varying": np.repeat(own[:varying, None], self.windows, axis=1),
+            "constant": own[varying:],
+            "x0": np.asarray(loop.x0, dtype=float),
+        }
+        if "bias" in self.shapes:
+            columns = clock.samples if self.noise else 1
+            found["error"] = np.zeros((loop.plant.tanks, columns))
+        if self.pumps != "own":
+            high = np.asarray(loop.actuator.high, dtype=float)
+            found["command"] = np.repeat(high[None], SWITCHES, axis=0)
+        return found
+
+    def values(self, z: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values that variables z in the unit cube stand for.
+
+        Returns
+        -------
+        {"varying" (coefficients, windows) and "constant" (coefficients,) in their own units, "x0"
+        (n,) [cm], "error" of the readings (n, samples), (n, 1) where constant [cm], "command"
+        (SWITCHES, m) [V]}; the last two where they are variables.
+        """
+        loop, found = self.case.loop, {}
+        low, high = (np.array([c[i] for c in self.coefficients]) for i in (2, 3))
+        n = self.shapes["varying"][0]
+        found["varying"] = low[:n, None] + (high - low)[:n, None] * z["varying"]
+        found["constant"] = low[n:] + (high - low)[n:] * z["constant"]
+        found["x0"] = self._start(z["start"]) if "start" in z else jnp.asarray(loop.x0)
+        if "bias" in z:
+            error = (2.0 * z["bias"] - 1.0)[:, None]
+            if "noise" in z:
+                error = clip(error + (2.0 * z["noise"] - 1.0), -1.0, 1.0)
+            found["error"] = self.band[:, None] * error
+        if self.pumps != "own":
+            low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
+            share = z["command"] if "command" in z else np.ones((SWITCHES, 1))
+            found["command"] = low + (high - low) * share
+        return found
+
+    def _start(self, z):
+        """Levels (n,) [cm] at t = 0. With a row of second order, the tanks above are lowered until
+        g >= 0: no filter can stop what has already been let in.
+        """
+        guard = self.case.loop.safety_filter
+        x = [top * share for top, share in zip(self.ceiling, z)]
+        if guard is None:
+            return jnp.stack(x)
+        rates = rates_of(guard.least, guard.most, guard.inflow, 0.0)
+        root = lambda h: smooth_sqrt(h, rates.knee)
+        for i in guard.held:
+            if guard.slope[i] <= 0.0:
+                continue
+            sources = [(j, most) for j, sink, _, most in rates.links if sink == i]
+            least = FLOOR * root(guard.limit[i])
+            may = rates.out[i] * root(x[i]) + guard.slope[i] * (guard.limit[i] - x[i])
+            does = sum(most * lower_clip(root(x[j]), least) for j, most in sources)
+            share = jnp.where(does > may, may / does, 1.0) * (1.0 - 1e-9)
+            for j, _ in sources:
+                x[j] = x[j] * share**2
+        return jnp.stack(x)
+
+    def loop_of(self, values: Mapping[str, Any]) -> ClosedLoop:
+        """Return the loop with these values; coefficients of the plant are faults of it, unknown to
+        controller and filter.
+        """
+        loop: Any = self.case.loop
+        n, clock = self.shapes["varying"][0], self.case.clock
+        constant = list(zip(self.coefficients[n:], values["constant"]))
+        loop = with_values(loop, {c.name: v for c, v in constant if not of_plant(c)})
+        whole = [(c, jnp.broadcast_to(v, (self.windows,))) for c, v in constant if of_plant(c)]
+        rows = [*zip(self.coefficients, values["varying"]), *whole]
+        changes = {"x0": values["x0"]}
+        if rows:
+            changes["faults"] = Course(
+                value=jnp.stack([row for _, row in rows]),
+                names=tuple(c.name.removeprefix("plant.") for c, _ in rows),
+                length=(clock.duration + clock.dt) / self.windows,
+                then=loop.faults,
+            )
+        if "error" in values:
+            error = jnp.broadcast_to(values["error"], (loop.plant.tanks, clock.samples))
+            changes["sensor"] = GivenErrors(error=error, top=_tops(loop))
+        if "command" in values:
+            changes["controller"] = dataclasses.replace(loop.controller, command=values["command"])
+        return dataclasses.replace(loop, **changes)
+
+    def levels(self, values: Mapping[str, Any], checkpoint: bool = False) -> Levels:
+        """Return the highest levels of a run with these values; -inf where the run diverged.
+
+        checkpoint: keep the state of each sample alone for reverse mode, and compute each sample
+        anew on the way back. A program with `loop.run`'s chunks takes four times as long to
+        compile.
+        """
+        loop, clock = self.loop_of(values), self.case.clock
+        state = initial(loop, clock)
+        none = tuple(jnp.full_like(x, -jnp.inf) for x in state.x)
+
+        def body(carry, now):
+            state, before, highest, time = carry
+            after, sample = step(loop, clock, state, now)
+            above = [(x > old) & (x > top) for x, old, top in zip(sample.x, before, highest)]
+            highest = tuple(jnp.where(a, x, top) for a, x, top in zip(above, sample.x, highest))
+            time = tuple(jnp.where(a, sample.t, t) for a, t in zip(above, time))
+            return (after, sample.x, highest, time), None
+
+        body = jax.checkpoint(body) if checkpoint else body
+        known = inputs(loop, clock, (), None)
+        carry = (state, state.x, none, none)
+        (state, last, highest, time), _ = scan(body, carry, known, length=clock.samples)
+        rose = [jnp.isfinite(top) for top in highest]
+        end = (clock.samples - 1) * clock.dt
+        highest = jnp.stack([jnp.where(r, top, x) for r, top, x in zip(rose, highest, last)])
+        time = jnp.stack([jnp.where(r, t, end) for r, t in zip(rose, time)])
+        return Levels(jnp.where(is_broken(state), -jnp.inf, highest), time)
+
+    def objective(self, z: Mapping[str, Any], tank: Any) -> tuple[Any, Levels]:
+        """Return (highest level of one tank [cm], Levels) of a run with variables z."""
+        found = self.levels(self.values(z), checkpoint=True)
+        return found.highest[tank], found
+
+
+def of_plant(coefficient: Coefficient) -> bool:
+    """Return whether a coefficient is an entry of an array of the plant, which may have a course.
+
+    Examples
+    --------
+    >>> of_plant(Coefficient("plant.drain[0]", 1.0, 0.9, 1.1, True))
+    True
+    """
+    return coefficient.name.startswith("plant.") and len(split_index(coefficient.name)[1]) == 1
+
+
+def without_overflow(loop: ClosedLoop) -> ClosedLoop:
+    """Return a loop whose levels may rise past the rims: at a rim, nothing could be seen to pass.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> without_overflow(presets.find("cascaded/pi").loop).plant.overflow
+    False
+    """
+    plant: Any = loop.plant
+    if not plant.overflow:
+        return loop
+    return dataclasses.replace(loop, plant=dataclasses.replace(plant, overflow=False))
+
+
+def reading_band(loop: ClosedLoop) -> np.ndarray:
+    """Return the (n,) largest error of readings [cm]: of the sensor's noise (6 standard
+    deviations), ADC and offset, or the band of the safety filter where that is wider.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> reading_band(with_values(loop, {"sensor.noise": 0.01})).tolist()
+    [0.06, 0.06]
+    """
+    n, sensor, guard = loop.plant.tanks, loop.sensor, loop.safety_filter
+    own = band_of(sensor) if isinstance(sensor, LevelSensor) else 6.0 * np.asarray(sensor.noise)
+    own = np.broadcast_to(own, (n,))
+    return own if guard is None else np.maximum(own, np.asarray(guard.band))
+
+
+def _tops(loop):
+    """(n) highest level that each sensor can read [cm], None without an ADC."""
+    if not isinstance(loop.sensor, LevelSensor) or not loop.sensor.bits:
+        return (None,) * loop.plant.tanks
+    return tuple(float(v) for v in top_of(loop.sensor, loop.plant.tanks))
+
+
+def _without_controller(loop, clock):
+    """A loop whose commands are those of a PumpPlan, limited by its filter and its pumps."""
+    low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    if not np.all(np.isfinite([low, high])):
+        raise InputError("attack: pumps other than the case's own need finite limits of the pumps")
+    plan = PumpPlan(
+        command=np.repeat(high[None], SWITCHES, axis=0),
+        length=(clock.duration + clock.dt) / SWITCHES,
+    )
+    actuator = loop.actuator
+    if actuator.allocates:  # by a controller's cost, which a plan has not
+        actuator = dataclasses.replace(actuator, saturation="clip")
+    return dataclasses.replace(loop, controller=plan, actuator=actuator)
+
+
+def programs(attacked: Attacked) -> tuple[Any, Any]:
+    """Return two compiled functions of batches: (values) -> Levels, and (variables, tanks) ->
+    ((level of each one's tank, Levels), its slopes by the variables).
+    """
+    slopes = jax.value_and_grad(attacked.objective, has_aux=True)
+    run = jax.jit(jax.vmap(attacked.levels), compiler_options=WIDE)
+    return run, jax.jit(jax.vmap(slopes), compiler_options=WIDE)
+
+
+def batch_size(attacked: Attacked, runs: int) -> int:
+    """Return the number of runs of a batch: at most `runs`, and no more than MEMORY allows."""
+    case = attacked.case
+    state = jax.eval_shape(lambda: initial(case.loop, case.clock))
+    numbers = sum(v.size for v in jax.tree.leaves(state)) + 9 * case.loop.plant.tanks
+    return max(1, min(runs, MEMORY // (8 * numbers * case.clock.samples)))

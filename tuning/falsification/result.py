@@ -1,0 +1,189 @@
+"""The result of an attack; made by `tuning.falsification.study`."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank.core.tree import with_values
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.plants.faults import Faults
+from tuning.falsification.attacked import Attacked, of_plant
+from tuning.problem.result import Result
+
+TOLERANCE = 1e-9
+"""Share of a limit by which rounding may pass it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Found:
+    """The highest level that an attack found in one tank, and the run that has it.
+
+    Attributes
+    ----------
+    tank : int
+        Counted from 0.
+    limit : float
+        Level that must not be passed [cm].
+    certified : bool or None
+        Whether the safety filter is proved to keep it; None without a filter.
+    reason : str
+        The theorem, or the condition that failed.
+    nominal, drawn, level : float
+        Highest level of the case as it is, of random draws, and in all [cm].
+    time_s : float
+        When it was reached [s].
+    rise : float
+        What the level can rise by at most between two samples [cm]; nan where it is not known.
+    values : dict
+        As `Attacked.values`.
+    """
+
+    tank: int
+    limit: float
+    certified: bool | None
+    reason: str
+    nominal: float
+    drawn: float
+    level: float
+    time_s: float
+    rise: float
+    values: Mapping[str, np.ndarray] = dataclasses.field(repr=False)
+
+    @property
+    def margin(self) -> float:
+        """Distance of the level found to the limit [cm], negative where it passes."""
+        return self.limit - self.level
+
+    @property
+    def passed(self) -> bool:
+        """Whether the level found is above the limit."""
+        return self.level > self.limit * (1.0 + TOLERANCE)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Attack(Result):
+    """The worst that was found of a case; made by `tuning.attack`.
+
+    Attributes
+    ----------
+    attacked : Attacked
+        The case as a function of what the attack may change.
+    found : tuple of Found
+        One for each tank.
+    history : (iterations + 1, tanks) array
+        Highest level after each step of the ascent [cm].
+    starts, draws, seed : int
+    wall_s : float
+        [s].
+    """
+
+    REPORT = "tuning.report.studies.falsification"
+
+    attacked: Attacked
+    found: tuple[Found, ...]
+    history: np.ndarray
+    starts: int
+    draws: int
+    seed: int
+    wall_s: float
+
+    @property
+    def case(self) -> Any:
+        """The case that was attacked, without overflow."""
+        return self.attacked.case
+
+    @property
+    def passed(self) -> list[Found]:
+        """What passed its limit."""
+        return [one for one in self.found if one.passed]
+
+    @property
+    def worst(self) -> Found:
+        """What comes highest by its limit."""
+        return max(self.found, key=lambda one: one.level / one.limit)
+
+    def parameters(self, one: Found) -> dict[str, Any]:
+        """Return {dotted name: value, or the list of its values in windows of equal length} of the
+        run that has the level `one`. "sensor.offset[i]" is the mean error of a reading [cm].
+        """
+        found = {}
+        for c, value in zip(self.attacked.coefficients, _rows(one)):
+            same = np.all(value == value[0])
+            found[c.name] = float(value[0]) if same else [float(v) for v in value]
+        found |= {f"x0[{i}]": float(h) for i, h in enumerate(one.values["x0"])}
+        if "error" in one.values:
+            mean = np.mean(one.values["error"], axis=1)
+            found |= {f"sensor.offset[{i}]": float(v) for i, v in enumerate(mean)}
+        return found
+
+    def loop(self, one: Found) -> Any:
+        """Return the ClosedLoop of the run that has the level `one`."""
+        return self.attacked.loop_of(jax.tree.map(np.asarray, dict(one.values)))
+
+    def rig(self, one: Found) -> Any:
+        """Return the run that has the level `one` as a Case that a rig file can describe: the
+        nominal plant with faults from t = 0, its start, and the mean error of each reading as the
+        sensor's offset. Errors that change from sample to sample, an ADC's range and commands in
+        place of the controller's have no place in a rig file (`not_in_rig`).
+        """
+        case, values = self.case, one.values
+        if self.attacked.pumps != "own":
+            case = self.attacked.original
+        loop: Any = case.loop
+        constant = zip(self.attacked.coefficients, _rows(one))
+        loop = with_values(loop, {c.name: v[0] for c, v in constant if not of_plant(c)})
+        changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(one)}
+        safety = case.safety
+        if "error" in values and isinstance(loop.sensor, LevelSensor):
+            changes["sensor"] = dataclasses.replace(
+                loop.sensor,
+                noise=np.zeros(loop.plant.tanks),
+                offset=np.mean(values["error"], axis=1),
+            )
+            if safety is not None:  # that of the case, not that of a sensor with this offset
+                safety = {**safety, "band": np.asarray(loop.safety_filter.band)}
+        return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
+
+    def not_in_rig(self, one: Found) -> list[str]:
+        """Return what of the run that has the level `one` no rig file can describe, in words."""
+        error, missing = one.values.get("error"), []
+        if error is not None and np.ptp(error, axis=1).max() > 0.0:
+            missing.append("reading errors that change from sample to sample (their mean is)")
+        if error is not None and getattr(self.case.loop.sensor, "bits", 0):
+            missing.append("readings without the steps of the ADC")
+        if self.attacked.pumps != "own":
+            missing.append("commands in place of the controller's")
+        return missing
+
+    def _faults(self, one):
+        """The Faults of the plant in the run of `one`, equal windows joined; the case's own last.
+
+        None where there are none.
+        """
+        clock, own = self.case.clock, self.case.loop.faults
+        edges = np.linspace(0.0, clock.duration + clock.dt, self.attacked.windows + 1)
+        windows, extra = [], []
+        for c, row in zip(self.attacked.coefficients, _rows(one)):
+            if not of_plant(c):
+                continue
+            starts = [k for k in range(len(row)) if k == 0 or row[k] != row[k - 1]]
+            for k, end in zip(starts, [*starts[1:], len(row)]):
+                if row[k] != c.nominal:
+                    name = c.name.removeprefix("plant.")
+                    windows.append((name, float(edges[k]), float(edges[end])))
+                    extra.append(row[k] - c.nominal)
+        factor = np.ones(len(extra))
+        if own is not None:
+            factor, extra = np.append(factor, own.factor), np.append(extra, own.extra)
+            windows += own.windows
+        if not windows:
+            return None
+        return Faults(factor=factor, extra=np.asarray(extra), windows=tuple(windows))
+
+
+def _rows(one):
+    """Values in each window of every coefficient: (windows,) arrays, (1,) where constant."""
+    return [*np.asarray(one.values["varying"]), *np.asarray(one.values["constant"])[:, None]]
