@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank.core.clock import Chunk, indices, sample_times
+from jaxtank.xla.barrier import materialised
 
 TOLERANCE = 5e-7
 """Part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s."""
@@ -43,6 +44,7 @@ def channel(clock, initial, changes, duration, shape, lag=None):
     plain = _join(pieces, clock)
     if lag is None:
         return plain
+    plain = materialised(plain)  # its bits are those without a filter
     filtered = _join(_filtered(initial, changes, duration, lag, clock), clock)
     return tuple(jnp.where(lag > 0, new, old) for new, old in zip(filtered, plain))
 
