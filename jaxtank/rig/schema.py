@@ -88,12 +88,14 @@ PLANT = (
 )
 KIND = Key("kind", kind="any")
 """The key that names the class of a controller or an observer; its doc lists the classes."""
+FILTER = "time constant of a first-order filter behind the ramps of each; 0: none"
 COURSE = tuple(Key.of(Ramps, name, default=None) for name in ("ramp", "shape"))
 OPEN_LOOP = (
     KIND,
     _optional("initial", "(m,) input of each pump before the first change", "list", "V"),
     _optional("changes", "[time in s, pump from 1, input] of each change", "any", "V"),
     *COURSE,
+    Key.of(Ramps, "filter", f"(m,) {FILTER}", kind="array", default=None),
 )
 """[law] of kind "open-loop"; of other kinds the keys are the fields of the class."""
 REFERENCE = (
@@ -103,6 +105,7 @@ REFERENCE = (
     _optional("changes", "[time in s, output from 1, setpoint] of each change", "any", "cm"),
     *COURSE,
     Key.of(Ramps, "band", default=None),
+    Key.of(Ramps, "filter", f"(outputs,) {FILTER}", kind="array", default=None),
     _optional("sine", "a sine on top: [reference.sine]; {}: none", "table"),
 )
 SINE = (

@@ -147,6 +147,10 @@ def _reference(loop, start):
             raise InputError("its reference has no table")
         return []
     found = block(SECTIONS["reference"], signals.ramp_values(reference), units)
+    if reference.filter is None:
+        key = next(k for k in SECTIONS["reference"].keys if k.name == "filter")
+        none = [0.0] * reference.channels
+        found.lines.append(Line(key.name, none, key.meta(units), False))
     if isinstance(loop.reference, Sum):
         values = signals.sine_values(loop.reference.second)
         return [found, block(SECTIONS["reference.sine"], values, units)]

@@ -16,6 +16,8 @@ from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, inflow_pulses
 from jaxtank.signals.setpoints import Ramps, Sine, ramps
 
+COURSE = ("ramp", "shape", "band", "filter")
+
 
 def steps(reference):
     """The `Ramps` of a reference that [reference] can describe: itself, or what a sine is added to;
@@ -47,10 +49,11 @@ def ramps_of(section, table, old, words, sizes):
     are called.
     """
     own, known = {k.name: k for k in section.keys}, ramp_values(old)
-    start = {name: written(own[name], value) for name, value in known.items() if name in own}
+    given = {name: v for name, v in known.items() if name in own and v is not None}
+    start = {name: written(own[name], value) for name, value in given.items()}
     values = read_entry(section, {**start, **table}, sizes)
     changes = _changes(f"{section.name}.changes", values["changes"], words, np.size(old.initial))
-    course = {name: values.get(name, getattr(old, name)) for name in ("ramp", "shape", "band")}
+    course = {name: values.get(name, getattr(old, name)) for name in COURSE}
     return ramps(values["initial"].tolist(), changes, **course)
 
 
@@ -85,7 +88,8 @@ def _changes(label, changes, words, channels):
 def ramp_values(signal):
     """{key: value} of a Ramps; changes as in a file, [[time [s], channel from 1, value], ...]."""
     changes = zip(signal.changes, np.asarray(signal.targets))
-    own = {name: getattr(signal, name) for name in ("initial", "ramp", "shape", "band")}
+    own = {name: getattr(signal, name) for name in ("initial", *COURSE)}
+    own["ramp"] = float(signal.ramp)
     return {**own, "changes": [[t, i + 1, float(v)] for (t, i), v in changes]}
 
 

@@ -6,14 +6,16 @@ Imports core; may be imported by every folder above.
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import Chunk, Clock, indices, pointwise, sample_times
+from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.signals.base import Signal
+from jaxtank.signals.courses import channel
 
 SHAPES = ("linear", "quintic")
 
@@ -30,6 +32,11 @@ class Ramps(Signal):
     at 0 before and 1 after. D = 0 gives steps. A change that begins before the last one of its
     channel has ended starts from the value reached by then. Built by `ramps`.
 
+    With `filter` (linear changes only) the controller follows f instead, T f' = r - f, f(0) = r(0),
+    solved exactly, and errors are those from f; overshoot, rise and settling refer to the targets.
+    A time constant T of 0 changes no bit. Levels, D and T are leaves: derivatives by them are exact
+    (where a change ends on a sample, those from below D).
+
     Examples
     --------
     >>> steps = ramps([3.0], [(1.0, 0, 8.0)], ramp=2.0)
@@ -40,7 +47,14 @@ class Ramps(Signal):
     initial: np.ndarray = leaf("cm", "(channels,) value before the first change")
     targets: np.ndarray = leaf("cm", "(changes,) value after each change")
     changes: tuple = static(doc="((time [s], channel), ...) in order of time")
-    ramp: float = static("s", "duration D of every change", low=0.0, default=60.0)
+    ramp: np.ndarray = leaf("s", "duration D of every change", low=0.0, default=lambda values: 60.0)
+    filter: Any = leaf(
+        "s",
+        "(channels,) time constant of a first-order filter behind the ramps; 0: none",
+        low=0.0,
+        like="initial",
+        default=None,
+    )
     shape: str = static(doc="course of a change", choices=SHAPES, default="linear")
     band: float = static(
         "-",
@@ -57,22 +71,17 @@ class Ramps(Signal):
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
-        # of each channel: (first sample, function of time)
-        pieces = [[(0, _flat(self.initial[i]))] for i in range(self.channels)]
-        for j, (start, i) in enumerate(self.changes):
-            # the last target, or the value reached by a change that has not ended
-            level = pieces[i][-1][1](start)[0]
-            if pieces[i][-1][0] > _index(start, clock):
-                pieces[i].pop()
-                level = pieces[i][-1][1](start)[0]
-            pieces[i].append(
-                (
-                    _index(start, clock),
-                    _course(level, self.targets[j] - level, start, self.ramp, self.shape),
-                )
+        if self.filter is not None and self.shape != "linear":
+            raise InputError(
+                f"reference.filter: is for ramps, and reference.shape = {self.shape!r}: set the"
+                " shape to 'linear', or leave the filter out"
             )
-            pieces[i].append((_index(start + self.ramp, clock), _flat(self.targets[j])))
-        value, rate, second = zip(*(_join(channel, clock) for channel in pieces))
+        columns = []
+        for i in range(self.channels):
+            own = [(t, self.targets[j]) for j, (t, c) in enumerate(self.changes) if c == i]
+            lag = None if self.filter is None else self.filter[i]
+            columns.append(channel(clock, self.initial[i], own, self.ramp, self.shape, lag))
+        value, rate, second = zip(*columns)
         return value, rate, second
 
     @pointwise
@@ -111,7 +120,7 @@ class Ramps(Signal):
         for start, following in zip(starts, [*starts[1:], math.inf]):
             for i, target in by_time[start]:
                 now[i] = target
-            if start + self.ramp <= min(following, until):
+            if start + float(self.ramp) <= min(following, until):
                 values.append(now.copy())
         return np.array(values)
 
@@ -172,6 +181,7 @@ def ramps(
     ramp: float = 60.0,
     shape: str = "linear",
     band: float = 0.05,
+    filter: Any = None,
 ) -> Ramps:
     """Return a `Ramps` built from a list.
 
@@ -182,6 +192,7 @@ def ramps(
     ramp : duration of every change [s]; 0 gives steps
     shape : "linear" or "quintic"
     band : half width of the settling band, as a share of each step [-]
+    filter : (channels,) time constants of a first-order filter behind the ramps [s]; None: none
 
     Raises
     ------
@@ -193,10 +204,10 @@ def ramps(
     [[3.0, 3.0], [8.0, 3.0]]
     """
     changes = sorted(changes, key=lambda change: change[0])
-    for time, channel, _ in changes:
-        if not 0 <= channel < len(initial):
+    for time, which, _ in changes:
+        if not 0 <= which < len(initial):
             raise InputError(
-                f"reference change at {time:g} s names channel {channel}: there are {len(initial)},"
+                f"reference change at {time:g} s names channel {which}: there are {len(initial)},"
                 " counted from 0"
             )
         if not time >= 0:
@@ -206,60 +217,9 @@ def ramps(
     return Ramps(
         initial=number(initial),
         targets=number([target for _, _, target in changes]),
-        changes=tuple((float(time), int(channel)) for time, channel, _ in changes),
-        ramp=float(ramp),
+        changes=tuple((float(time), int(which)) for time, which, _ in changes),
+        ramp=number(ramp),
         shape=shape,
         band=float(band),
+        filter=None if filter is None else number(filter),
     )
-
-
-def _index(time, clock):
-    """First sample at or after `time`; half a part in a million of a sample is forgiven, so that 20
-    s is sample 2000 at 0.01 s.
-    """
-    return max(0, math.ceil(min(time / clock.dt, 2.0**53) - 5e-7))
-
-
-def _flat(level):
-    return lambda t: (level + jnp.zeros_like(t), jnp.zeros_like(t), jnp.zeros_like(t))
-
-
-def _course(level, delta, start, duration, shape):
-    """Value, rate and second derivative of a change of `delta` from `level`, as a function of time
-    inside the change.
-    """
-    if shape == "linear":
-        return lambda t: (
-            level + delta * ((t - start) / duration),
-            delta / duration + jnp.zeros_like(t),
-            jnp.zeros_like(t),
-        )
-
-    def quintic(t):
-        x = (t - start) / duration
-        s = x * x * x * (10.0 + x * (6.0 * x - 15.0))
-        ds = 30.0 * x * x * (1.0 - x) * (1.0 - x) / duration
-        dds = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / duration**2
-        return level + delta * s, delta * ds, delta * dds
-
-    return quintic
-
-
-def _join(pieces, clock):
-    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Chunk`,
-    which may lie anywhere, on all.
-    """
-    if isinstance(clock, Chunk):
-        k, t = indices(clock), sample_times(clock)
-        found = pieces[0][1](t)
-        for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):
-            if after > first:
-                found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(t), found))
-        return found
-    starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
-    parts = [
-        f((a + jnp.arange(b - a)) * clock.dt)
-        for (_, f), a, b in zip(pieces, starts, starts[1:])
-        if b > a
-    ]
-    return tuple(jnp.concatenate(column) for column in zip(*parts))

@@ -30,7 +30,7 @@ from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.inflows import pours
 from jaxtank.signals.setpoints import Sine, ramps
-from tuning.uncertainty import feasibility
+from tuning.uncertainty import needs
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import probabilities, spread_of
 
@@ -311,9 +311,9 @@ def test_steady_states_are_looked_for_in_blocks(monkeypatch):
     case = presets.find("gouta2015/backstepping")
     draws = Draws(case.loop, spread_of(case))
     values = draws.values(probabilities("random", draws.dimensions, 300, 0))
-    whole = feasibility.infeasible(case, values)
-    monkeypatch.setattr(feasibility, "BLOCK", 128)
-    np.testing.assert_array_equal(feasibility.infeasible(case, values), whole)
+    whole = needs.infeasible(case, values)
+    monkeypatch.setattr(needs, "BLOCK", 128)
+    np.testing.assert_array_equal(needs.infeasible(case, values), whole)
     assert 0 < whole.sum() < 300
 
 

@@ -153,7 +153,7 @@ def test_show_tells_every_parameter_with_its_unit_and_range():
         )
     assert rows["controller.k1"].startswith("0.088 1/s 0.001 : 5 gain k1")
     assert rows["plant.rim"].startswith("30 30 30 30 cm")
-    assert {"reference.ramp*", "plant.overflow*", "clock.dt*", "clock.substeps*"} <= set(rows)
+    assert {"reference.ramp", "reference.shape*", "plant.overflow*", "clock.dt*", "clock.substeps*"} <= set(rows)
     assert "not in use" in rows["actuator.dead_zone"]
     preset = presets.load("gouta2015")
     flat = " ".join(said.out.split())
@@ -185,7 +185,7 @@ def test_show_json_has_the_same_and_follows_set():
         "s",
         None,
         None,
-        True,
+        False,
     )
     # what the paper prints stays what it prints
     assert page["published"]["controller.k1"][0] == 0.088
@@ -929,7 +929,7 @@ BAD = [  # arguments, words that the line must have
         ["tune", CASE, "--free", "controller.kk=1:5"],
         "unknown parameter 'controller.kk'; nearest: controller.k",
     ),
-    (["tune", CASE, "--free", "reference.ramp=1:90"], "reference.ramp: cannot be tuned"),
+    (["tune", CASE, "--free", "reference.band=0.1:0.9"], "reference.band: cannot be tuned"),
     (["tune", CASE, "--free", "clock.dt=0.01:0.1"], "clock.dt: cannot be tuned"),
     (["tune", CASE, "--free", "actuator.lag=0.1:2"], "actuator.lag"),
     (

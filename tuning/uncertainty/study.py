@@ -24,7 +24,7 @@ from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.feasibility import infeasible
+from tuning.uncertainty.needs import infeasible
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import check_whole, probabilities, spread_of
 

@@ -32,10 +32,11 @@ def test_every_parameter_can_be_read_described_and_set_by_its_name(loop):
         "controller.model.drain",
         "sensor.noise",
         "reference.targets",
+        "reference.ramp",
         "x0",
     } <= set(values)
     # static fields are not parameters
-    assert not {"plant.overflow", "plant.links", "reference.ramp"} & set(values)
+    assert not {"plant.overflow", "plant.links", "reference.band"} & set(values)
     for name, value in values.items():
         assert np.array_equal(get_value(loop, name), value)
         assert describe(loop, name)["kind"] == "leaf"
@@ -178,11 +179,11 @@ def test_an_unknown_name_is_answered_with_the_nearest(loop, name, near):
 
 
 def test_a_static_field_is_described_but_is_no_leaf(loop):
-    assert describe(loop, "reference.ramp")["kind"] == "static"
-    assert describe(loop, "reference.ramp")["unit"] == "s"
+    assert describe(loop, "reference.band")["kind"] == "static"
+    assert describe(loop, "reference.band")["unit"] == "-"
     for ask in (get_value, lambda tree, name: with_values(tree, {name: 1.0})):
-        with pytest.raises(InputError, match=r"reference\.ramp"):
-            ask(loop, "reference.ramp")
+        with pytest.raises(InputError, match=r"reference\.band"):
+            ask(loop, "reference.band")
 
 
 @pytest.mark.parametrize(
@@ -331,11 +332,12 @@ def test_a_changed_gain_does_not_retrace_and_a_changed_static_does(gouta):
         {"controller.k": 1},
         {"plant.area[0]": 20.0},
         {"plant.drain": [0.1, 0.2, 0.0, 0.0]},
+        {"reference.ramp": 45.0},
     ]
     costs = [float(error(with_values(case.loop, values))) for values in changes]
     assert len(traces) == 1
     assert len(set(costs)) == len(changes)
-    error(rig.set_values(case, {"reference.ramp": 30.0}).loop)
+    error(rig.set_values(case, {"reference.shape": "quintic"}).loop)
     assert len(traces) == 2
     # a leaf that was absent is a new program too
     error(with_values(case.loop, {"actuator.lag": 0.5}))

@@ -251,3 +251,12 @@ def test_nan_is_told_with_time_tank_and_parameters(gouta):
             jaxtank.NonFiniteError, match=r"tank 1, 2, 3 .* t = 2\.01 s .* controller.Tp = 11"
         ):
             call()
+
+
+def test_by_the_duration_of_ramps_setpoints_and_the_filter_of_the_reference(gouta):
+    """Rates of the reference are fed forward; the ramps end between two samples."""
+    values = {"clock.dt": 0.2, "clock.duration": 360.0, "reference.ramp": 61.03}
+    case = gouta("backstepping-ff", {**values, "reference.filter": 4.0, "controller.k1": 0.05})
+    names = ["reference.ramp", "reference.targets[2]", "reference.initial[1]"]
+    found = agree(case, [*names, "reference.filter[0]"])
+    assert np.all(np.abs(found) > 1e-6)

@@ -182,7 +182,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
         if not np.array_equal(v, parameters(old.loop)[n])
     }
     # the model is the plant's
-    assert changed == {"plant.area", "controller.model.area", "reference.targets"}
+    assert changed == {"plant.area", "controller.model.area", "reference.ramp", "reference.targets"}
     assert (case.clock, case.limits, case.free) == (old.clock, old.limits, old.free)
 
 
@@ -387,7 +387,7 @@ BAD = {  # text of a file: words its message must have
     free('"controller.k" = [nan, 1.0]'): ["controller.k", "nan"],
     free('"controller.k" = [0.01, inf]'): ["controller.k", "inf"],
     free('"controller.k" = [-1.0, 1.0]'): ["controller.k", "-1"],
-    free('"reference.ramp" = [1.0, 90.0]'): ["reference.ramp"],
+    free('"reference.band" = [0.1, 0.9]'): ["reference.band"],
     free('"plant.area[9]" = [1.0, 30.0]'): ["plant.area[9]"],
     free('"plant.area[x]" = [1.0, 30.0]'): ["plant.area[x]"],
     objective("rms = 1"): ["rms", "nearest: "],

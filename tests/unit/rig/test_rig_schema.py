@@ -77,6 +77,7 @@ changes = [[20.0, 1, 5.0]]
 ramp = 30.0
 shape = "quintic"
 band = 0.02
+filter = [0.4]
 [reference.sine]
 amplitude = 0.5
 offset = 0.1

@@ -427,7 +427,7 @@ def test_starts_are_distinct_and_the_first_is_the_given_one():
         ({"free": {"controller.k": (0.1, 1.0)}}, "starts outside"),
         ({"free": {"controller.k": (1.0, 0.1)}}, "LOW below HIGH"),
         ({"free": {"controller.k": (-1.0, 1.0)}}, "above 0"),
-        ({"free": {"reference.ramp": (1.0, 90.0)}}, "cannot be tuned"),
+        ({"free": {"reference.band": (0.1, 0.9)}}, "cannot be tuned"),
         ({"free": {}}, "nothing to tune"),
         ({"limits": {"max_levels": 3}}, "max_level"),
         ({"limits": {"max_level": [30, 30]}}, "or 4 of them"),

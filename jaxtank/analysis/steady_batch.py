@@ -1,0 +1,198 @@
+"""Steady states of many plants of one topology at once, on the host: no compilation.
+
+Imports core and plants; may be imported by every folder above.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxtank.core.errors import InputError
+
+FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "gravity")
+"""Leaves of a TankNetwork that its steady states depend on."""
+
+ITERATIONS = 60
+"""Newton steps at most, for networks with pipes."""
+
+
+class SteadyStates:
+    """The steady states of N plants that differ in numbers, as a function of their outputs.
+
+    Without pipes, efflux speeds and inputs are affine in the roots of the outputs and are solved
+    for once; with pipes, by Newton's method in the levels that are not controlled.
+
+    Parameters
+    ----------
+    plant : TankNetwork with as many pumps as outputs
+    values : {name of FLOWS: (N, ...)}; those left out are the plant's own
+    inflow : (n,) or (N, n) steady inflow of each tank that no pump brings [cm^3/s]
+
+    Raises
+    ------
+    InputError for another plant.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> plant = state_coupled_four_tank(15.0)
+    >>> levels, inputs = SteadyStates(plant, {"pump_gain": plant.pump_gain * [[1.0], [0.5]]}).at(
+    ...     [[8.0, 8.0]]
+    ... )
+    >>> levels.shape, inputs.round(3).tolist()
+    ((2, 1, 4), [[[2.949, 2.949]], [[5.897, 5.897]]])
+    """
+
+    def __init__(self, plant: Any, values: Mapping[str, ArrayLike], inflow: ArrayLike = 0.0):
+        if plant.pumps != len(plant.outputs):
+            raise InputError(
+                "a steady state needs as many pumps as outputs: this rig has"
+                f" {plant.pumps} and {len(plant.outputs)}"
+            )
+        count = max([1, *(np.shape(v)[0] for v in values.values())])
+        own = {}
+        for name in FLOWS:
+            value = np.asarray(values.get(name, getattr(plant, name)), dtype=float)
+            batched = value if name in values else value[None]
+            own[name] = np.broadcast_to(batched, (count, *batched.shape[1:]))
+        self.plant, self.own = plant, own
+        self.inflow = np.broadcast_to(np.asarray(inflow, dtype=float), (count, plant.tanks))
+        self.out, self.efflux, self.pumps = _balance(plant, own)
+        self.free = [i for i in range(plant.tanks) if i not in plant.outputs]
+        if not plant.pipes:
+            self.speeds, self.inputs, self.constant = self._affine()
+
+    def at(self, outputs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return levels (N, P, n) [cm] and inputs (N, P, m) [V] at outputs (P, m) or (N, P, m).
+
+        A level below zero stands for an efflux that would have to flow backwards: no steady state
+        exists. NaN where none was found.
+        """
+        y = np.asarray(outputs, dtype=float)
+        if self.plant.pipes:
+            return self._with_pipes(np.broadcast_to(y, (len(self.out), *y.shape[-2:])))
+        weight = 2.0 * self.own["gravity"][:, None, None]
+        known = np.sqrt(weight * y)
+        speeds = known @ self.speeds.swapaxes(1, 2) + self.constant[:, None, : self.plant.tanks]
+        inputs = known @ self.inputs.swapaxes(1, 2) + self.constant[:, None, self.plant.tanks :]
+        return speeds * np.abs(speeds) / weight, inputs
+
+    def _affine(self):
+        """(N, n, m) speeds and (N, m, m) inputs of an efflux speed of 1 cm/s of each controlled
+        tank, and (N, n + m) those of the inflow alone.
+        """
+        plant, outputs = self.plant, list(self.plant.outputs)
+        columns = np.concatenate([self.efflux[:, :, self.free], self.pumps], axis=2)
+        right = np.concatenate([self.efflux[:, :, outputs], self.inflow[:, :, None]], axis=2)
+        try:
+            with np.errstate(all="ignore"):
+                solution = -np.linalg.solve(columns, right)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                "the rig has no unique steady states: its pumps cannot move the outputs"
+                " independently"
+            ) from None
+        whole = np.zeros((len(columns), plant.tanks + plant.pumps, right.shape[2]))
+        whole[:, self.free] = solution[:, : len(self.free)]
+        whole[:, outputs, range(len(outputs))] = 1.0
+        whole[:, plant.tanks :] = solution[:, len(self.free) :]
+        unit = whole[:, :, :-1]
+        return unit[:, : plant.tanks], unit[:, plant.tanks :], whole[:, :, -1]
+
+    def _with_pipes(self, y):
+        """`at` of a network with pipes: Newton with halved steps where one does not help."""
+        n, free = self.plant.tanks, self.free
+        x = np.empty((*y.shape[:2], n))
+        x[..., list(self.plant.outputs)] = y
+        x[..., free] = y.max(axis=2, keepdims=True)
+        for _ in range(ITERATIONS):
+            flow, slope = self._flows(x)
+            pumps = np.broadcast_to(self.pumps[:, None], (*x.shape[:2], n, y.shape[2]))
+            columns = np.concatenate([slope[..., free], pumps], axis=3)
+            try:
+                with np.errstate(all="ignore"):
+                    move = -np.linalg.solve(columns, flow[..., None])[..., 0]
+            except np.linalg.LinAlgError:
+                return np.full_like(x, np.nan), np.full_like(y, np.nan)
+            step = move[..., : len(free)]
+            done = np.abs(step) <= 1e-12 * np.maximum(1e-6, np.abs(x[..., free]))
+            if done.all():
+                break
+            x[..., free] = self._shortened(x, step)
+        residual = flow + np.einsum("spnm,spm->spn", pumps, move[..., len(free) :])
+        lost = np.abs(residual).max(axis=2) > 1e-8 * np.abs(flow).max(axis=2) + 1e-12
+        x[lost], u = np.nan, np.where(lost[..., None], np.nan, move[..., len(free) :])
+        return x, u
+
+    def _shortened(self, x, step):
+        """Levels that are not controlled after a step, halved while the imbalance rises."""
+        free, before = self.free, self._imbalance(x)
+        share = np.ones((*x.shape[:2], 1))
+        for _ in range(8):
+            trial = x.copy()
+            trial[..., free] += share * step
+            worse = self._imbalance(trial) > before
+            if not worse.any():
+                break
+            share = np.where(worse[..., None], 0.5 * share, share)
+        return trial[..., free]
+
+    def _imbalance(self, x):
+        """(N, P) flow that no inputs can balance, as a norm."""
+        flow, _ = self._flows(x)
+        inverse = np.linalg.pinv(self.pumps)[:, None]
+        inputs = np.einsum(
+            "spmn,spn->spm", np.broadcast_to(inverse, (*flow.shape[:2], *inverse.shape[2:])), flow
+        )
+        return np.linalg.norm(flow - np.einsum("snm,spm->spn", self.pumps, inputs), axis=2)
+
+    def _flows(self, x):
+        """(N, P, n) flow into each tank without pumps [cm^3/s], (N, P, n, n) its slopes."""
+        plant, w = self.plant, np.sqrt(2.0 * self.own["gravity"])[:, None]
+        root, steep = _root(x, plant.knee)
+        flow = np.einsum("sij,spj->spi", self.efflux, root) * w[..., None] + self.inflow[:, None]
+        slope = self.efflux[:, None] * steep[:, :, None] * w[..., None, None]
+        for k, (one, other) in enumerate(plant.pipes):
+            s, ds = _signed_root(x[..., one] - x[..., other], plant.knee)
+            size = self.own["pipe"][:, k, None] * w
+            for tank, sign in ((one, -1.0), (other, 1.0)):
+                flow[..., tank] += sign * size * s
+                slope[..., tank, one] += sign * size * ds
+                slope[..., tank, other] -= sign * size * ds
+        return flow, slope
+
+
+def _balance(plant, own):
+    """(out (N, n) area of all outlets, efflux (N, n, n), pumps (N, n, m)): flow = efflux @ speeds +
+    pumps @ inputs, without pipes.
+    """
+    out = np.array(own["drain"])
+    count, n = out.shape
+    efflux, pumps = np.zeros((count, n, n)), np.zeros((count, n, plant.pumps))
+    for k, (source, sink) in enumerate(plant.links):
+        out[:, source] += own["orifice"][:, k]
+        efflux[:, sink, source] += own["orifice"][:, k]
+    efflux[:, range(n), range(n)] -= out
+    for j, (first, second) in enumerate(plant.feeds):
+        share = 1.0 if second is None else own["split"][:, j]
+        pumps[:, first, j] += share * own["pump_gain"][:, j]
+        if second is not None:
+            pumps[:, second, j] += (1.0 - share) * own["pump_gain"][:, j]
+    return out, efflux, pumps
+
+
+def _root(h, knee):
+    """`smooth_sqrt` and its slope."""
+    deep, x = h >= knee, np.maximum(h, 0.0) / knee
+    root = np.sqrt(np.where(deep, h, 1.0))
+    laminar = (1.5 * h / knee - 0.5 * np.minimum(x, 1.0) ** 2) * knee**0.5
+    slope = (1.5 - np.minimum(x, 1.0)) * knee**-0.5
+    return np.where(deep, root, laminar), np.where(deep, 0.5 / root, slope)
+
+
+def _signed_root(z, knee):
+    """`smooth_signed_sqrt` and its slope."""
+    square = z * z + knee * knee
+    return z / square**0.25, (1.0 - 0.5 * z * z / square) / square**0.25

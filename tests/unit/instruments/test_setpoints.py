@@ -1,0 +1,117 @@
+"""Setpoints whose levels, durations and filter are leaves: closed forms, other solvers, slopes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import signal as linear_systems
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.clock import Chunk, Clock
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
+from jaxtank.signals.setpoints import ramps
+
+CLOCK = Clock(dt=0.1, duration=60.0)
+# the second change begins before the first has ended; the other channel has one of its own
+CHANGES = [(5.0, 0, 8.0), (12.0, 0, 2.0), (20.0, 1, 6.0), (40.0, 0, 5.0)]
+INITIAL = np.array([3.0, 4.0])
+TIMES = np.arange(CLOCK.samples) * CLOCK.dt
+
+
+def reference(ramp=10.0, filter=None):
+    return ramps(INITIAL.tolist(), CHANGES, ramp=ramp, filter=filter)
+
+
+@jax.jit
+def sample(signal):
+    return tuple(jnp.stack(v) for v in signal.sample(CLOCK))
+
+
+def test_the_filter_of_ramps_is_that_of_another_solver():
+    lags = (4.0, 0.3)
+    plain, found = np.asarray(sample(reference())[0]), np.asarray(sample(reference(10.0, lags))[0])
+    for start, lag, r, f in zip(INITIAL, lags, plain, found):
+        # exact for an input that is a straight line between samples
+        _, other, _ = linear_systems.lsim(([1.0], [lag, 1.0]), r - start, TIMES)
+        np.testing.assert_allclose(f, start + other, atol=1e-11)
+
+
+def test_the_filter_of_a_step_is_an_exponential_and_its_rates_are_its_slopes():
+    f, rate, second = (np.asarray(v)[1] for v in sample(reference(0.0, (1.0, 2.5))))
+    since = np.maximum(TIMES - 20.0, 0.0)
+    after = np.exp(-since / 2.5) * (TIMES >= 20.0 - 1e-9)
+    np.testing.assert_allclose(f, 6.0 - 2.0 * np.where(TIMES < 20.0 - 1e-9, 1.0, after), atol=1e-12)
+    np.testing.assert_allclose(rate, 2.0 / 2.5 * after, atol=1e-12)
+    np.testing.assert_allclose(second, -2.0 / 2.5**2 * after, atol=1e-12)
+    value, rate, second = (np.asarray(v)[0] for v in sample(reference(10.0, (4.0, 1.0))))
+    corners = [0.0, 5.0, 12.0, 22.0, 40.0, 50.0, 60.0]
+    inner = np.abs(TIMES[:, None] - corners).min(axis=1) > 0.15
+    np.testing.assert_allclose(np.gradient(value, 0.1)[inner], rate[inner], atol=2e-4)
+    np.testing.assert_allclose(np.gradient(rate, 0.1)[inner], second[inner], atol=2e-4)
+
+
+@pytest.mark.parametrize("name", ["calofir/backstepping", "gouta2015/backstepping-ff"])
+def test_a_time_constant_of_zero_changes_no_bit_of_a_run(name):
+    case = presets.find(name)
+    case = rig.set_values(case, {"clock.dt": max(case.clock.dt, 0.1)})
+    other = rig.set_values(case, {"reference.filter": 0.0})
+    runs = [jaxtank.simulate(c.loop, c.clock, save_every=10) for c in (case, other)]
+    for column in ("r", "x", "u", "e"):
+        np.testing.assert_array_equal(*(getattr(run, column) for run in runs))
+
+
+@pytest.mark.parametrize("filter", [None, (4.0, 0.0)])
+def test_a_part_of_the_samples_is_as_in_the_whole(filter):
+    part = jax.jit(lambda s: s.sample(Chunk(first=93, samples=200, dt=CLOCK.dt)))
+    for whole, own in zip(sample(reference(7.23, filter)), part(reference(7.23, filter))):
+        np.testing.assert_allclose(jnp.stack(own), whole[:, 93:293], atol=1e-13)
+
+
+@pytest.mark.parametrize("ramp", [10.0, 7.0, 7.23, 7.299, 0.04])
+def test_the_rates_of_a_ramp_add_up_to_its_step_for_any_duration(ramp):
+    _, rate, _ = sample(ramps([3.0], [(20.0, 0, 8.0)], ramp=ramp))
+    np.testing.assert_allclose(CLOCK.dt * np.sum(rate), 5.0, rtol=1e-12)
+
+
+def numbers(name, x):
+    """Sums of values and of rates that weigh each sample differently."""
+    value, rate, _ = sample(with_values(reference(7.23, (4.0, 0.5)), {name: x}))
+    weights = jnp.sin(0.37 * jnp.arange(CLOCK.samples))
+    return jnp.stack([jnp.sum(weights * value), jnp.sum(weights * rate)])
+
+
+@pytest.mark.parametrize("name", ["ramp", "targets[1]", "initial[0]", "filter[0]"])
+def test_slopes_by_every_leaf_are_central_differences(name):
+    x = {"ramp": 7.23, "targets[1]": 2.0, "initial[0]": 3.0, "filter[0]": 4.0}[name]
+    slope = jax.jacfwd(lambda v: numbers(name, v))(x)
+    central = (numbers(name, x + 1e-5) - numbers(name, x - 1e-5)) / 2e-5
+    np.testing.assert_allclose(slope, central, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("ramp", [10.0, 7.5])
+def test_where_a_ramp_ends_on_a_sample_its_slope_is_the_one_from_below(ramp):
+    def f(x):
+        value, rate, _ = sample(with_values(reference(), {"ramp": x}))
+        weights = jnp.sin(0.37 * jnp.arange(CLOCK.samples))
+        return jnp.stack([jnp.sum(weights * value), jnp.sum(weights * rate)])
+
+    slope, below = jax.jacfwd(f)(ramp), (f(ramp - 1e-4) - f(ramp - 2e-4)) / 1e-4
+    np.testing.assert_allclose(slope, below, rtol=1e-3)
+    above = (f(ramp + 2e-4) - f(ramp + 1e-4)) / 1e-4
+    assert not np.allclose(above, below, rtol=1e-2)  # it is a kink
+
+
+@pytest.mark.parametrize(
+    "name, signal", [("ramp", reference(0.0)), ("filter", reference(0.0, (0.0, 0.0)))]
+)
+def test_slopes_of_steps_and_of_no_filter_are_finite(name, signal):
+    total = lambda v: sum(map(jnp.sum, sample(with_values(signal, {name: v}))))
+    assert np.all(np.isfinite(jax.jacfwd(total)(jnp.asarray(getattr(signal, name)))))
+
+
+def test_a_filter_is_for_ramps():
+    curves = ramps([3.0], [(20.0, 0, 8.0)], shape="quintic", filter=[1.0])
+    with pytest.raises(InputError, match=r"reference\.filter.*'quintic'"):
+        curves.sample(CLOCK)

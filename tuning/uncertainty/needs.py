@@ -1,0 +1,174 @@
+"""What the steady states of a reference need of many plants: levels and inputs, and which plants
+can give them. Imported by `study` and `tuning.feasible`.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxtank.analysis.steady_batch import FLOWS, SteadyStates
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, split_index
+from jaxtank.rig import check_limits
+from jaxtank.signals.base import Constant
+from tuning.uncertainty.plateaus import plateaus_of
+
+BLOCK = 1 << 14
+"""Draws whose steady states are computed at once: a plateau takes some 100 bytes a draw."""
+
+TOLERANCE = 1e-9
+"""By how much a limit may be passed, as a share of its size: rounding."""
+
+
+class Needs:
+    """Levels and inputs of the steady states at every plateau of a case, for each of N plants.
+
+    Parameters
+    ----------
+    case : Case
+    values : {dotted name: (N, ...)} drawn parameters
+    limits : {measure: limit} as in `tune`, of which `max_level` counts; those of the case where
+        None. A tank without a limit has its rim.
+
+    Attributes
+    ----------
+    plateaus : list of Plateau
+    low, high : (N, n + m) limits of the n levels [cm] and the m inputs [V]
+
+    Raises
+    ------
+    InputError
+        The case has no plateaus, or another number of pumps than outputs.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = presets.find("gouta2015/backstepping")
+    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.5]]})
+    >>> needs.at().shape, needs.feasible().tolist()
+    ((2, 6, 6), [True, False])
+    """
+
+    def __init__(
+        self, case: Case, values: Mapping[str, Any], limits: Mapping[str, Any] | None = None
+    ):
+        loop: Any = case.loop
+        plateaus = plateaus_of(case)
+        if not plateaus:
+            raise InputError(
+                f"{case.name}: its reference has no plateaus, so none can be infeasible"
+            )
+        if not hasattr(loop.plant, "links") or loop.plant.pumps != len(loop.plant.outputs):
+            raise InputError(
+                f"{case.name}: steady states need a network of tanks with as many pumps as outputs"
+            )
+        count = len(next(iter(values.values()))) if values else 1
+        drawn = lambda name: drawn_values(loop, name, values, count)
+        inflow = drawn("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
+        flows = {name: drawn(f"plant.{name}") for name in FLOWS}
+        self.case, self.plateaus, self.count = case, plateaus, count
+        self.states = SteadyStates(loop.plant, flows, inflow)
+        # None of the names is drawn unless asked for: setpoints of one draw may differ from another
+        self.setpoints = np.stack(
+            [np.stack([drawn(name) for name in p.names], axis=-1) for p in plateaus], axis=1
+        )
+        self.rim = drawn("plant.rim")
+        self.at_rim, level = _limit_of(case, limits)
+        top = np.where(self.at_rim, self.rim, level)
+        self.low = np.concatenate([np.zeros_like(top), drawn("actuator.low")], axis=1)
+        self.high = np.concatenate([top, drawn("actuator.high")], axis=1)
+
+    def at(self, setpoints: Any = None) -> np.ndarray:
+        """Return (N, P, n + m) levels and inputs at setpoints (P, outputs) or (N, P, outputs).
+
+        Those of the case where None. A level below 0: the flow would have to run backwards.
+        """
+        levels, inputs = self.states.at(self.setpoints if setpoints is None else setpoints)
+        return np.concatenate([levels, inputs], axis=2)
+
+    def excess(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
+        """Return (N, P, n + m) by how much `needed` passes a limit [cm, V]; negative: a margin.
+
+        `low` and `high` take the place of the limits of the case; inf where there is no steady
+        state.
+        """
+        needed = self.at() if needed is None else needed
+        low, high = self.low if low is None else low, self.high if high is None else high
+        scale = TOLERANCE * np.maximum(np.abs(low), np.abs(high))
+        over = np.maximum(needed - high[:, None], low[:, None] - needed) - scale[:, None]
+        return np.where(np.isfinite(over), over, np.inf)
+
+    def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
+        """Return (N,) True where every plateau has a steady state within the limits."""
+        return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
+
+
+def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:
+    """Return (count, ...) values of a leaf, or of an entry of it, over the draws.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+    name : dotted name
+    values : {dotted name: (count, ...)}, of leaves and of entries
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> drawn_values(loop, "x0[1]", {"x0": np.array([[1.0, 2.0], [3.0, 4.0]])}, 2).tolist()
+    [2.0, 4.0]
+    """
+    base, index = split_index(name)
+    whole = np.asarray(get_value(loop, base), dtype=float)
+    found = np.array(np.broadcast_to(whole, (count, *whole.shape)))
+    for other, drawn in values.items():
+        owner, entry = split_index(other)
+        if owner == base:
+            drawn = np.asarray(drawn, dtype=float)
+            found[(slice(None), *entry)] = drawn.reshape(
+                drawn.shape + (1,) * (found[(slice(None), *entry)].ndim - drawn.ndim)
+            )
+    return found[(slice(None), *index)]
+
+
+def _limit_of(case, limits):
+    """((n,) True where a tank's limit is its rim, (n,) limit [cm])."""
+    plant = case.loop.plant
+    given = check_limits(case.loop, case.limits if limits is None else limits)
+    level, rim = given.get("max_level", "rim"), np.asarray(plant.rim, dtype=float)
+    if isinstance(level, str):
+        return np.ones(plant.tanks, dtype=bool), rim
+    level = np.broadcast_to(np.asarray(level, dtype=float), (plant.tanks,))
+    at_rim = np.isnan(level) | (plant.overflow & (level >= rim))
+    return at_rim, np.where(at_rim, rim, level)
+
+
+def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
+    """Return where a plateau of the reference has no steady state within rims and pump limits.
+
+    Parameters
+    ----------
+    case : Case
+    values : {name: (N, ...)} drawn parameters
+
+    Returns
+    -------
+    (N,) array of bool, or None
+        None where the steady states of the plant have no closed form.
+    """
+    plant, reference = case.loop.plant, case.loop.reference
+    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs):
+        return None
+    if reference.plateaus(case.clock.duration) is None or not plateaus_of(case):
+        return None
+    count = len(next(iter(values.values())))
+    rims = {"max_level": "rim"}
+    return np.concatenate(
+        [
+            ~Needs(case, {n: v[i : i + BLOCK] for n, v in values.items()}, rims).feasible()
+            for i in range(0, count, BLOCK)
+        ]
+    )

@@ -1,0 +1,77 @@
+"""The plateaus of a reference: when each is held, and the names of the setpoints that make it.
+
+Imported by `needs` and `tuning.feasible`.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank.case import Case
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.setpoints import Ramps, Sine
+
+
+class Plateau(NamedTuple):
+    """Setpoints that are held for a while.
+
+    Examples
+    --------
+    >>> Plateau(80.0, ("reference.targets[0]",), (8.0,)).time_s
+    80.0
+    """
+
+    time_s: float
+    """From when on [s]."""
+    names: tuple[str, ...]
+    """(outputs,) dotted name of each setpoint."""
+    values: tuple[float, ...]
+    """(outputs,) each setpoint [cm]."""
+
+
+def plateaus_of(case: Case) -> list[Plateau] | None:
+    """Return the plateaus of a case in order of time, or None where its reference has none.
+
+    Those whose changes end before the next one and the end of the run; none of those during which
+    a sine moves an output.
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> [p.values for p in plateaus_of(presets.find("gouta2015/backstepping"))][1:3]
+    [(8.0, 8.0), (8.0, 14.0)]
+    """
+    reference: Any = case.loop.reference
+    if isinstance(reference, Ramps):
+        return _of_ramps(reference, case.clock.duration, "reference.")
+    if isinstance(reference, Constant):
+        names = tuple(f"reference.level[{i}]" for i in range(reference.channels))
+        return [Plateau(0.0, names, tuple(map(float, reference.level)))]
+    if isinstance(reference, Sum) and isinstance(reference.first, Ramps):
+        sine = reference.second
+        if isinstance(sine, Sine):
+            found = _of_ramps(reference.first, case.clock.duration, "reference.first.")
+            ends = [p.time_s for p in found[1:]] + [case.clock.duration]
+            apart = lambda p, end: end <= sine.start or p.time_s >= sine.end
+            return [p for p, end in zip(found, ends) if apart(p, end)]
+    return None
+
+
+def _of_ramps(reference, duration, prefix):
+    """The plateaus of Ramps of which the dotted names begin with `prefix`."""
+    ramp = float(reference.ramp)
+    names = [f"{prefix}initial[{i}]" for i in range(reference.channels)]
+    values = [float(v) for v in reference.initial]
+    starts = sorted({time for time, _ in reference.changes})
+    found = [] if starts and starts[0] <= 0.0 else [Plateau(0.0, tuple(names), tuple(values))]
+    for start, following in zip(starts, [*starts[1:], np.inf]):
+        for j, (time, i) in enumerate(reference.changes):
+            if time == start:
+                names[i], values[i] = f"{prefix}targets[{j}]", float(reference.targets[j])
+        if start + ramp <= min(following, duration):
+            found.append(Plateau(start + ramp, tuple(names), tuple(values)))
+    return found
