@@ -13,7 +13,6 @@ import importlib
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
 TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
-    from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
     from tuning.identification.design import compare_experiments as compare_experiments
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from tuning.identification.fit import identify as identify
     from tuning.identification.problem import Estimation as Estimation
     from tuning.identification.result import Identification as Identification
+    from tuning.identification.result import Identifications as Identifications
     from tuning.optimal_input.perfect_information import bound as bound
     from tuning.problem.bounds import Bound as Bound
     from tuning.problem.problem import Problem as Problem
@@ -72,7 +72,7 @@ _NAMES = {
     "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",
-    "Identifications": "tuning.identification.batch",
+    "Identifications": "tuning.identification.result",
     "identify": "tuning.identification.fit",
     "identify_many": "tuning.identification.batch",
     "log": "tuning.identification.experiment",
