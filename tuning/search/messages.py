@@ -10,7 +10,7 @@ no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
 objective-without-slope          the gradient of the objective is zero: it changes in steps
-gradient-not-zero                a gradient is left that no active limit balances
+gradient-not-zero                a slope of the objective is left that no active limit blocks
 kink                             the same, but nothing lower was found along it
 not-converged                    no search converged
 start-violates-limit             the values before tuning violate a limit
@@ -148,7 +148,7 @@ def _gradient_left(result: TuningResult) -> Found:
         kink = result.status == Status.CONVERGED
         yield Message(
             "kink" if kink else "gradient-not-zero",
-            "a gradient is left that no active limit balances (KKT residual"
+            "the objective has a slope in a direction that no active limit blocks (KKT residual"
             f" {residual:.2g} of the objective per range of a parameter): "
             + (
                 "a kink, because steps along it find nothing lower within the limits"
