@@ -1,4 +1,11 @@
-"""Everything here runs in float64; a test of float32 says so and runs in a process of its own."""
+"""Everything here runs in float64; a test of float32 says so and runs in a process of its own.
+
+Compiled programs are kept in pytest's own cache between runs and shared by workers and
+subprocesses; `pytest --cache-clear` compiles everything anew.
+"""
+
+import os
+import shutil
 
 import jax
 import pytest
@@ -6,6 +13,29 @@ import pytest
 import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 
 jax.config.update("jax_enable_x64", True)
+
+FOLDER = "JAX_COMPILATION_CACHE_DIR"
+LARGEST_CACHE = 2**30
+"""Bytes of compiled programs above which a run begins without any."""
+
+
+def pytest_configure(config):
+    """Keep what XLA compiles in .pytest_cache: its key holds program, options and versions.
+
+    Workers and subprocesses inherit the folder; one that the user has set stays.
+    """
+    cache = getattr(config, "cache", None)
+    if cache is None or FOLDER in os.environ:  # -p no:cacheprovider; a worker
+        return
+    folder = cache.mkdir("xla")
+    entries = [path for path in folder.iterdir() if path.is_file()]
+    if sum(path.stat().st_size for path in entries) > LARGEST_CACHE:
+        shutil.rmtree(folder)
+        folder = cache.mkdir("xla")
+    os.environ[FOLDER] = str(folder)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+    jax.config.update("jax_compilation_cache_dir", str(folder))  # jax has read the environment
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by marks

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from tuning.answer.default import tune as tune
     from tuning.falsification.result import Attack as Attack
     from tuning.falsification.study import attack as attack
-    from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
     from tuning.identification.design import compare_experiments as compare_experiments
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from tuning.identification.fit import identify as identify
     from tuning.identification.problem import Estimation as Estimation
     from tuning.identification.result import Identification as Identification
+    from tuning.identification.result import Identifications as Identifications
     from tuning.optimal_input.perfect_information import bound as bound
     from tuning.problem.bounds import Bound as Bound
     from tuning.problem.problem import Problem as Problem
@@ -77,7 +77,7 @@ _NAMES = {
     "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",
-    "Identifications": "tuning.identification.batch",
+    "Identifications": "tuning.identification.result",
     "identify": "tuning.identification.fit",
     "identify_many": "tuning.identification.batch",
     "log": "tuning.identification.experiment",

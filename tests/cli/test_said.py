@@ -40,7 +40,7 @@ def test_without_limits_nothing_is_said_to_hold():
     assert (
         "all limits held" not in page
         and "rims are limits" not in page
-        and "a level may rise above one unnoticed" in page
+        and "a level above its rim is not reported" in page
     )
     page = repr(tuning.tune(case, limits={"max_level": "rim"}, **QUICK))
     assert "all limits held" in page and "rims are limits" in page

@@ -21,55 +21,14 @@ from tuning.identification.confidence import ROUND_OFF, VAGUE
 from tuning.identification.data_checks import check_data, check_float64, check_length
 from tuning.identification.experiment import Log
 from tuning.identification.problem import Estimation
+from tuning.identification.result import Identifications
 
 MEMORY = 256 * 2**20
 """Bytes of sensitivities held at once: the logs are simulated in chunks that fit."""
 STATIONARY = 1e-10
 """Share of the cost below which the predicted gain of a full step ends a fit."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Identifications:
-    """Result of `tuning.identify_many`: arrays with one row for each log.
-
-    Attributes
-    ----------
-    names, units : tuple of str
-        Of the parameters.
-    values, sd : (logs, parameters) array
-        Estimates and standard deviations; NaN in `sd`, `interval95` and `covariance` of what is not
-        identifiable or ends at its bound.
-    interval95 : (logs, parameters, 2) array
-        95 % intervals, for white noise.
-    covariance : (logs, parameters, parameters) array
-        Of the estimates.
-    levels, levels_sd : (logs, tanks) array
-        Levels at the first sample.
-    rmse, autocorrelation : (logs, channels) array
-        Of the residuals; autocorrelation at one sample.
-    converged : (logs,) bool array
-    iterations : int
-        Of the slowest fit.
-    wall_s : float
-        Run time [s].
-    """
-
-    names: tuple
-    units: tuple
-    values: np.ndarray
-    sd: np.ndarray
-    interval95: np.ndarray
-    covariance: np.ndarray
-    levels: np.ndarray
-    levels_sd: np.ndarray
-    rmse: np.ndarray
-    autocorrelation: np.ndarray
-    converged: np.ndarray
-    iterations: int
-    wall_s: float
-
-    def __len__(self):
-        return len(self.values)
+STUCK = 1e12
+"""Damping above which a fit has stopped without converging."""
 
 
 def identify_many(
@@ -136,10 +95,10 @@ def identify_many(
     )
     batch = _Batch(problem)
     z, end, converged, count = _minimise(batch, iterations)
-    return _result(batch, z, end, converged=converged, iterations=count, began=began)
+    return _result(case, batch, z, end, converged=converged, iterations=count, began=began)
 
 
-def _result(batch, z, end, *, converged, iterations, began):
+def _result(case, batch, z, end, *, converged, iterations, began):
     """Return the Identifications at the unknowns z (logs, unknowns)."""
     problem, logs = batch.problem, len(z)
     names, shared, tanks = problem.coordinates.names, problem.coordinates.size, list(problem.tanks)
@@ -155,7 +114,11 @@ def _result(batch, z, end, *, converged, iterations, began):
     with np.errstate(invalid="ignore", divide="ignore"):  # a channel without a reading in some log
         rmse = np.sqrt(end.squares / problem.mask.sum(axis=1)) * problem.noise
         autocorrelation = end.products / end.squares
+    length = case.loop.units[0]
     return Identifications(
+        case=case,
+        logs=tuple(log.name for log in problem.logs),
+        channels=tuple((f"h{i + 1}", "V" if v else length) for i, v in problem.data.channels),
         names=names,
         units=tuple(next(b.unit for b in problem.bounds if b.name == n) for n in names),
         values=values,
@@ -285,9 +248,9 @@ def _minimise(batch, iterations):
         for new, old in zip((trial, *at), (z, *here)):
             old[better] = new[better]
         eased = damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3)
-        damping = np.where(better, eased, damping * growth)
-        growth = np.where(better, 2.0, 2 * growth)
-        stuck |= damping > 1e12
+        damping = np.where(better, eased, np.minimum(damping * growth, STUCK * 10))
+        growth = np.where(better, 2.0, np.minimum(2 * growth, STUCK))
+        stuck |= damping > STUCK
         damping = np.maximum(damping, 1e-12)
     return z, here, done, count
 

@@ -1,6 +1,6 @@
-"""The result of `identify`: estimates with intervals, the identified case, files and figures.
+"""The results of `identify` (estimates with intervals, the identified case) and `identify_many`.
 
-Imported by `fit`; reports are opened when they are asked for.
+Imported by `fit` and `batch`; reports are opened when they are asked for.
 """
 
 import dataclasses
@@ -116,3 +116,60 @@ class Identification(Result):
     def message(self) -> str:
         """How it ended, in one line."""
         return self._report().message(self)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False, eq=False)
+class Identifications(Result):
+    """Result of `tuning.identify_many`: arrays with one row for each log.
+
+    `print(result)` for a table; `to_json()`, `plot()`, `save(folder)`.
+
+    Attributes
+    ----------
+    case : Case
+        The case that was given.
+    logs : tuple of str
+        Names of the logs.
+    channels : tuple of (str, str)
+        (name, unit) of each channel of readings.
+    names, units : tuple of str
+        Of the parameters.
+    values, sd : (logs, parameters) array
+        Estimates and standard deviations; NaN in `sd`, `interval95` and `covariance` of what is not
+        identifiable or ends at its bound.
+    interval95 : (logs, parameters, 2) array
+        95 % intervals, for white noise.
+    covariance : (logs, parameters, parameters) array
+        Of the estimates.
+    levels, levels_sd : (logs, tanks) array
+        Levels at the first sample.
+    rmse, autocorrelation : (logs, channels) array
+        Of the residuals; autocorrelation at one sample.
+    converged : (logs,) bool array
+    iterations : int
+        Of the slowest fit.
+    wall_s : float
+        Run time [s].
+    """
+
+    REPORT = "tuning.report.studies.identifications"
+
+    case: Case
+    logs: tuple[str, ...]
+    channels: tuple[tuple[str, str], ...]
+    names: tuple
+    units: tuple
+    values: np.ndarray
+    sd: np.ndarray
+    interval95: np.ndarray
+    covariance: np.ndarray
+    levels: np.ndarray
+    levels_sd: np.ndarray
+    rmse: np.ndarray
+    autocorrelation: np.ndarray
+    converged: np.ndarray
+    iterations: int
+    wall_s: float
+
+    def __len__(self):
+        return len(self.values)

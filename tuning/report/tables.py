@@ -28,14 +28,34 @@ def number(value, digits=5):
 
 
 def numbers(value, digits=5):
-    """Return the entries of a measure, side by side.
+    """Return the entries of a measure, side by side; "none" for one that is undefined.
+
+    A dash would read as the sign of the entry after it.
 
     Examples
     --------
-    >>> numbers([1.0, 2.5])
-    '1  2.5'
+    >>> numbers([1.0, 2.5]), numbers([float("inf"), 3.0])
+    ('1  2.5', 'none  3')
     """
-    return "  ".join(number(v, digits) for v in np.ravel(value))
+    values = np.ravel(np.asarray(value, dtype=float))
+    return "  ".join(number(v, digits) if math.isfinite(v) else "none" for v in values)
+
+
+def undefined(measures):
+    """Return sentences: why entries of {measure: value} are printed as "none".
+
+    Examples
+    --------
+    >>> undefined({"max_level": [3.0]})
+    []
+    >>> undefined({"estimation_rms": [float("nan")]})[0].startswith("estimation_rms: none, because")
+    True
+    """
+    return [
+        f"{m}: none, because {why}"
+        for m, v in measures.items()
+        if (why := _why(m, v)) and not np.isfinite(np.asarray(v, dtype=float)).all()
+    ]
 
 
 def reasons(measures):

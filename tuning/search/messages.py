@@ -11,7 +11,7 @@ no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
 objective-without-slope          the gradient of the objective is zero: it changes in steps
-gradient-not-zero                a gradient is left that no active limit balances
+gradient-not-zero                a slope of the objective is left that no active limit blocks
 kink                             the same, but nothing lower was found along it
 not-converged                    no search converged
 start-violates-limit             the values before tuning violate a limit

@@ -211,7 +211,7 @@ def _gradient_left(result: TuningResult) -> Found:
         kink = result.status == Status.CONVERGED
         yield Message(
             "kink" if kink else "gradient-not-zero",
-            "a gradient is left that no active limit balances (KKT residual"
+            "the objective has a slope in a direction that no active limit blocks (KKT residual"
             f" {residual:.2g} of the objective per range of a parameter): "
             + (
                 "a kink, because steps along it find nothing lower within the limits"

@@ -3,6 +3,7 @@ the chain to a tuned rig.
 """
 
 import csv
+import dataclasses
 import functools
 import json
 
@@ -218,6 +219,44 @@ def test_coverage_of_the_intervals(case, hundred):
         np.abs(hundred.autocorrelation).mean(), np.sqrt(2 / np.pi / 300), rtol=0.15
     )
     assert hundred.rmse.mean() == pytest.approx(0.1, rel=0.01)
+
+
+def test_many_records_have_the_face_of_every_result(hundred, tmp_path):
+    """Text, HTML, JSON, files: the numbers of the arrays, one record with a bound without sd."""
+    few = dataclasses.replace(
+        hundred,
+        **{
+            field: getattr(hundred, field)[:3].copy()
+            for field in ["values", "sd", "interval95", "covariance", "levels", "levels_sd", "rmse"]
+        },
+        autocorrelation=hundred.autocorrelation[:3],
+        converged=np.array([True, True, False]),
+        logs=hundred.logs[:3],
+    )
+    few.sd[2, 1], few.interval95[2, 1] = np.nan, np.nan
+    text = str(few)
+    assert "3 records, each fitted separately; 2 converged" in text
+    assert f"{few.values[0, 0]:.5g} (sd {few.sd[0, 0]:.2g})" in text
+    assert f"{few.values[2, 1]:.5g} (no interval)" in text
+    assert "<table>" in few._repr_html_() and "<table>" in hundred._repr_html_()
+
+    paths = few.save(tmp_path / "out")
+    assert {p.name for p in paths} == {
+        *("result.json", "estimates.csv", "estimates.png", "report.html")
+    }
+    record = json.loads((tmp_path / "out" / "result.json").read_text())["records"][2]
+    names = few.names
+    assert record == json.loads(json.dumps(few.to_json()["records"][2]))
+    assert record["parameters"][names[0]]["value"] == few.values[2, 0]
+    assert record["parameters"][names[0]]["interval95"] == few.interval95[2, 0].tolist()
+    assert record["parameters"][names[1]]["sd"] is None and not record["converged"]
+    assert len({r["name"] for r in few.to_json()["records"]}) == 3
+    rows = list(csv.DictReader((tmp_path / "out" / "estimates.csv").open()))
+    column = next(head for head in rows[0] if head.startswith(names[1]))
+    np.testing.assert_allclose([float(r[column]) for r in rows], few.values[:, 1], rtol=1e-9)
+    axes = few.plot()["estimates"].axes
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), few.values[:, 0])
+    np.testing.assert_array_equal(axes[1].lines[1].get_ydata(), few.values[2:, 1])
 
 
 def test_the_batch_and_the_single_fit_agree(away, clean, hundred):

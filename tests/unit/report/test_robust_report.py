@@ -31,7 +31,7 @@ def row(page, name):
 def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case):
     result = tuning.tune_robust(case, samples=3, fresh=4, **SEARCH)
     page = repr(result)
-    assert f"objective: the mean of 3 plants{RESTS}" in page
+    assert f"objective: rms_error_total; the mean of 3 plants{RESTS}" in page
     costs = [s["objective"]["after"] for s in report.scenario_rows(result)]
     assert float(row(page, "objective")[2]) == pytest.approx(np.mean(costs), rel=1e-4)
     alone = jaxtank.evaluate(result.tuned.loop, result.tuned.clock, ["max_error"])["max_error"]
@@ -56,11 +56,24 @@ def test_scenarios_are_told_as_such(case, weights, words):
             **SEARCH,
         )
     )
-    assert f"objective: {words}{RESTS}" in page
+    assert f"objective: rms_error_total; {words}{RESTS}" in page
 
 
 def test_a_single_run_needs_no_such_line(case):
-    assert "other rows" not in repr(tuning.tune(case, validation=0, **SEARCH))
+    """What is not a number is explained, and so is a rig without validation runs."""
+    result = tuning.tune(case, validation=0, **SEARCH)
+    page = repr(result)
+    assert "other rows" not in page and "\nobjective: rms_error_total\n" in page
+    assert page.count("\nsettling_time: none, because") == 1 and "no validation" not in page
+    before, after = ({**result.measures[side]} for side in ("before", "after"))
+    before["settling_time"], after["settling_time"] = [np.inf], [-3.0]
+    plain = result.case.replace(uncertain={}, covariance=None)
+    other = result.replace(case=plain, measures={"before": before, "after": after})
+    page = repr(other)
+    assert row(page, "settling_time")[1:] == ["none", "-3"]
+    assert "before, settling_time: none, because the output was outside its band" in page
+    assert "settling_time: a negative time [s] is one before the end of the change" in page
+    assert "no validation on other plants" in page and "[uncertain]" in page
 
 
 def test_what_was_expected_stands_apart_from_what_was_measured():

@@ -138,6 +138,8 @@ def simulate(args):
         print(tables.dumps(payload))
     else:
         print(f"{case.name}: {case.title}\n\n{tables.measure_table(values, case.loop.units)}")
+        for line in tables.undefined(values):
+            print(line)
         if case.loop.safety_filter is not None:
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
     report_written(written, args)

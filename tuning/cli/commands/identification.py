@@ -10,6 +10,7 @@ from tuning.cli import values
 from tuning.cli.arguments import option, repeatable
 from tuning.cli.interrupts import Interrupts, put_back
 from tuning.cli.options import report_unreachable, report_written
+from tuning.cli.terminal import Line
 
 LONGEST = 1e7
 """Longest planned experiment [s]: four months."""
@@ -115,9 +116,11 @@ def _identify(args, case, free):
         if not args.quiet:
             names, samples = ", ".join(one.name for one in logs), sum(one.samples for one in logs)
             print(f"{names}: {samples} samples", file=sys.stderr, flush=True)
+            line.compiling("the simulation and its derivatives", 10)
 
-    interrupts = Interrupts()
+    line, interrupts = Line(args.quiet), Interrupts()
     found = identify(case, logs, free, progress=interrupts.check, ready=ready, **options)
+    line.end()
     written = []
     try:
         written = found.save(args.out, args.line) if args.out else []

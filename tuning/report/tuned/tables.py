@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.problem.problem import TAIL
-from tuning.report.tables import clean, number, numbers, objective_unit, table
+from tuning.report.tables import clean, number, numbers, objective_unit, table, undefined
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""
@@ -30,9 +30,12 @@ def parts_of(result):
     if result.tuned.loop.plant.overflow:
         rims = "rims are physics: liquid above them overflows"
     elif any(limit.measure == "max_level" for limit in problem.limits):
-        rims = "rims are limits: a level may rise above one"
+        rims = "rims are limits only: nothing spills in the model, so a level may be above its rim"
     else:
-        rims = "rims are neither physics nor limits here: a level may rise above one unnoticed"
+        rims = (
+            "rims are neither physics nor limits here: nothing spills in the model, and a level"
+            " above its rim is not reported"
+        )
     return [*parts, f"{rims}; evaluated at dt = {result.tuned.clock.dt:g} s"]
 
 
@@ -64,15 +67,37 @@ def _measure_table(result):
     objective, measures = result.objective, result.measures
     unit = objective_unit(objective["terms"], units)
     rows = [["objective", unit, number(objective["before"]), number(objective["after"])]]
+    shown = []
     alone = set(objective["terms"])
     for m in ms.placed("shown"):
         if m not in measures["after"] or (m == "rms_error_total" and alone == {m}):
             continue
         before = numbers(measures["before"][m], 4)
         after = numbers(measures["after"][m], 5 if "level" in m else 4)
+        shown.append(m)
         rows.append([m, ms.unit(m, units), before, after])
     heads = ["measure", "unit", "before", "after"]
-    return [table(rows, heads), *_runs_of(result, len(rows) > 1)]
+    terms = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in objective["terms"].items())
+    notes = _notes({m: (measures["before"][m], measures["after"][m]) for m in shown}, units)
+    runs = _runs_of(result, len(rows) > 1)
+    return [table(rows, heads), "; ".join([f"objective: {terms}", *runs]), *notes]
+
+
+def _notes(shown, units):
+    """Return sentences on entries that are not plain numbers: undefined ones, negative times.
+
+    shown : {measure: (before, after)}.
+    """
+    before, after = (undefined({m: pair[i] for m, pair in shown.items()}) for i in (0, 1))
+    words = [line for line in before if line in after]
+    words += [f"before, {line}" for line in before if line not in after]
+    words += [f"after, {line}" for line in after if line not in before]
+    if any(np.any(np.asarray(v) < 0) for v in shown.get("settling_time", ())):
+        words.append(
+            f"settling_time: a negative time [{ms.unit('settling_time', units)}] is one before the"
+            " end of the change of the setpoint"
+        )
+    return words
 
 
 def _limit_table(result):
@@ -109,7 +134,7 @@ def _runs_of(result, others):
         "worst": "the worst",
     }
     rest = "; the other rows: the case's own run, on its own plant" if others else ""
-    return [f"objective: {of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
+    return [f"{of[problem.risk]} of {len(problem.runs)} {what}{rest}"]
 
 
 def worst_of_scenarios(constraints):
@@ -194,7 +219,7 @@ def _validation_table(result):
     """The objective and the limits on the validation set, before and after."""
     found = result.validation
     if not found:
-        return []
+        return _why_not_validated(result)
     rows = [
         [
             side,
@@ -220,6 +245,18 @@ def _validation_table(result):
     return [table(rows, heads), f"{_improved(found)}; perturbed: {perturbed}{noise}{failed}", ""]
 
 
+def _why_not_validated(result):
+    """Return a sentence: the rig names nothing from which validation runs could be drawn."""
+    case = result.case
+    if case.uncertain or case.covariance or any(run.key is not None for run in result.problem.runs):
+        return []
+    return [
+        "no validation on other plants: the rig names nothing that is uncertain. An [uncertain]"
+        ' table in its file ("plant.drain" = 0.05 for +-5 %) makes tune validate the answer',
+        "",
+    ]
+
+
 def _improved(found):
     """Return in how many validation runs tuning improved the objective, in words.
 
@@ -227,11 +264,18 @@ def _improved(found):
     """
     if found["comparable"] == 1.0:
         return f"tuning improved the objective in {100 * found['better_share']:.0f} % of them"
-    part = f"every limit holds both before and after in {100 * found['comparable']:.3g} % of them"
     share = found["better_share_of_comparable"]
     if share is None:
-        return f"{part}, so the objectives cannot be compared"
-    return f"{part}, and tuning improved the objective in {100 * share:.0f} % of those"
+        return (
+            "in no run do the starting and the tuned values both hold all limits, so the"
+            " objectives cannot be compared"
+        )
+    runs = round(found["comparable"] * (found["samples"] - found["failed"]))
+    return (
+        f"the starting and the tuned values both hold all limits in {runs} of these runs"
+        f" ({100 * found['comparable']:.3g} %); there tuning improved the objective in"
+        f" {100 * share:.0f} %"
+    )
 
 
 def _choice_table(result):
