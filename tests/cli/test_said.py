@@ -35,14 +35,14 @@ def test_the_advice_is_taken(tmp_path, capsys):
 
 def test_without_limits_nothing_is_said_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
-    page = repr(tuning.tune(case, limits={}, **QUICK))
+    page = repr(tuning.tune(case, nominal=True, limits={}, **QUICK))
     assert "validation runs" in page
     assert (
         "all limits held" not in page
         and "rims are limits" not in page
         and "a level above its rim is not reported" in page
     )
-    page = repr(tuning.tune(case, limits={"max_level": "rim"}, **QUICK))
+    page = repr(tuning.tune(case, nominal=True, limits={"max_level": "rim"}, **QUICK))
     assert "all limits held" in page and "rims are limits" in page
 
 

@@ -114,7 +114,7 @@ def test_slopes_by_law_and_plant_are_those_of_differences(case):
 
 
 def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
-    result = tuning.tune(case, starts=1, screening=4, validation=4)
+    result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
     assert result.success and result.objective["after"] < 0.9 * result.objective["before"]
     found = tuning.ensemble(result.tuned, samples=8, fan=False)
     assert (
@@ -128,7 +128,7 @@ def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
 
 def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
     """Neither class has a name in a rig file; all but rig.toml is written."""
-    result = tuning.tune(case, starts=1, screening=4, validation=4)
+    result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
     (tmp_path / "rig.toml").write_text("of an earlier result")
     (tmp_path / "result.json").write_text("{}")
     with pytest.warns(

@@ -274,7 +274,7 @@ def test_an_answer_says_that_its_run_is_of_steps_too_long(last, substeps, words,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         case = rig.loads(COLANDER.format(last=last, substeps=substeps))
-        result = tuning.tune(case, starts=1, screening=2, iterations=2, validation=0)
+        result = tuning.tune(case, nominal=True, starts=1, screening=2, iterations=2, validation=0)
         told = [repr(result), json.dumps(report.json_of(result), ensure_ascii=False)]
         if words == WRONG:  # the page as well: its pictures take longer than the search
             result.save(tmp_path)
@@ -293,7 +293,7 @@ def test_an_answer_says_it_of_a_scenario_too():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         case = rig.from_table({**tomllib.loads(text), "scenario": [{"name": "high"}, low]})
-        result = tuning.tune(case, starts=1, screening=2, iterations=2, validation=0)
+        result = tuning.tune(case, nominal=True, starts=1, screening=2, iterations=2, validation=0)
     assert result.message.startswith(f"scenario low: {WRONG}")
 
 

@@ -203,7 +203,7 @@ def test_minibatches_come_near_the_whole(case):
         "screening": 8,
         "validation": 0,
     }
-    best = tuning.tune(case, **options).objective["after"]
+    best = tuning.tune(case, nominal=True, **options).objective["after"]
     drawn = tuning.tune(case, batch=2, iterations=30, **options)
     assert drawn.method == "adam" and drawn.objective["after"] < 1.03 * best
     again = tuning.tune(case, batch=2, iterations=30, **options)
@@ -355,7 +355,7 @@ def test_a_start_from_rest_where_there_is_none_is_refused():
     with pytest.raises(
         InputError, match=r"scenario 'pump 1 \+30 %': x0 = \"steady\": .*leave the scenario out"
     ):
-        tuning.tune(again)
+        tuning.tune(again, nominal=True)
 
 
 @pytest.mark.parametrize(
@@ -530,7 +530,7 @@ def test_trf_on_a_quadratic_is_one_step_from_its_answer():
 @pytest.mark.slow
 def test_mirror_images_are_named_and_counted_once():
     case = rig.set_values(presets.find("calofir/backstepping"), {"clock.substeps": 1})
-    result = tuning.tune(case, starts=4, screening=16, validation=0)
+    result = tuning.tune(case, nominal=True, starts=4, screening=16, validation=0)
     a, b = (result.parameters[n]["after"] for n in ("controller.K_phi", "controller.K_y"))
     assert result.symmetry["values"] == {"controller.K_phi": b, "controller.K_y": a}
     assert result.symmetry["objective"] == pytest.approx(result.objective["after"], rel=1e-6)
@@ -559,7 +559,7 @@ def test_the_trade_off_of_a_limit(case):
     ] == "infeasible"
     costs = [p["objective"] for p in points[:3]]
     assert costs == sorted(costs) and costs[2] > 1.05 * costs[0]
-    alone = tuning.tune(case, limits={"max_level": 31.0}, starts=4, screening=16, validation=0)
+    alone = tuning.tune(case, nominal=True, limits={"max_level": 31.0}, starts=4, screening=16, validation=0)
     assert points[2]["objective"] == pytest.approx(alone.objective["after"], rel=2e-3)
     assert points[3]["violation"] > 0.12  # a share of the limit: more than 3 cm
 

@@ -71,7 +71,7 @@ def case(gouta):
 def results(case, tmp_path_factory):
     """{kind: (what saves itself to a folder, names of its pictures)}."""
     tuned = tuning.tune(
-        case, starts=1, screening=2, iterations=3, validation=4, limits={"max_level": 30.0}
+        case, nominal=True, starts=1, screening=2, iterations=3, validation=4, limits={"max_level": 30.0}
     )
     cloud = tuning.ensemble(case, samples=4, limits={"max_level": 9.0})
     felt = tuning.sensitivity(

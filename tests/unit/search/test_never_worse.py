@@ -199,7 +199,7 @@ def held(result):
 
 def test_no_screened_point_is_better_at_the_true_step_where_the_coarse_one_differs(watertank):
     case = rig.set_values(watertank, {"clock.dt": 0.004})
-    result = tuning.tune(case, starts=1, screening=16, validation=0, seed=5)
+    result = tuning.tune(case, nominal=True, starts=1, screening=16, validation=0, seed=5)
     assert result.provenance["coarse_dt_s"] == 0.04
     zs = sobol(16, 2, seed=5)
     costs, margins = result.problem.screen(zs)
@@ -231,7 +231,7 @@ def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank
 def test_a_controller_that_no_longer_follows_is_not_converged(watertank):
     """The least total variation of the input is that of gains at their lower ends."""
     result = tuning.tune(
-        watertank, objective={"input_travel": 1.0}, limits={}, starts=2, screening=4, validation=0
+        watertank, nominal=True, objective={"input_travel": 1.0}, limits={}, starts=2, screening=4, validation=0
     )
     codes = [m.code for m in result.messages]
     assert result.status == "not_converged" and "no-longer-follows" in codes
@@ -282,4 +282,4 @@ def test_a_start_at_a_constant_setpoint_is_no_change(watertank):
     why, missing = undefined("rise_time", case)
     assert missing == [True] and "x0" in why
     with pytest.raises(jaxtank.InputError, match="rise_time = 5 s: undefined on this run"):
-        tuning.tune(case, limits={"rise_time": 5.0}, starts=1)
+        tuning.tune(case, nominal=True, limits={"rise_time": 5.0}, starts=1)

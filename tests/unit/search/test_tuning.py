@@ -31,7 +31,7 @@ FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 @pytest.mark.slow
 def test_ngpc_on_tracking_error_alone(gouta):
     """RMS 0.0820 -> at most 0.0405 cm, Tp near 5.15 s."""
-    result = tuning.tune(gouta("ngpc"), free={"controller.Tp": (1.0, 60.0)}, limits={})
+    result = tuning.tune(gouta("ngpc"), nominal=True, free={"controller.Tp": (1.0, 60.0)}, limits={})
     assert result.success and result.method == "trf"
     np.testing.assert_allclose(result.objective["before"], 0.0820, atol=5e-5)
     assert result.objective["after"] <= 0.0405
@@ -42,7 +42,7 @@ def test_ngpc_on_tracking_error_alone(gouta):
 @pytest.mark.slow
 def test_backstepping_on_tracking_error_alone(gouta):
     """RMS 0.506 -> at most 0.048 cm."""
-    result = tuning.tune(gouta("backstepping"), limits={})
+    result = tuning.tune(gouta("backstepping"), nominal=True, limits={})
     assert result.success
     np.testing.assert_allclose(result.objective["before"], 0.5063, atol=1e-4)
     assert result.objective["after"] <= 0.048
@@ -50,7 +50,7 @@ def test_backstepping_on_tracking_error_alone(gouta):
 
 @pytest.fixture(scope="module")
 def limited(gouta):
-    return tuning.tune(gouta("backstepping"))
+    return tuning.tune(gouta("backstepping"), nominal=True)
 
 
 def test_backstepping_under_the_rims(gouta, limited):
@@ -161,7 +161,7 @@ def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     """
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
     result = tuning.tune(
-        case, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4
+        case, nominal=True, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4
     )
     np.testing.assert_allclose(result.parameters["controller.Tp"]["after"], 7.33, atol=0.15)
     np.testing.assert_allclose(result.objective["after"], 1.796, rtol=5e-3)
@@ -185,7 +185,7 @@ def test_the_penalised_cost_is_that_of_the_tuning_study(gouta, Tp, cost):
 
 def quick(gouta, name="backstepping", values=None, **options):
     few = {"starts": 2, "screening": 8, "validation": 0}
-    return tuning.tune(gouta(name, {**FAST, **(values or {})}), **{**few, **options})
+    return tuning.tune(gouta(name, {**FAST, **(values or {})}), nominal=True, **{**few, **options})
 
 
 @pytest.fixture(scope="module")
@@ -257,9 +257,9 @@ def test_rims_as_physics_turn_the_limit_into_one_of_overflow(gouta):
 @pytest.mark.slow
 def test_a_limit_of_no_overflow_can_be_met_and_is_held_by_the_answer(gouta):
     case = gouta("backstepping", {**FAST, "plant.overflow": True})
-    result = tuning.tune(case, starts=2, screening=8)
+    result = tuning.tune(case, nominal=True, starts=2, screening=8)
     assert result.success and max(c["value"] for c in result.constraints) <= 1e-3
-    numeric = tuning.tune(case, starts=2, screening=8, limits={"max_level": 30.0})
+    numeric = tuning.tune(case, nominal=True, starts=2, screening=8, limits={"max_level": 30.0})
     assert {c["measure"] for c in numeric.constraints} == {"overflow_volume"}
 
 
@@ -519,7 +519,7 @@ def test_an_objective_of_zero_gives_no_share_and_no_warning():
         {"clock.duration": 40.0},
     )
     result = tuning.tune(
-        case, free={"controller.Kc": (0.5, 2.0)}, starts=1, screening=4, validation=0
+        case, nominal=True, free={"controller.Kc": (0.5, 2.0)}, starts=1, screening=4, validation=0
     )
     assert (
         result.objective["after"] == 0.0

@@ -43,13 +43,13 @@ def told(result):
 def whole(gouta, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
     return (
-        tuning.tune(gouta("backstepping", FAST), log=folder, **OPTIONS),
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=folder, **OPTIONS),
         (folder / NAME).read_bytes(),
     )
 
 
 def test_with_and_without_a_log_alike(gouta, whole):
-    assert told(tuning.tune(gouta("backstepping", FAST), **OPTIONS)) == told(whole[0])
+    assert told(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == told(whole[0])
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
@@ -57,7 +57,7 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
     data = whole[1]
     (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
     kept = data[: int(share * len(data))].count(b"\n")
-    result = tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+    result = tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     assert told(result) == told(whole[0])
     assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
 
@@ -66,31 +66,31 @@ def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch
     (tmp_path / NAME).write_bytes(whole[1])
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
     assert told(
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     ) == told(whole[0])
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
     (tmp_path / NAME).write_bytes(whole[1])
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, seed=1, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS)
     with pytest.raises(InputError, match="what differs: loop"):
         tuning.tune(
-            gouta("backstepping", {**FAST, "controller.k": 0.031}),
+            gouta("backstepping", {**FAST, "controller.k": 0.031}), nominal=True,
             log=tmp_path,
             resume=True,
             **OPTIONS,
         )
     assert (tmp_path / NAME).read_bytes() == whole[1]
     with pytest.raises(InputError, match="holds no checkpoint to continue"):
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path / "none", resume=True, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS)
 
 
 @pytest.mark.parametrize("text", [b"hello\n", b"[1]\n", b'{"jaxtank": 1}\n', b"\xff\xfe\n"])
 def test_what_is_no_log_is_refused(gouta, tmp_path, text):
     (tmp_path / NAME).write_bytes(text)
     with pytest.raises(InputError, match="not a log"):
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     assert (tmp_path / NAME).read_bytes() == text
 
 
@@ -98,7 +98,7 @@ def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
     lines = whole[1].splitlines(keepends=True)
     (tmp_path / NAME).write_bytes(b"".join([*lines[:3], b"{}\n", *lines[3:]]))
     with pytest.raises(InputError, match="line 4"):
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
 
 
 @pytest.mark.parametrize(
