@@ -109,8 +109,9 @@ class Setting:
         except InputError:
             return self
         found, rows = searched.safety_design(**given)
-        band = np.asarray(found.band).tolist()
-        return self.replace(searched=searched, filter={"band": band} | given, certificates=rows)
+        # both follow from the noise, which the case as given may not state
+        own = {"band": np.asarray(found.band).tolist(), "rate": float(np.max(found.rate))}
+        return self.replace(searched=searched, filter=own | given, certificates=rows)
 
     def without_filter(self) -> "Setting":
         """Return the setting without a safety filter."""
