@@ -68,7 +68,8 @@ class Needs:
         drawn = lambda name: drawn_values(loop, name, values, count)
         inflow = drawn("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
         flows = {name: drawn(f"plant.{name}") for name in FLOWS}
-        self.case, self.plateaus, self.count = case, plateaus, count
+        self.case, self.values, self.limits = case, dict(values), limits
+        self.plateaus, self.count = plateaus, count
         self.states = SteadyStates(loop.plant, flows, inflow)
         # None of the names is drawn unless asked for: setpoints of one draw may differ from another
         self.setpoints = np.stack(
@@ -79,6 +80,10 @@ class Needs:
         top = np.where(self.at_rim, self.rim, level)
         self.low = np.concatenate([np.zeros_like(top), drawn("actuator.low")], axis=1)
         self.high = np.concatenate([top, drawn("actuator.high")], axis=1)
+
+    def first(self, count: int) -> "Needs":
+        """Return the Needs of the first `count` plants."""
+        return Needs(self.case, {n: v[:count] for n, v in self.values.items()}, self.limits)
 
     def at(self, setpoints: Any = None) -> np.ndarray:
         """Return (N, P, n + m) levels and inputs at setpoints (P, outputs) or (N, P, outputs).
