@@ -13,6 +13,12 @@ import importlib
 # A type checker reads these imports in place of `__getattr__`; at run time none is made here.
 TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --help
 if TYPE_CHECKING:
+    from tuning.feasible.result import Feasibility as Feasibility
+    from tuning.feasible.result import Mend as Mend
+    from tuning.feasible.study import apply_mend as apply_mend
+    from tuning.feasible.study import can_follow as can_follow
+    from tuning.feasible.study import feasibility as feasibility
+    from tuning.feasible.study import least_offset as least_offset
     from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
@@ -60,6 +66,12 @@ _NAMES = {
     "Status": "tuning.problem.status",
     "TuningResult": "tuning.search.result",
     "Certificate": "tuning.search.robust",
+    "Feasibility": "tuning.feasible.result",
+    "Mend": "tuning.feasible.result",
+    "apply_mend": "tuning.feasible.study",
+    "can_follow": "tuning.feasible.study",
+    "feasibility": "tuning.feasible.study",
+    "least_offset": "tuning.feasible.study",
     "Correlated": "tuning.uncertainty.distributions",
     "Discrete": "tuning.uncertainty.distributions",
     "Ensemble": "tuning.uncertainty.result",

@@ -20,6 +20,7 @@ SECTIONS = {"Parameters", "Returns", "Examples"}
 # Objects that functions return: the example is that of the function.
 RESULTS = {
     *("Trajectory", "Bound", "Certificate", "Ensemble", "Estimation", "Identification"),
+    "Feasibility",
     *("Identifications", "Log", "ParameterChange", "TuningResult"),
 }
 

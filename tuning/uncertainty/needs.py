@@ -11,6 +11,7 @@ from jaxtank.analysis.steady_batch import FLOWS, SteadyStates
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, split_index
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant
 from tuning.uncertainty.plateaus import plateaus_of
@@ -110,6 +111,27 @@ class Needs:
         return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
 
 
+def judges(case: Case) -> bool:
+    """Return whether `Needs` is defined for a case.
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> judges(presets.find("cascaded/pi"))
+    True
+    """
+    plant = case.loop.plant
+    return (
+        isinstance(plant, TankNetwork)
+        and plant.pumps == len(plant.outputs)
+        and bool(plateaus_of(case))
+    )
+
+
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:
     """Return (count, ...) values of a leaf, or of an entry of it, over the draws.
 
@@ -164,10 +186,7 @@ def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
     (N,) array of bool, or None
         None where the steady states of the plant have no closed form.
     """
-    plant, reference = case.loop.plant, case.loop.reference
-    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs):
-        return None
-    if reference.plateaus(case.clock.duration) is None or not plateaus_of(case):
+    if getattr(case.loop.plant, "pipes", None) != () or not judges(case):
         return None
     count = len(next(iter(values.values())))
     rims = {"max_level": "rim"}
