@@ -156,7 +156,7 @@ def _least_move(needs, where, values, quantile, start):
 
 def _rims(needs: Needs) -> Mend | None:
     """Rims raised; none where a limit of its own is below."""
-    if needs.rim.std(axis=0).any():
+    if np.ptp(needs.rim, axis=0).any():
         return None
     tanks = needs.rim.shape[1]
     return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), tanks)
@@ -165,7 +165,7 @@ def _rims(needs: Needs) -> Mend | None:
 def _pumps(needs: Needs) -> Mend | None:
     """Upper limits of the pumps raised."""
     tanks, whole = needs.rim.shape[1], needs.high.shape[1]
-    if needs.high[:, tanks:].std(axis=0).any():
+    if np.ptp(needs.high[:, tanks:], axis=0).any():
         return None
     return _raised(needs, "pumps", "actuator.high", tanks, np.arange(tanks, whole), whole)
 

@@ -47,7 +47,7 @@ class Needs:
     --------
     >>> from jaxtank import presets
     >>> case = presets.find("gouta2015/backstepping")
-    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.5]]})
+    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.4]]})
     >>> needs.at().shape, needs.feasible().tolist()
     ((2, 6, 6), [True, False])
     """
@@ -57,13 +57,10 @@ class Needs:
     ):
         loop: Any = case.loop
         plateaus = plateaus_of(case)
-        if not plateaus:
+        if not judges(case) or not plateaus:
             raise InputError(
-                f"{case.name}: its reference has no plateaus, so none can be infeasible"
-            )
-        if not hasattr(loop.plant, "links") or loop.plant.pumps != len(loop.plant.outputs):
-            raise InputError(
-                f"{case.name}: steady states need a network of tanks with as many pumps as outputs"
+                f"{case.name}: feasibility is for networks of tanks with as many pumps as outputs,"
+                " and setpoints that are held for a while (no sine)"
             )
         count = len(next(iter(values.values()))) if values else 1
         drawn = lambda name: drawn_values(loop, name, values, count)
@@ -72,7 +69,6 @@ class Needs:
         self.case, self.values, self.limits = case, dict(values), limits
         self.plateaus, self.count = plateaus, count
         self.states = SteadyStates(loop.plant, flows, inflow)
-        # None of the names is drawn unless asked for: setpoints of one draw may differ from another
         self.setpoints = np.stack(
             [np.stack([drawn(name) for name in p.names], axis=-1) for p in plateaus], axis=1
         )
