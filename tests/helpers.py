@@ -39,6 +39,7 @@ RANKS = [
     "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
     "tuning.problem tuning.storage",
     "tuning.uncertainty tuning.identification tuning.optimal_input",
+    "tuning.feasible",
     "tuning.search tuning.falsification",
     "tuning.answer",
     "tuning.report",

@@ -17,6 +17,13 @@ if TYPE_CHECKING:
     from tuning.answer.default import tune as tune
     from tuning.falsification.result import Attack as Attack
     from tuning.falsification.study import attack as attack
+    from tuning.feasible.result import Feasibility as Feasibility
+    from tuning.feasible.result import Mend as Mend
+    from tuning.feasible.study import apply_mend as apply_mend
+    from tuning.feasible.study import can_follow as can_follow
+    from tuning.feasible.study import feasibility as feasibility
+    from tuning.feasible.study import least_offset as least_offset
+    from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
     from tuning.identification.design import compare_experiments as compare_experiments
@@ -64,6 +71,12 @@ _NAMES = {
     "Status": "tuning.problem.status",
     "TuningResult": "tuning.search.result",
     "Certificate": "tuning.search.robust",
+    "Feasibility": "tuning.feasible.result",
+    "Mend": "tuning.feasible.result",
+    "apply_mend": "tuning.feasible.study",
+    "can_follow": "tuning.feasible.study",
+    "feasibility": "tuning.feasible.study",
+    "least_offset": "tuning.feasible.study",
     "Correlated": "tuning.uncertainty.distributions",
     "Discrete": "tuning.uncertainty.distributions",
     "Ensemble": "tuning.uncertainty.result",

@@ -11,6 +11,7 @@ from jaxtank.analysis.steady_batch import FLOWS, SteadyStates
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, split_index
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant
 from tuning.uncertainty.plateaus import plateaus_of
@@ -46,7 +47,7 @@ class Needs:
     --------
     >>> from jaxtank import presets
     >>> case = presets.find("gouta2015/backstepping")
-    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.5]]})
+    >>> needs = Needs(case, {"plant.pump_gain": case.loop.plant.pump_gain * [[1.0], [0.4]]})
     >>> needs.at().shape, needs.feasible().tolist()
     ((2, 6, 6), [True, False])
     """
@@ -56,21 +57,18 @@ class Needs:
     ):
         loop: Any = case.loop
         plateaus = plateaus_of(case)
-        if not plateaus:
+        if not judges(case) or not plateaus:
             raise InputError(
-                f"{case.name}: its reference has no plateaus, so none can be infeasible"
-            )
-        if not hasattr(loop.plant, "links") or loop.plant.pumps != len(loop.plant.outputs):
-            raise InputError(
-                f"{case.name}: steady states need a network of tanks with as many pumps as outputs"
+                f"{case.name}: feasibility is for networks of tanks with as many pumps as outputs,"
+                " and setpoints that are held for a while (no sine)"
             )
         count = len(next(iter(values.values()))) if values else 1
         drawn = lambda name: drawn_values(loop, name, values, count)
         inflow = drawn("disturbance.level") if isinstance(loop.disturbance, Constant) else 0.0
         flows = {name: drawn(f"plant.{name}") for name in FLOWS}
-        self.case, self.plateaus, self.count = case, plateaus, count
+        self.case, self.values, self.limits = case, dict(values), limits
+        self.plateaus, self.count = plateaus, count
         self.states = SteadyStates(loop.plant, flows, inflow)
-        # None of the names is drawn unless asked for: setpoints of one draw may differ from another
         self.setpoints = np.stack(
             [np.stack([drawn(name) for name in p.names], axis=-1) for p in plateaus], axis=1
         )
@@ -79,6 +77,10 @@ class Needs:
         top = np.where(self.at_rim, self.rim, level)
         self.low = np.concatenate([np.zeros_like(top), drawn("actuator.low")], axis=1)
         self.high = np.concatenate([top, drawn("actuator.high")], axis=1)
+
+    def first(self, count: int) -> "Needs":
+        """Return the Needs of the first `count` plants."""
+        return Needs(self.case, {n: v[:count] for n, v in self.values.items()}, self.limits)
 
     def at(self, setpoints: Any = None) -> np.ndarray:
         """Return (N, P, n + m) levels and inputs at setpoints (P, outputs) or (N, P, outputs).
@@ -103,6 +105,27 @@ class Needs:
     def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
         """Return (N,) True where every plateau has a steady state within the limits."""
         return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
+
+
+def judges(case: Case) -> bool:
+    """Return whether `Needs` is defined for a case.
+
+    Parameters
+    ----------
+    case : Case
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> judges(presets.find("cascaded/pi"))
+    True
+    """
+    plant = case.loop.plant
+    return (
+        isinstance(plant, TankNetwork)
+        and plant.pumps == len(plant.outputs)
+        and bool(plateaus_of(case))
+    )
 
 
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:
@@ -159,10 +182,7 @@ def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
     (N,) array of bool, or None
         None where the steady states of the plant have no closed form.
     """
-    plant, reference = case.loop.plant, case.loop.reference
-    if getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs):
-        return None
-    if reference.plateaus(case.clock.duration) is None or not plateaus_of(case):
+    if getattr(case.loop.plant, "pipes", None) != () or not judges(case):
         return None
     count = len(next(iter(values.values())))
     rims = {"max_level": "rim"}

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank.case import Case
-from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.setpoints import Ramps, Sine
+from jaxtank.signals.base import Constant
+from jaxtank.signals.setpoints import Ramps
 
 
 class Plateau(NamedTuple):
@@ -32,8 +32,8 @@ class Plateau(NamedTuple):
 def plateaus_of(case: Case) -> list[Plateau] | None:
     """Return the plateaus of a case in order of time, or None where its reference has none.
 
-    Those whose changes end before the next one and the end of the run; none of those during which
-    a sine moves an output.
+    Those whose changes end before the next one and the end of the run. A reference with a sine has
+    none: its setpoints move.
 
     Parameters
     ----------
@@ -47,31 +47,24 @@ def plateaus_of(case: Case) -> list[Plateau] | None:
     """
     reference: Any = case.loop.reference
     if isinstance(reference, Ramps):
-        return _of_ramps(reference, case.clock.duration, "reference.")
+        return _of_ramps(reference, case.clock.duration)
     if isinstance(reference, Constant):
         names = tuple(f"reference.level[{i}]" for i in range(reference.channels))
         return [Plateau(0.0, names, tuple(map(float, reference.level)))]
-    if isinstance(reference, Sum) and isinstance(reference.first, Ramps):
-        sine = reference.second
-        if isinstance(sine, Sine):
-            found = _of_ramps(reference.first, case.clock.duration, "reference.first.")
-            ends = [p.time_s for p in found[1:]] + [case.clock.duration]
-            apart = lambda p, end: end <= sine.start or p.time_s >= sine.end
-            return [p for p, end in zip(found, ends) if apart(p, end)]
     return None
 
 
-def _of_ramps(reference, duration, prefix):
-    """The plateaus of Ramps of which the dotted names begin with `prefix`."""
+def _of_ramps(reference, duration):
+    """The plateaus of Ramps."""
     ramp = float(reference.ramp)
-    names = [f"{prefix}initial[{i}]" for i in range(reference.channels)]
+    names = [f"reference.initial[{i}]" for i in range(reference.channels)]
     values = [float(v) for v in reference.initial]
     starts = sorted({time for time, _ in reference.changes})
     found = [] if starts and starts[0] <= 0.0 else [Plateau(0.0, tuple(names), tuple(values))]
     for start, following in zip(starts, [*starts[1:], np.inf]):
         for j, (time, i) in enumerate(reference.changes):
             if time == start:
-                names[i], values[i] = f"{prefix}targets[{j}]", float(reference.targets[j])
+                names[i], values[i] = f"reference.targets[{j}]", float(reference.targets[j])
         if start + ramp <= min(following, duration):
             found.append(Plateau(start + ramp, tuple(names), tuple(values)))
     return found

@@ -1,0 +1,69 @@
+"""Steady states of many plants at once against those of each alone, and against its rates."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxtank import presets
+from jaxtank.analysis.steady_batch import SteadyStates
+from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.core.errors import InputError
+from jaxtank.plants.network import network
+
+DRAWN = ("drain", "orifice", "pipe", "pump_gain")
+
+
+def drawn(plant, count=4):
+    """{name: (count, ...)} parameters 10 % off."""
+    rng = np.random.default_rng(0)
+    values = {name: np.asarray(getattr(plant, name)) for name in DRAWN}
+    return {n: v * rng.uniform(0.9, 1.1, (count, *v.shape)) for n, v in values.items()}
+
+
+@pytest.mark.parametrize(
+    "name, outputs",
+    [
+        ("gouta2015/ngpc", [[3.0, 3.0], [16.0, 14.0]]),
+        ("mirakhorli/sfc", [[12.0, 12.0], [10.0, 12.5]]),
+        ("cascaded/pi", [[2.0], [7.0]]),
+        ("calofir/backstepping", [[0.2], [0.35]]),
+        ("khalid/gpc-mimo", [[0.16, 0.15], [0.15, 0.15]]),
+    ],
+)
+def test_it_is_that_of_each_plant_alone(name, outputs):
+    plant = presets.find(name).loop.plant
+    values = drawn(plant)
+    levels, inputs = SteadyStates(plant, values).at(outputs)
+    for s in range(4):
+        own = dataclasses.replace(plant, **{n: v[s] for n, v in values.items()})
+        for k, y in enumerate(outputs):
+            x, u = equilibrium(own, y)
+            np.testing.assert_allclose(levels[s, k], x, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(inputs[s, k], u, rtol=1e-8, atol=1e-10)
+
+
+def test_a_steady_inflow_and_a_pump_into_two_tanks_leave_no_rate():
+    plant = presets.find("mirakhorli/sfc").loop.plant
+    inflow = np.array([1.0, -0.5, 2.0, 0.3])
+    levels, inputs = SteadyStates(plant, {}, inflow).at([[12.0, 12.0]])
+    rates = plant.derivative(0.0, tuple(levels[0, 0]), tuple(inputs[0, 0]), tuple(inflow))
+    np.testing.assert_allclose(np.asarray(rates), 0.0, atol=1e-12)
+
+
+def test_a_flow_that_would_run_backwards_is_a_level_below_zero():
+    levels, _ = SteadyStates(presets.find("gouta2015/ngpc").loop.plant, {}).at([[16.0, 3.0]])
+    assert levels[0, 0, 3] < 0 < levels[0, 0, 2]
+
+
+def test_a_rig_with_fewer_pumps_than_outputs_is_refused():
+    plant = network(
+        area=[20.0] * 2,
+        drain=[0.2] * 2,
+        pump_gain=[5.0],
+        feeds=[(0, None)],
+        rim=30.0,
+        outputs=(0, 1),
+    )
+    with pytest.raises(InputError, match="as many pumps as outputs"):
+        SteadyStates(plant, {})

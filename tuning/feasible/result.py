@@ -1,0 +1,131 @@
+"""The result of a feasibility study: what each plateau needs, and the smallest mends.
+
+Made by `study`; imported by whoever reads a Feasibility.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tuning.problem.result import Result
+from tuning.uncertainty.sampling import clopper_pearson
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlateauNeed:
+    """A level or an input that a plateau needs and that some plants cannot have.
+
+    Attributes
+    ----------
+    time_s : float
+        From when the plateau is held [s].
+    setpoints : tuple of float
+        (outputs,) [cm].
+    tank, pump : int or None
+        Which tank or pump, counted from 1; the other one is None.
+    needed : float
+        By the nominal plant [cm or V]; below 0 for a level: its flow would have to run backwards.
+    needed_p95 : float
+        Exceeded (a lower limit: fallen below) by 5 % of the plants.
+    limit : float
+    share : float
+        Plants that need more (a lower limit: less) [-].
+    unit : str
+    """
+
+    time_s: float
+    setpoints: tuple[float, ...]
+    tank: int | None
+    pump: int | None
+    needed: float
+    needed_p95: float
+    limit: float
+    share: float
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mend:
+    """The smallest change of one kind that makes the plateaus of 95 % of the plants feasible (of
+    "ramps": that makes the nominal run hold its limits).
+
+    Attributes
+    ----------
+    what : str
+        One of `tuning.feasible.mends.KINDS`.
+    set : dict
+        {dotted name: number or list} as for `--set`; {} where nothing needs to change.
+    share : float or None
+        Plants that it makes feasible, of the draws it was found with [-]; None for ramps.
+    words : str
+        The change for people.
+
+    Examples
+    --------
+    >>> Mend(what="rims", set={"plant.rim[2]": 40.5}, share=0.96, words="rim of tank 3").options
+    ['--set plant.rim[2]=40.5']
+    """
+
+    what: str
+    set: Mapping[str, Any]
+    share: float | None
+    words: str
+
+    @property
+    def options(self) -> list[str]:
+        """The options of the command that make this change."""
+        return [f"--set {name}={_text(value)}" for name, value in self.set.items()]
+
+
+def _text(value):
+    """A value without spaces, as the command line takes it."""
+    return str(value).replace(" ", "")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Feasibility(Result):
+    """Which plants can hold the setpoints of a case under some controller; by `tuning.feasibility`.
+
+    Attributes
+    ----------
+    case : Case
+    distributions : dict
+        {dotted name: distribution} of what varies.
+    infeasible : (samples,) array of bool
+        True where the steady state of some plateau needs a level or an input outside its limits.
+    plateaus : tuple of PlateauNeed
+        What some of the plants cannot have, in order of time.
+    mends : tuple of Mend
+    seed : int
+    wall_s : float
+        Run time, of the share and the plateaus [s]; of the mends in `mends_s`.
+    mends_s : float
+    """
+
+    REPORT = "tuning.report.studies.feasible"
+
+    case: Any
+    distributions: Mapping[str, Any]
+    infeasible: np.ndarray
+    plateaus: tuple[PlateauNeed, ...]
+    mends: tuple[Mend, ...]
+    seed: int
+    wall_s: float
+    mends_s: float
+
+    @property
+    def samples(self) -> int:
+        """Number of plants."""
+        return len(self.infeasible)
+
+    @property
+    def infeasible_for_any_controller(self) -> float:
+        """Share of the plants that no controller can hold at every plateau [-]."""
+        return float(np.mean(self.infeasible))
+
+    @property
+    def interval95(self) -> list[float]:
+        """Exact 95 % interval of that share."""
+        return clopper_pearson(int(np.sum(self.infeasible)), self.samples)
