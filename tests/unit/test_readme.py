@@ -142,7 +142,7 @@ def test_the_rigs_shown_are_the_one_that_is_tested():
     assert len(tables) == 5 and tables == {name: of_file[name] for name in tables}
 
 
-def test_what_the_page_says_of_outputs_holds():
+def test_what_the_page_states_of_outputs_holds():
     """The default, and what a PID refuses: both for the rig of two tanks in the page."""
     text = (RIGS / "two_tanks.toml").read_text()
     line = 'outputs = ["lower"]\n'

@@ -32,7 +32,7 @@ SAME = (
 )
 
 
-def told(result):
+def reported(result):
     from tuning.report import tuning as report
 
     page = report.json_of(result)
@@ -49,7 +49,7 @@ def whole(gouta, tmp_path_factory):
 
 
 def test_with_and_without_a_log_alike(gouta, whole):
-    assert told(tuning.tune(gouta("backstepping", FAST), **OPTIONS)) == told(whole[0])
+    assert reported(tuning.tune(gouta("backstepping", FAST), **OPTIONS)) == reported(whole[0])
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
@@ -58,16 +58,16 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
     (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
     kept = data[: int(share * len(data))].count(b"\n")
     result = tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
-    assert told(result) == told(whole[0])
+    assert reported(result) == reported(whole[0])
     assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
 
 
 def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes(whole[1])
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
-    assert told(
+    assert reported(
         tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
-    ) == told(whole[0])
+    ) == reported(whole[0])
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
