@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from tuning.feasible.study import can_follow as can_follow
     from tuning.feasible.study import feasibility as feasibility
     from tuning.feasible.study import least_offset as least_offset
-    from tuning.identification.batch import Identifications as Identifications
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
     from tuning.identification.design import compare_experiments as compare_experiments

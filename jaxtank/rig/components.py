@@ -12,6 +12,7 @@ import numpy as np
 from jaxtank import controllers
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
 from jaxtank.core.toml_schema import NEEDED, Key, Section, type_of
 from jaxtank.core.tree import number
@@ -77,6 +78,9 @@ ROLES = {
 REGISTERED: set[str] = set()
 """Kinds that were added by `register`."""
 
+GROUP = "jaxtank.components"
+"""Entry points by which an installed package names its classes: kind = "package.module:Class"."""
+
 _KIND = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _FIELDS = (bool, int, float, str, tuple)
 
@@ -138,6 +142,14 @@ def register(kind: str, cls: type) -> type:
         known[kind] = cls
         REGISTERED.add(kind)
     return cls
+
+
+def _kinds(role, kind):
+    """Return the kinds of a role with those of installed packages; imports `kind`'s class."""
+    points = {} if kind in role.classes else installed(GROUP)
+    if kind in points:
+        register(kind, imported(points[kind]))
+    return role.classes | points
 
 
 def _checked(cls):
@@ -270,8 +282,9 @@ def component(name, table, plant, offered):
     if "kind" not in table:
         raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
     kind = table["kind"]
+    kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
     if not isinstance(kind, str) or kind not in role.classes:
-        raise unknown(f"{name} kind", str(kind), role.classes)
+        raise unknown(f"{name} kind", str(kind), kinds)
     section = section_of(name, kind, plant.units)
     offered = {} if kind in REGISTERED and not role.kept else offered
     usual = {key: value for key, value in offered.items() if key in section.names}

@@ -34,7 +34,7 @@ CORNER = (
     "an interior point rounds a corner off over 1e-6 of the data; a solution of one sample lies on"
     " it, between the slopes of both sides"
 )
-ROUGH = {
+COARSE = {
     "khalid/laguerre-constrained": (1e-3, CORNER),
     "khalid/laguerre-mimo-constrained": (1e-3, CORNER),
     "khalid/gpc-mimo-constrained": (1e-2, CORNER),
@@ -130,7 +130,7 @@ def subject(names, seed=0):
         found = found[0] if isinstance(found, tuple) else found
         return jnp.concatenate([jnp.ravel(found[m]) for m in MEASURES])
 
-    tolerance, why = ROUGH.get(names[0], (1e-5, "runs of 64 samples amplify rounding"))
+    tolerance, why = COARSE.get(names[0], (1e-5, "runs of 64 samples amplify rounding"))
     return Subject(
         label(names),
         functools.partial(value, lp.evaluate_and_flag),
@@ -163,7 +163,7 @@ def groups():
     return list(found.values())
 
 
-def carried(name, lanes):
+def carried(name, batch):
     """The derivatives that the tuner carries along with a run (`loop.sensitivities`), which are not
     those of jax.jvp; `lanes`: as it makes them for several runs side by side.
     """
@@ -190,12 +190,12 @@ def carried(name, lanes):
 
     def forwards(theta):
         slopes = sensitivities_compiled(
-            loop, clock, MEASURES, order, unravel(theta), None, batched=lanes
+            loop, clock, MEASURES, order, unravel(theta), None, batched=batch
         )[1]
         return jnp.concatenate([slopes[m].reshape(-1, theta.size) for m in MEASURES])
 
     return Subject(
-        f"sensitivities {name}{', lanes' if lanes else ''}",
+        f"sensitivities {name}{', lanes' if batch else ''}",
         lambda theta: flat(lp.evaluate_and_flag(at(theta), clock, MEASURES)[0]),
         np.array([ravel_pytree([p[n] for n in order])[0] for p in points]),
         np.array(
@@ -213,7 +213,7 @@ def carried(name, lanes):
 
 
 SUBJECTS = {label(names): functools.partial(subject, names) for names in groups()} | {
-    f"sensitivities {name}{', lanes' if lanes else ''}": functools.partial(carried, name, lanes)
+    f"sensitivities {name}{', lanes' if batch else ''}": functools.partial(carried, name, batch)
     for name in (
         "gouta2015/ngpc",
         "gouta2022/chadpc",
@@ -221,5 +221,5 @@ SUBJECTS = {label(names): functools.partial(subject, names) for names in groups(
         "mirakhorli/hybrid",
         "khalid/gpc",
     )
-    for lanes in (False, True)
+    for batch in (False, True)
 }

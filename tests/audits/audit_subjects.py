@@ -527,23 +527,26 @@ def commanded(case):
     )
 
     def function(p):
-        law, x, r, dr, ddr, d, u0 = p
+        controller, x, r, dr, ddr, d, u0 = p
         plan = jax.tree.map(
-            lambda a: a[0], law.prepare(*(tuple(v[None] for v in s) for s in (r, dr, ddr)))
+            lambda a: a[0], controller.prepare(*(tuple(v[None] for v in s) for s in (r, dr, ddr)))
         )
-        state, out = law.init(tuple(x[0]), tuple(u0)), []
+        state, out = controller.init(tuple(x[0]), tuple(u0)), []
         for k in range(2):
             tick = Tick(t=0.0, r=tuple(r), dr=tuple(dr), ddr=tuple(ddr), dt=dt, plan=plan)
-            command, state = law.step(state, tick, Estimate(x=tuple(x[k]), d=tuple(d)))
+            command, state = controller.step(state, tick, Estimate(x=tuple(x[k]), d=tuple(d)))
             applied = tuple(jnp.clip(u, a, b) for u, a, b in zip(command, low, high))
-            state = law.track(state, tick, command, applied)
-            out += [command, law.input_metric(Estimate(x=tuple(x[k]))) if law.allocates else ()]
+            state = controller.track(state, tick, command, applied)
+            out += [
+                command,
+                controller.input_metric(Estimate(x=tuple(x[k]))) if controller.allocates else (),
+            ]
         return out
 
     return function
 
 
-def of_law(name, points=12, change=lambda case: case, **more):
+def of_controller(name, points=12, change=lambda case: case, **more):
     @subject(f"law {name}", points=points, **more)
     def _(rng):
         case = change(presets.find(name))
@@ -572,14 +575,14 @@ def of_law(name, points=12, change=lambda case: case, **more):
         ), commanded(case)
 
 
-LAWS = {
+CONTROLLERS = {
     "gouta2015": ("ngpc", "backstepping", "backstepping-ff"),
     "gouta2022": ("enmpc", "chadpc", "enmpc-printed", "chadpc-printed", "pi", "pid-ff", "fopi"),
     "calofir": ("backstepping",),
     "mirakhorli": ("sfc", "smc", "hybrid", "lqi", "smc-printed"),
     "khalid": ("gpc", "gpc-nc2-constrained", "laguerre-mimo", "laguerre-mimo-constrained"),
 }
-ROUGH = {
+COARSE = {
     "gpc-nc2-constrained": {
         "tolerance": 1e-4,
         "why": "the interior point stops at a complementarity of 1e-12",
@@ -594,16 +597,18 @@ ROUGH = {
         ),
     },
 }
-for _paper, _names in LAWS.items():
+for _paper, _names in CONTROLLERS.items():
     for _name in _names:
-        of_law(f"{_paper}/{_name}", **ROUGH.get(_name, {}))
+        of_controller(f"{_paper}/{_name}", **COARSE.get(_name, {}))
 
 
 def with_a_schedule(case):
     case = schedule.schedule(case, {"controller.k": "h1", "controller.k1": "h1"}, [5.0, 10.0, 20.0])
-    law = case.loop.controller
-    law = dataclasses.replace(law, values=np.asarray(law.values) * np.array([1.0, 1.5, 0.8]))
-    return case.replace(loop=dataclasses.replace(case.loop, controller=law))
+    control = case.loop.controller
+    control = dataclasses.replace(
+        control, values=np.asarray(control.values) * np.array([1.0, 1.5, 0.8])
+    )
+    return case.replace(loop=dataclasses.replace(case.loop, controller=control))
 
 
-of_law("gouta2015/backstepping-slow", change=with_a_schedule)
+of_controller("gouta2015/backstepping-slow", change=with_a_schedule)

@@ -151,22 +151,26 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                 f"{name}: exit code {code}, {steps} kept on the way, {whole[name][2]:.1f} s",
                 flush=True,
             )
-        told = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
-        while told["kills"] < count:
-            name = commands[told["trials"] % len(commands)]
-            folder, again, first = Path("run"), False, told["kills"]
-            told["trials"] += 1
+        reported = {"kills": 0, "trials": 0, "afresh": 0, "wrong": []}
+        while reported["kills"] < count:
+            name = commands[reported["trials"] % len(commands)]
+            folder, again, first = Path("run"), False, reported["kills"]
+            reported["trials"] += 1
             shutil.rmtree(folder, ignore_errors=True)
             for attempt in range(12):
                 option = "--resume" if again else "--out"
                 child = start(cli, [*COMMANDS[name], option, str(folder)])
-                if attempt < 4 and (attempt == 0 or rng.random() < 0.5) and told["kills"] < count:
+                if (
+                    attempt < 4
+                    and (attempt == 0 or rng.random() < 0.5)
+                    and reported["kills"] < count
+                ):
                     few = rng.randint(1, max(1, whole[name][1])) if rng.random() < 0.5 else None
                     code = kill(
                         child, folder, rng.uniform(0.0, 0.3 if few else 0.9 * whole[name][2]), few
                     )
                     if code is None:
-                        told["kills"] += 1
+                        reported["kills"] += 1
                         again = True
                         continue
                 else:
@@ -174,27 +178,29 @@ def drill(count, seed=0, commands=tuple(COMMANDS), tell=print):
                 if again and code == 2 and AFRESH.search(Path("said.txt").read_text()):
                     # nothing had been kept yet, or all was done and only the log went
                     again = False
-                    told["afresh"] += 1
+                    reported["afresh"] += 1
                     continue
                 break
             if code != whole[name][0]:
-                told["wrong"].append(
+                reported["wrong"].append(
                     f"{name}: exit code {code}: {Path('said.txt').read_text()[-500:]}"
                 )
             elif contents(folder) != whole[name][3]:
                 mine, theirs = contents(folder), whole[name][3]
-                told["wrong"].append(
+                reported["wrong"].append(
                     f"{name}: differs in"
                     f" {sorted(n for n in mine | theirs if mine.get(n) != theirs.get(n))}"
                 )
                 if os.environ.get("KEEP"):
-                    shutil.copytree(folder, Path(os.environ["KEEP"]) / f"{name}{told['trials']}")
+                    shutil.copytree(
+                        folder, Path(os.environ["KEEP"]) / f"{name}{reported['trials']}"
+                    )
             tell(
-                f"{name}: {told['kills'] - first} killed, {told['kills']} in all;"
-                f" {len(told['wrong'])} wrong",
+                f"{name}: {reported['kills'] - first} killed, {reported['kills']} in all;"
+                f" {len(reported['wrong'])} wrong",
                 flush=True,
             )
-        return told
+        return reported
     finally:
         os.chdir(here)
         shutil.rmtree(home, ignore_errors=True)

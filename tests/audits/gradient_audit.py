@@ -243,7 +243,7 @@ def one_sided(run, points, moves, pairs):
     return np.take_along_axis(better, best[:, :, None] + 1, axis=2)[:, :, 0], NEAR[best + 3]
 
 
-def told(rows):
+def reported(rows):
     """The table and its last line: how many points, the worst error."""
     lines = [f"{'subject':44} points  slopes  worst     step      fwd=rev   kinks  between  piled"]
     for r in rows:
@@ -330,12 +330,12 @@ def main(words):
             rows.append(audit(make()))
             if "--record" in words:
                 record(rows[-1:], known)
-            print(told(rows[-1:]).splitlines()[1], flush=True)
+            print(reported(rows[-1:]).splitlines()[1], flush=True)
             # programs of a subject are not used again, and take gigabytes together
             jax.clear_caches()
     if "--record" in words:
         rows = record(rows, known)
-    print(told(rows).splitlines()[-1])
+    print(reported(rows).splitlines()[-1])
     return 0 if all(r.good for r in rows) else 1
 
 

@@ -117,15 +117,15 @@ def suite(*words):
 def run(name):
     """Run a drill and record it."""
     if name == "fuzz":
-        found, said = suite("-s", "tests/audits/test_fuzz.py")
-        told = re.search(
+        found, printed = suite("-s", "tests/audits/test_fuzz.py")
+        reported = re.search(
             r"rig files: (\d+) read, (\d+) refused; logs: (\d+) read, (\d+) refused; command lines"
             r" refused: (\d+) of (\d+)",
-            said,
+            printed,
         )
-        if told is None:
+        if reported is None:
             return record(name, 0, summed(found))
-        rigs, bad, logs, worse, refused, lines = map(int, told.groups())
+        rigs, bad, logs, worse, refused, lines = map(int, reported.groups())
         record(
             name,
             rigs + bad + logs + worse + lines,
@@ -177,10 +177,12 @@ def table():
 
 def main(words):
     if "--versions" in words:
-        which, report, told = words[words.index("--versions") + 1 :]
+        which, report, reported = words[words.index("--versions") + 1 :]
         found = cases(report)
         return record(
-            f"versions, {which}", len(found), f"{Path(told).read_text().strip()}: {summed(found)}"
+            f"versions, {which}",
+            len(found),
+            f"{Path(reported).read_text().strip()}: {summed(found)}",
         )
     wanted = [w for w in words if not w.startswith("-")]
     for name in DRILLS if wanted == ["all"] else wanted:

@@ -62,8 +62,8 @@ def contents(folder):
 def say(words, capsys):
     """(exit code, stdout, lines of stderr) of a command."""
     code = main.main([str(w) for w in words])
-    said = capsys.readouterr()
-    return code, said.out, said.err.splitlines()
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err.splitlines()
 
 
 @contextlib.contextmanager
@@ -164,9 +164,9 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
     words, folder = WRITERS[name], tmp_path / "out"
     before = old_result(folder, words, capsys)
     # enough for a log, or a batch, not for the largest file of the result
-    room = 0.5 * max(map(len, before.values()))
+    margin = 0.5 * max(map(len, before.values()))
     seed = ["--seed", "1"] if name in ("simulate", "tune", "uncertainty") else []
-    with small_disk(int(room)):
+    with small_disk(int(margin)):
         code, out, err = say([*words, *seed, "--out", folder], capsys)
     last = [line for line in err if line.startswith("jaxtank: ")]
     assert code == 2 and len(last) == 1 and last[0] == err[-1] and "File too large" in last[0], err
@@ -260,7 +260,7 @@ seed = 1
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen, capsys):
+def test_a_folder_that_cannot_be_written_to_is_refused_by_input_validation(name, frozen, capsys):
     for folder in (frozen, frozen / "in" / "it", frozen / "result.json" / "under"):
         code, out, err = say([*WRITERS[name], "--out", folder], capsys)
         assert code == 2 and out == "" and len(err) == 1 and err[0].startswith("jaxtank: --out"), (
@@ -269,7 +269,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused_at_the_door(name, frozen,
     assert contents(frozen) == {"result.json": b"old"}
 
 
-def test_a_folder_that_cannot_be_is_refused_at_the_door(tmp_path, capsys):
+def test_a_folder_that_cannot_be_is_refused_by_input_validation(tmp_path, capsys):
     (tmp_path / "link").symlink_to(tmp_path / "nowhere")
     for folder, why in ((tmp_path / "link", "nowhere"), ("a\0b", "NUL")):
         code, out, err = say([*WRITERS["simulate"], "--out", folder], capsys)
@@ -380,11 +380,11 @@ def test_two_at_once(tmp_path):
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
-    said = [(*p.communicate(), p.returncode) for p in both]
-    assert sorted(code for *_, code in said) in ([0, 2], [0, 0])
+    printed = [(*p.communicate(), p.returncode) for p in both]
+    assert sorted(code for *_, code in printed) in ([0, 2], [0, 0])
     assert all(
         err == "" if code == 0 else "another run" in err and err.count("\n") == 1
-        for _, err, code in said
+        for _, err, code in printed
     )
     mine, theirs = contents(tmp_path / "out"), contents(tmp_path / "alone")
     assert mine.keys() == theirs.keys() and mine["draws.csv"] == theirs["draws.csv"]
@@ -431,8 +431,8 @@ LONG = [
 @pytest.mark.slow_for("6")
 @pytest.mark.parametrize("lines", [6, *(pytest.param(n, marks=pytest.mark.slow) for n in (11, 25))])
 def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
-    said, code = interrupted([*LONG, "--starts", "40", "--quiet"], tmp_path / "out", lines)
-    assert code == 130 and "interrupted" in said and "Traceback" not in said, said
+    printed, code = interrupted([*LONG, "--starts", "40", "--quiet"], tmp_path / "out", lines)
+    assert code == 130 and "interrupted" in printed and "Traceback" not in printed, printed
     found = json.loads((tmp_path / "out" / "result.json").read_text())
     assert found["status"] == "interrupted" and "best point so far" in found["message"]
     evaluated = (tmp_path / "out" / evaluation_log.NAME).read_bytes().count(b"\n") - 1
@@ -452,8 +452,8 @@ def test_ctrl_c_gives_the_best_point_so_far(lines, tmp_path):
 def test_a_signal_before_anything_was_found_ends_the_program_and_frees_its_folder(
     lines, number, word, tmp_path
 ):
-    said, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
-    assert (said, code) == (f"jaxtank: {word}\n", 128 + number)
+    printed, code = interrupted([*LONG, "--quiet"], tmp_path / "out", lines, number)
+    assert (printed, code) == (f"jaxtank: {word}\n", 128 + number)
     left = {p.name for p in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
     assert left <= {evaluation_log.NAME}
     with folder_lock.hold(tmp_path / "out"):
@@ -567,8 +567,10 @@ def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
     )
     # what is recalled has no slopes
     assert [fit.jacobian.size > 0 for fit in seen[2:]] == [False, False, True]
-    told = [{k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)]
-    assert json.dumps(told[0]) == json.dumps(told[1])
+    reported = [
+        {k: v for k, v in found.to_json().items() if k != "wall_s"} for found in (whole, again)
+    ]
+    assert json.dumps(reported[0]) == json.dumps(reported[1])
     with pytest.raises(InputError, match="of another problem; what differs: noise"):
         tuning.identify(case, log, free, folder=tmp_path, resume=True, **{**options, "noise": 0.06})
 

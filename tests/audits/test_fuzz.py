@@ -173,7 +173,7 @@ CASES = [
 HARMLESS = {"list", "compare", "bench"}
 
 
-def told(words, capsys):
+def reported(words, capsys):
     """(exit code, lines of stderr) of a command that is meant to be refused before it runs
     anything.
     """
@@ -220,7 +220,7 @@ def refused_lines(count, seed, folder, capsys, monkeypatch):
             words += [rng.choice(CASES)]
             for _ in range(rng.randint(1, 3)):
                 words += [rng.choice(OPTIONS), rng.choice(VALUES)]
-        code, err = told(words, capsys)
+        code, err = reported(words, capsys)
         assert "Traceback" not in err and "internal error" not in err, (words, err)
         assert code in (0, 2, 5), (words, code, err)
         if code:

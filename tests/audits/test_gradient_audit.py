@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gradient_audit import STEPS, Subject, audit, differences, told
+from gradient_audit import STEPS, Subject, audit, differences, reported
 
 from jaxtank import presets
 from jaxtank.controllers.fuzzy import membership
@@ -31,7 +31,7 @@ def rows():
     found = []
     yield found
     if found:
-        print("\n" + told(found))
+        print("\n" + reported(found))
 
 
 ALL = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
@@ -47,7 +47,7 @@ def test_forward_and_reverse_are_the_differences(name, rows):
     if name not in audit_subjects.QUICK:
         # a program of its own for each: together they would take tens of gigabytes
         jax.clear_caches()
-    assert rows[-1].good, told(rows[-1:])
+    assert rows[-1].good, reported(rows[-1:])
 
 
 @pytest.mark.slow
@@ -214,8 +214,8 @@ def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
     assert found[0] == pytest.approx(found[1], rel=1e-12, abs=1e-15)
     # one-sided differences of 1e-6, extrapolated: 1e-9 of round-off, and where a root bends at its
     # knee 1e-5
-    slack = 1e-5 * max(1.0, abs(left), abs(right))
-    assert min(left, right) - slack <= found[0] <= max(left, right) + slack
+    margin = 1e-5 * max(1.0, abs(left), abs(right))
+    assert min(left, right) - margin <= found[0] <= max(left, right) + margin
     assert slope is None or found[0] == pytest.approx(slope, rel=1e-12)
 
 

@@ -28,7 +28,7 @@ from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant, Table
-from jaxtank.signals.inflows import pours
+from jaxtank.signals.inflows import pulses
 from jaxtank.signals.setpoints import Sine, ramps
 from tuning.uncertainty import needs
 from tuning.uncertainty.draws import Draws
@@ -156,10 +156,10 @@ def peaks(what, *sizes):
     if not Path("/proc/self/status").exists():
         pytest.skip("the most memory that a process has held is read from /proc")
     here = [str(Path(__file__).parent), what, *map(str, sizes)]
-    told = subprocess.run(
+    reported = subprocess.run(
         [sys.executable, "-c", PEAK, *here], capture_output=True, text=True, check=True
     )
-    found = json.loads(told.stdout)
+    found = json.loads(reported.stdout)
     print(
         "\n"
         + ", ".join(f"{what} of {size}: {peak / 2**20:.0f} MiB" for size, peak in zip(sizes, found))
@@ -197,7 +197,7 @@ def noisy(reference=None):
             (3.0, 6.0), [(t, i, 5.0 + i) for i, t in enumerate(late)], ramp=5.0, shape="quintic"
         ),
         sensor=dataclasses.replace(loop.sensor, noise=np.full(4, 1e-3)),
-        disturbance=pours(4, [(t + 0.5, 1.1, 0, 50.0) for t in late]),
+        disturbance=pulses(4, [(t + 0.5, 1.1, 0, 50.0) for t in late]),
         faults=faults(loop.plant, [("pump_gain[0]", late[0], late[1], 0.9, 0.0)]),
         actuator=dataclasses.replace(loop.actuator, low=np.full(2, -100.0), high=np.full(2, 100.0)),
     )
@@ -250,11 +250,11 @@ def test_what_looks_ahead_is_not_cut():
         def prepare(self, r, dr, ddr):
             return r[0][::-1]
 
-    law = tank(moving()).controller
+    control = tank(moving()).controller
     assert is_pointwise(tank(moving()))
     assert not is_pointwise(tank(Table(values=np.ones((1, 3)), period=1.0)))
     assert not is_pointwise(
-        dataclasses.replace(tank(moving()), controller=Ahead(signal=law.signal))
+        dataclasses.replace(tank(moving()), controller=Ahead(signal=control.signal))
     )
 
 

@@ -222,7 +222,7 @@ def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
     np.testing.assert_allclose(leaky.rates(x, u), plant.rates(x, u) - 1.0, rtol=1e-12)
 
 
-def test_a_pump_that_draws_from_a_tank_is_told_apart():
+def test_a_pump_that_draws_from_a_tank_is_named_apart():
     """The same check finds a rig that is not cooperative: a pump that gives one tank more than it
     delivers, out of another.
     """
@@ -275,16 +275,16 @@ def test_the_order_of_the_tanks_is_a_name(seed, tanks, kind):
 def test_swapped_inputs_of_a_symmetric_rig_give_swapped_levels(seed, tanks, kind):
     """Two equal halves of up to three tanks, joined by what is its own mirror image."""
     plant, rng, _ = random_rig(seed, SIZE, kind)
-    mirror = (3, 4, 5, 0, 1, 2)
-    image, of = relabelled(plant, mirror)
+    permuted = (3, 4, 5, 0, 1, 2)
+    image, of = relabelled(plant, permuted)
     names = ("area", "drain", "orifice", "pipe", "pump_gain", "split")
     even = dataclasses.replace(
         image,
         **{n: 0.5 * (np.asarray(getattr(plant, n)) + np.asarray(getattr(image, n))) for n in names},
     )
     x, u = levels(rng, SIZE), rng.uniform(0, 5, len(FEEDS))
-    one, two = course(even, x, u, STILL)[0], course(even, x[list(mirror)], u[of], STILL)[0]
-    np.testing.assert_allclose(one[:, mirror], two, rtol=1e-12, atol=1e-12)
+    one, two = course(even, x, u, STILL)[0], course(even, x[list(permuted)], u[of], STILL)[0]
+    np.testing.assert_allclose(one[:, permuted], two, rtol=1e-12, atol=1e-12)
     assert np.abs(one - two).max() > 1e-3  # they are two runs
 
 

@@ -192,16 +192,16 @@ def test_what_never_ends_or_is_too_large_is_not_read(tmp_path):
             "log.csv",
         ):
             (folder / name).symlink_to(odd)
-        says = "is not a file|at most"
-        with pytest.raises(InputError, match=says):
+        states = "is not a file|at most"
+        with pytest.raises(InputError, match=states):
             evaluation_log.EvaluationLog(folder, {"p": 1}, resume=True)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=states):
             batch_store.read_manifest(folder)
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=states):
             batch_store.read_batch(folder / "part-000000.npz", {"x"})
-        with pytest.raises(InputError, match=says):
+        with pytest.raises(InputError, match=states):
             files.read_text(folder / "rig.toml", "rig file")
-        with pytest.raises(DataError, match=says):
+        with pytest.raises(DataError, match=states):
             csv_log.read_log(folder / "log.csv", loop)
 
 

@@ -62,7 +62,7 @@ def draw(case, samples, **options):
 SINGLE = ("-DSINGLE", "-fsingle-precision-constant")
 
 
-def c_lanes(folder, single=False):
+def c_batch(folder, single=False):
     """The C loop of floor_lanes.c, None where there is no gcc."""
     if shutil.which("gcc") is None:
         return None
@@ -90,7 +90,7 @@ def c_run(function, case, samples, single=False):
     """A call of the C loop on the plants that `draw` draws: () -> (total rms error (samples,),
     highest levels (samples, 4)) [cm].
     """
-    plant, law, clock = case.loop.plant, case.loop.controller, case.clock
+    plant, controller, clock = case.loop.plant, case.loop.controller, case.clock
     space = Draws(case.loop, spread_of(case))
     v = space.values(probabilities("random", space.dimensions, samples, 0))
     rows = np.concatenate([v["plant.drain"][:, :2].T, v["plant.orifice"].T, v["plant.pump_gain"].T])
@@ -98,7 +98,7 @@ def c_run(function, case, samples, single=False):
     rows = np.ascontiguousarray(
         np.pad(rows, ((0, 0), (0, -samples % BLOCK)), mode="edge"), dtype=real
     )
-    model = law.model
+    model = controller.model
     area, drain, orifice, gain = (
         np.array(x, dtype=float) for x in (model.area, model.drain, model.orifice, model.pump_gain)
     )
@@ -130,9 +130,9 @@ def c_run(function, case, samples, single=False):
             plant.gravity,
             plant.knee,
             clock.dt,
-            law.k,
-            law.k1,
-            law.level_floor,
+            controller.k,
+            controller.k1,
+            controller.level_floor,
             case.loop.actuator.high[0],
         )
     ]
@@ -149,7 +149,7 @@ def c_run(function, case, samples, single=False):
     return run
 
 
-def beside_lanes(function, case, samples, rounds, single=False):
+def beside_batch(function, case, samples, rounds, single=False):
     """(ns per step and plant of ours, of the C loop, ratio, largest difference [cm]): medians of
     core time, the two in turn.
     """
@@ -221,11 +221,11 @@ def main():
     print(f"1,024 plants x {fine.clock.samples} samples: {ns:.1f} ns per step and plant, {beside}")
     halves = {"clock.integrator": "midpoint"}
     with tempfile.TemporaryDirectory() as folder:
-        function = c_lanes(folder)
+        function = c_batch(folder)
         for words, case in (
             (("RK4", fine), ("midpoint", rig.set_values(fine, halves))) if function else ()
         ):
-            a, b, ratio, apart = beside_lanes(function, case, 1000, rounds)
+            a, b, ratio, apart = beside_batch(function, case, 1000, rounds)
             print(
                 f"1,000 plants x {case.clock.samples} samples, {words}: {a:.1f} ns of one core per"
                 f" step and plant, {b:.1f} the C loop in lanes, {ratio:.2f} x; they agree to"

@@ -143,7 +143,7 @@ class Trace:
         return min((row[4] for row in self.rows if row[0] <= seconds), default=np.inf)
 
 
-def prices(problem, z, lanes, rounds=7):
+def prices(problem, z, batch, rounds=7):
     """What things cost, in seconds: {what: (compile, run)}, medians over interleaved rounds. lanes:
     size of a population run as one batch.
     """
@@ -151,7 +151,7 @@ def prices(problem, z, lanes, rounds=7):
         "simulation": lambda z: problem.screen(z[None]),
         "pass": problem.point,
         "rough pass": problem.coarse_point,
-        "population": lambda z: problem.screen(np.tile(z, (lanes, 1))),
+        "population": lambda z: problem.screen(np.tile(z, (batch, 1))),
     }
     spent = {name: [] for name in calls}
     for k in range(rounds + 1):
@@ -172,14 +172,14 @@ def ours(problem, method, z, reference, price, iterations):
     )
 
     def seen(search):
-        rough = len(search.history) == seen.known
+        coarse = len(search.history) == seen.known
         seen.known = len(search.history)
         spent = (
             (1, tenth, price["rough pass"][1] / unit)
-            if rough
+            if coarse
             else (1, 1.0, price["pass"][1] / unit)
         )
-        trace.add(np.inf if rough else search.history[-1][1], *spent)
+        trace.add(np.inf if coarse else search.history[-1][1], *spent)
 
     seen.known = 0
     problem.cache = type(problem.cache)()
@@ -287,8 +287,8 @@ def compare(parameters, options):
     starts = starts_of(
         problem, options.starts if parameters != 20 else min(options.starts, options.race_starts)
     )
-    lanes = 4 + int(3 * np.log(parameters))  # what cma takes
-    price = prices(problem, starts[0], lanes)
+    batch = 4 + int(3 * np.log(parameters))  # what cma takes
+    price = prices(problem, starts[0], batch)
     unit = price["simulation"][1]
     reference = problem.point(starts[0])
     traces = {
@@ -314,7 +314,7 @@ def compare(parameters, options):
         "compile_s": {name: p[0] for name, p in price.items()},
         "run_ms": {name: 1e3 * p[1] for name, p in price.items()},
         "relative": {
-            name: p[1] / unit / (lanes if name == "population" else 1) for name, p in price.items()
+            name: p[1] / unit / (batch if name == "population" else 1) for name, p in price.items()
         },
         "methods": {m: summary(many, best * (1 + NEAR)) for m, many in traces.items()},
     }

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtank.analysis import elimination, qp
 
 jax.config.update("jax_enable_x64", True)
-SIZES, LANES, ROUNDS, CALLS = (48, 60, 100), 16, 5, 4
+SIZES, BATCHES, ROUNDS, CALLS = (48, 60, 100), 16, 5, 4
 
 
 def programme(n):
@@ -26,20 +26,20 @@ def programme(n):
     return H, f, G, low, high
 
 
-def core_us(n, lanes, slope):
+def core_us(n, batch, slope):
     """Core time [us] of one programme of a call, the least of ROUNDS."""
     H, f, G, low, high = programme(n)
     one = lambda e: qp.solve(H, e * f, G, low, high)
     one = jax.jacfwd(one) if slope else one
-    run = jax.jit(jax.vmap(one) if lanes > 1 else one)
-    size = np.linspace(0.05, 0.5, lanes) if lanes > 1 else 0.3
+    run = jax.jit(jax.vmap(one) if batch > 1 else one)
+    size = np.linspace(0.05, 0.5, batch) if batch > 1 else 0.3
     run(size).block_until_ready()
     found = []
     for _ in range(ROUNDS):
         began = time.process_time()
         for _ in range(CALLS):
             run(size).block_until_ready()
-        found.append((time.process_time() - began) / CALLS / lanes)
+        found.append((time.process_time() - began) / CALLS / batch)
     return 1e6 * min(found)
 
 
@@ -53,15 +53,15 @@ def main():
     )
     print("variables  lanes  what   ours us  LAPACK us")
     for n in SIZES:
-        for lanes in (1, LANES):
+        for batch in (1, BATCHES):
             for slope in (False, True):
                 times = []
                 for functions in (ours, lapack):
                     for name, function in zip(names, functions):
                         setattr(elimination, name, function)
-                    times.append(core_us(n, lanes, slope))
+                    times.append(core_us(n, batch, slope))
                 what = "slope" if slope else "run"
-                print(f"{n:9d}  {lanes:5d}  {what:5}  {times[0]:7.0f}  {times[1]:9.0f}", flush=True)
+                print(f"{n:9d}  {batch:5d}  {what:5}  {times[0]:7.0f}  {times[1]:9.0f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def constants(case):
     """(c (10,), gain k + k1, k1, coefficients of the decoupling (6,), floor, high) as the C loop
     has them.
     """
-    p, law = case.loop.plant, case.loop.controller
+    p, controller = case.loop.plant, case.loop.controller
     w = np.sqrt(2 * float(p.gravity))
     A, d, o, g = (np.asarray(getattr(p, n)) for n in ("area", "drain", "orifice", "pump_gain"))
     c = np.array(
@@ -56,15 +56,15 @@ def constants(case):
     b = np.append(b, [c[6] / c[7], c[8] / c[9]])
     return (
         c,
-        float(law.k) + float(law.k1),
-        float(law.k1),
+        float(controller.k) + float(controller.k1),
+        float(controller.k1),
         b,
-        float(law.level_floor),
+        float(controller.level_floor),
         float(case.loop.actuator.high[0]),
     )
 
 
-def law(c, gain, k1, b, floor, high, x, r, np):
+def controller(c, gain, k1, b, floor, high, x, r, np):
     """(2) voltages of the law, with the roots and clips of `np` (numpy or jax.numpy)."""
     s3, s4 = np.sqrt(np.maximum(x[2], floor)), np.sqrt(np.maximum(x[3], floor))
     v1 = -gain * (c[1] * s3 + c[2] * s4 - c[0] * np.sqrt(r[0]) + k1 * (x[0] - r[0]))
@@ -185,7 +185,7 @@ def plain_scan(case, r, x0):
     h = case.clock.dt
 
     def body(x, now):
-        u = jnp.stack(law(c, gain, k1, b, floor, high, x, now, jnp))
+        u = jnp.stack(controller(c, gain, k1, b, floor, high, x, now, jnp))
         f = lambda x: jnp.stack(field(c, x, u, jnp))
         a = f(x)
         p = f(x + 0.5 * h * a)
@@ -207,7 +207,7 @@ def diffrax_steps(case, r, x0):
     constant = diffrax.ConstantStepSize()
 
     def body(x, now):
-        u = jnp.stack(law(c, gain, k1, b, floor, high, x, now, jnp))
+        u = jnp.stack(controller(c, gain, k1, b, floor, high, x, now, jnp))
         solved = diffrax.diffeqsolve(
             term, diffrax.Tsit5(), 0.0, h, h, x, args=u, stepsize_controller=constant, max_steps=2
         )
@@ -228,7 +228,9 @@ def casadi_accumulated(case, r, x0):
         clip = staticmethod(lambda v, low, top: ca.fmin(ca.fmax(v, low), top))
 
     x, now = ca.SX.sym("x", 4), ca.SX.sym("r", 2)
-    u = law(c, gain, k1, b, floor, high, [x[i] for i in range(4)], [now[0], now[1]], Namespace)
+    u = controller(
+        c, gain, k1, b, floor, high, [x[i] for i in range(4)], [now[0], now[1]], Namespace
+    )
     parts = runge_kutta(
         lambda z: field(c, z, u, Namespace), tuple(x[i] for i in range(4)), case.clock.dt
     )
@@ -252,7 +254,7 @@ def scipy_lsoda(case, r, x0):
     def call():
         x, total = np.asarray(x0, dtype=float), 0.0
         for k in range(few):
-            u = law(c, gain, k1, b, floor, high, x, r[:, k], np)
+            u = controller(c, gain, k1, b, floor, high, x, r[:, k], np)
             total += np.sum((x[:2] - r[:, k]) ** 2)
             x = solve_ivp(
                 lambda t, x, u=u: field(c, x, u, np), (0, case.clock.dt), x, method="LSODA"
@@ -277,7 +279,7 @@ def plain_python(case, r, x0):
     def call():
         x, total = tuple(map(float, x0)), 0.0
         for now in rows:
-            u = law(c, gain, k1, b, floor, high, x, now, Namespace)
+            u = controller(c, gain, k1, b, floor, high, x, now, Namespace)
             total += (x[0] - now[0]) ** 2 + (x[1] - now[1]) ** 2
             x = runge_kutta(lambda z, u=u: field(c, z, u, Namespace), x, case.clock.dt)
         return math.sqrt(total / len(rows))
@@ -291,7 +293,7 @@ def python_control(case, r, x0):
     c, gain, k1, b, floor, high = constants(case)
     few = FEW // 10
     closed = lambda t, x, w, p: np.array(
-        field(c, x, law(c, gain, k1, b, floor, high, x, w, np), np)
+        field(c, x, controller(c, gain, k1, b, floor, high, x, w, np), np)
     )
     loop = control.nlsys(closed, None, inputs=2, outputs=4, states=4)
     t = np.arange(few) * case.clock.dt

@@ -26,7 +26,7 @@ from tuning.uncertainty.sampling import clopper_pearson
 
 N = 200
 SPREADS = (0.05, 0.10)
-LAWS = ("ngpc", "backstepping")
+CONTROLLERS = ("ngpc", "backstepping")
 SHORT = {"ngpc": "NGPC", "backstepping": "BS"}
 CHANGES = (20.0, 270.0, 470.0, 760.0, 900.0, 1200.0)  # ends of the plateaus of the benchmark [s]
 EVERY = 0.5  # of the errors that are kept [s]
@@ -82,16 +82,16 @@ def coefficients(plant, spread):
     }
 
 
-def case_of(law):
+def case_of(controller):
     """The case that is run."""
     return rig.set_values(
-        presets.find(f"gouta2015/{law}"), {"reference.ramp": 30.0, "clock.dt": 0.02}
+        presets.find(f"gouta2015/{controller}"), {"reference.ramp": 30.0, "clock.dt": 0.02}
     )
 
 
-def run(law, spread):
+def run(controller, spread):
     """The Found of a law."""
-    case = case_of(law)
+    case = case_of(controller)
     every = round(EVERY / case.clock.dt)
 
     def one(values):
@@ -107,11 +107,15 @@ def run(law, spread):
 
 def everything():
     """{(law, spread): Found} and {law: total RMS error of the plant as it should be [cm]}."""
-    found = {(law, spread): run(law, spread) for law in LAWS for spread in SPREADS}
+    found = {
+        (controller, spread): run(controller, spread)
+        for controller in CONTROLLERS
+        for spread in SPREADS
+    }
     nominal = {}
-    for law in LAWS:
-        case = case_of(law)
-        nominal[law] = float(
+    for controller in CONTROLLERS:
+        case = case_of(controller)
+        nominal[controller] = float(
             lp.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"]
         )
     return found, nominal
@@ -135,7 +139,7 @@ def ratio_of_medians(nominal):
     )
 
 
-def said(triple, unit):
+def printed(triple, unit):
     """Estimate, interval and unit as text."""
     estimate, low, high = triple
     return f"{estimate:+.3g} [{low:+.3g}, {high:+.3g}]{' ' + unit if unit else ''}"
@@ -157,7 +161,7 @@ def window(found, output, start, end):
 
 def rows(found, nominal):
     """The table."""
-    near, far = ([found[law, s] for s in SPREADS] for law in LAWS)
+    near, far = ([found[controller, s] for s in SPREADS] for controller in CONTROLLERS)
 
     def differences(name):  # NGPC less backstepping, mean over plants and outputs or pumps
         return [
@@ -166,7 +170,7 @@ def rows(found, nominal):
         ]
 
     def row(claim, paper, triples, unit, words=""):
-        return Row(claim, paper, tuple(words + said(t, unit) for t in triples), verdict(triples))
+        return Row(claim, paper, tuple(words + printed(t, unit) for t in triples), verdict(triples))
 
     stable = [sum(int((~f.failed).sum()) for f in pair) for pair in zip(near, far)]
     highest = [
@@ -226,7 +230,10 @@ def rows(found, nominal):
             "compensate the steady-state error",
             "both",
             tuple(
-                ", ".join(f"{SHORT[law]} {said(t, 'cm')}" for law, t in zip(LAWS, pair))
+                ", ".join(
+                    f"{SHORT[controller]} {printed(t, 'cm')}"
+                    for controller, t in zip(CONTROLLERS, pair)
+                )
                 + " at plateaus' ends"
                 for pair in rest
             ),
@@ -261,7 +268,10 @@ def rows(found, nominal):
             "a larger error of h2 while r1 goes to 16 cm",
             "both",
             tuple(
-                ", ".join(f"{SHORT[law]} {said(t, 'cm')}" for law, t in zip(LAWS, pair))
+                ", ".join(
+                    f"{SHORT[controller]} {printed(t, 'cm')}"
+                    for controller, t in zip(CONTROLLERS, pair)
+                )
                 for pair in second
             ),
             verdict([t for pair in second for t in pair]),
@@ -271,8 +281,8 @@ def rows(found, nominal):
             "both",
             tuple(
                 ", ".join(
-                    f"{SHORT[law]} past it in {k} of {N} {_share(k, N)}"
-                    for law, k in zip(LAWS, pair)
+                    f"{SHORT[controller]} past it in {k} of {N} {_share(k, N)}"
+                    for controller, k in zip(CONTROLLERS, pair)
                 )
                 for pair in over
             ),

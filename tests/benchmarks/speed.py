@@ -38,7 +38,7 @@ BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"
 HEADS = ["what", "measured", "ratio (range)", "to", "at most"]
 NAMES = bench.MEASURES
 COST = ("rms_error_total",)
-LANES = 16
+BATCHES = 16
 
 
 def timed(calls, rounds):
@@ -66,14 +66,14 @@ def parameters(case):
     """Values of 2, 8 and 30 parameters of the four-tank: gains; areas and pumps; every coefficient
     of the plant and of the law's model.
     """
-    law, plant = case.loop.controller, case.loop.plant
-    two = {"controller.k": np.float64(law.k), "controller.k1": np.float64(law.k1)}
+    controller, plant = case.loop.controller, case.loop.plant
+    two = {"controller.k": np.float64(controller.k), "controller.k1": np.float64(controller.k1)}
     eight = {
         **two,
         "plant.area": np.array(plant.area),
         "plant.pump_gain": np.array(plant.pump_gain),
     }
-    of = {"plant": plant, "controller.model": law.model}
+    of = {"plant": plant, "controller.model": controller.model}
     every = {
         f"{where}.{n}": np.array(getattr(part, n))
         for where, part in of.items()
@@ -163,7 +163,7 @@ def one_run(rounds):
     return rows
 
 
-def lanes(rounds):
+def batch(rounds):
     """Rows of many plants in one compiled loop, beside a C loop in vector lanes."""
     case = presets.find("gouta2015/backstepping")
     halves = case.replace(clock=dataclasses.replace(case.clock, integrator="midpoint"))
@@ -195,10 +195,10 @@ def lanes(rounds):
                 ]
             )
     program = [sys.executable, "-W", "ignore", "-c", SINGLE, str(max(rounds // 4, 3))]
-    told = subprocess.run(
+    reported = subprocess.run(
         program, check=True, capture_output=True, text=True, cwd=Path(__file__).parent
     ).stdout.split()
-    a, b, between = map(float, told)
+    a, b, between = map(float, reported)
     rival = f"vectorised C loop, float32 not compensated, {b:.1f} ns"
     rows.append(
         [
@@ -229,7 +229,7 @@ def gauss_newton(rounds):
     """
     case = presets.find("gouta2015/backstepping")
     values = parameters(case)[8]
-    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (LANES, 4)) * np.asarray(
+    orifice = np.random.default_rng(0).uniform(0.95, 1.05, (BATCHES, 4)) * np.asarray(
         case.loop.plant.orifice
     )
     names, point = tuple(values), tuple(values.values())
@@ -260,7 +260,7 @@ def gauss_newton(rounds):
     ]
 
 
-def laws(rounds):
+def controllers(rounds):
     """Rows of the other papers' laws."""
     rows = []
     for name in ("gouta2022/chadpc", "mirakhorli/hybrid", "mirakhorli/sfc", "calofir/backstepping"):
@@ -353,11 +353,11 @@ def cold():
         return f"{statistics.median(times):.2f} s"
 
     program = [sys.executable, "-c", COMPILE]
-    told = [
+    reported = [
         subprocess.run(program, check=True, capture_output=True, text=True).stdout.split()
         for _ in range(3)
     ]
-    first = [[float(word) for word in words] for words in told]
+    first = [[float(word) for word in words] for words in reported]
     run, slope = (f"{statistics.median(v):.2f} s" for v in zip(*first))
     return [
         [
@@ -379,7 +379,7 @@ def main(words):
     if cores:
         os.sched_setaffinity(0, {max(cores)})  # before jax starts its threads
     rounds = next((int(w) for w in words if w.isdigit()), 15)
-    rows = [*one_run(rounds), *lanes(rounds), *gauss_newton(rounds), *laws(rounds)]
+    rows = [*one_run(rounds), *batch(rounds), *gauss_newton(rounds), *controllers(rounds)]
     if cores:
         os.sched_setaffinity(0, cores)
     rows += cold()

@@ -88,11 +88,10 @@ def four_tank():
     """
     rows = {}
     for plant, saturation, ramp, levels, targets in FOUR_TANK_SETTINGS:
-        for (law, free), target in zip(FOUR_TANK.items(), targets):
-            case = (
-                f"gouta2015/{law}{'-table1' * (plant == 'A')}{'-boxqp' * (saturation == 'boxqp')}"
-            )
-            rows[f"gouta2015-{plant}-{ramp}-{saturation}-{levels}-{law}"] = Row(
+        for (controller, free), target in zip(FOUR_TANK.items(), targets):
+            variant = "-table1" * (plant == "A") + "-boxqp" * (saturation == "boxqp")
+            case = f"gouta2015/{controller}{variant}"
+            rows[f"gouta2015-{plant}-{ramp}-{saturation}-{levels}-{controller}"] = Row(
                 case,
                 values={"reference.ramp": float(ramp), **(LOST if levels == "lost" else {})},
                 free=free,
@@ -112,7 +111,7 @@ def four_tank():
     return rows
 
 
-def unseen():
+def validation():
     """The validation runs of mirakhorli notes S10: plants and seeds that `mirakhorli.rehearsal`
     does not have.
     """
@@ -160,7 +159,7 @@ def quadruple():
     """{name: Row} of mirakhorli, tuned for seven runs with noise and plants that are off, judged on
     nine others with other seeds.
     """
-    shared = {"unit": "cm^2 s", "held": unseen, "options": {"starts": 4}}
+    shared = {"unit": "cm^2 s", "held": validation, "options": {"starts": 4}}
     nominal = {"scenarios": (), "bound": "mirakhorli-sfc-nominal"}
     return {
         "mirakhorli-sfc-nominal": Row("mirakhorli/sfc", **nominal, **shared),

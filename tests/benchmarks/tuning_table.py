@@ -147,11 +147,11 @@ def best_inputs(name):
     case = case_of(asked)
     found = tuning.bound(case, asked.objective, asked.limits)
     made_with = provenance.provenance(case, 0)
-    told = found.to_json()
+    reported = found.to_json()
     kept = ("cost", "objective", "holds", "closed_loop", "source", "interval_s", "grids", "wall_s")
     return {
         "case": case.name,
-        **{n: told[n] for n in kept},
+        **{n: reported[n] for n in kept},
         "versions": {n: made_with[n] for n in VERSIONS},
     }
 

@@ -34,7 +34,7 @@ def script(tmp_path_factory):
     return lambda shell: str(folder / shell)
 
 
-def said(shell, code, *args, cwd=None):
+def printed(shell, code, *args, cwd=None):
     flags = {"bash": ["--norc", "--noprofile"], "zsh": ["-f"], "fish": ["--no-config"]}[shell]
     environment = {**os.environ, "TERM": "dumb", "HOME": str(cwd or "/nonexistent")}
     done = subprocess.run(
@@ -57,7 +57,7 @@ def bash_words(path, line, cwd=None):
         f'source {path}; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _jaxtank; printf'
         " '%s\\n' \"${COMPREPLY[@]}\""
     )
-    return [w for w in said("bash", code, "bash", "x", *words, cwd=cwd) if w]
+    return [w for w in printed("bash", code, "bash", "x", *words, cwd=cwd) if w]
 
 
 def zsh_words(path, line, cwd=None):
@@ -68,13 +68,13 @@ def zsh_words(path, line, cwd=None):
         " ${words[CURRENT]}* ]] && print -r -- $w; done; return 0; };"
     )
     code = f'{stub} source {path}; words=("$@"); CURRENT=$#; _jaxtank'
-    return said("zsh", code, "zsh", *line.split(" "), cwd=cwd)
+    return printed("zsh", code, "zsh", *line.split(" "), cwd=cwd)
 
 
 def fish_words(path, line, cwd=None):
     return [
         w.split("\t")[0]
-        for w in said("fish", f"source {path}; complete -C $argv[1]", line, cwd=cwd)
+        for w in printed("fish", f"source {path}; complete -C $argv[1]", line, cwd=cwd)
     ]
 
 
@@ -84,7 +84,7 @@ EACH = [pytest.param(shell, marks=need(shell)) for shell in completion.SHELLS]
 
 @need("bash")
 def test_bash_registers_it(script):
-    assert said("bash", f"source {script('bash')}; complete -p jaxtank") == [
+    assert printed("bash", f"source {script('bash')}; complete -p jaxtank") == [
         "complete -F _jaxtank jaxtank"
     ]
 

@@ -19,9 +19,9 @@ def refused(tmp_path, monkeypatch, capsys):
     def run(*words):
         monkeypatch.chdir(tmp_path)
         code = main.main(list(words))
-        said = capsys.readouterr()
-        (line,) = said.err.splitlines()
-        assert code == 2 and said.out == "" and list(tmp_path.iterdir()) == []
+        printed = capsys.readouterr()
+        (line,) = printed.err.splitlines()
+        assert code == 2 and printed.out == "" and list(tmp_path.iterdir()) == []
         return line
 
     return run

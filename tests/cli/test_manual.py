@@ -48,11 +48,11 @@ def test_the_equations_in_numbers_are_those_of_the_plant(paper):
         h = rng.uniform(0.2, 0.9, plant.tanks) * np.asarray(plant.rim)
         u = rng.uniform(0.1, 1.0, plant.pumps) * np.asarray(loop.actuator.high)
         lines = equations(plant)[-plant.tanks :]
-        told = [rate(line, h, u) for line in lines]
+        reported = [rate(line, h, u) for line in lines]
         actual = np.array(plant.derivative(0.0, tuple(h), tuple(u), None))
         # four digits are printed of each coefficient, and the terms are at most some times their
         # sum
-        np.testing.assert_allclose(told, actual, atol=2e-3 * np.abs(actual).max())
+        np.testing.assert_allclose(reported, actual, atol=2e-3 * np.abs(actual).max())
 
 
 def test_the_letters_follow_the_topology():
@@ -105,7 +105,7 @@ def test_everything_of_a_case_is_on_its_page(name):
         assert f"\n{heading}" in page
 
 
-def test_what_is_set_is_what_is_said():
+def test_what_is_set_is_what_is_reported():
     case = presets.find("gouta2022/chadpc")
     values = {
         "sensor.noise": 0.02,
@@ -139,7 +139,7 @@ def test_what_is_set_is_what_is_said():
     )
 
 
-def test_a_rig_of_ones_own_is_shown(capsys):
+def test_a_rig_of_ones_own_is_printed(capsys):
     assert main.main(["show", str(RIGS / "two_tanks.toml")]) == 0
     page = capsys.readouterr().out
     assert (

@@ -66,19 +66,19 @@ def test_bad_input_keeps_its_exit_code(tail):
 
 
 @pytest.mark.slow
-def test_progress_that_cannot_be_told_ends_no_run():
+def test_progress_that_cannot_be_reported_ends_no_run():
     """Full or closed: the answer is that of a run whose progress was read."""
-    told = shell(SEARCH, "")
-    assert told.returncode in (0, 3) and "start 1/1" in told.stderr
+    reported = shell(SEARCH, "")
+    assert reported.returncode in (0, 3) and "start 1/1" in reported.stderr
     for tail in ("2>/dev/full", "2>&-"):
         silent = shell(SEARCH, tail)
         assert (silent.returncode, figures(silent.stdout)) == (
-            told.returncode,
-            figures(told.stdout),
+            reported.returncode,
+            figures(reported.stdout),
         ), tail
 
 
-def test_ctrl_c_where_nobody_can_be_told_of_it():
+def test_ctrl_c_where_nothing_can_be_reported():
     """The handler of the signal speaks, too."""
     code = (
         "import os, signal, sys; from tuning.cli import interrupts, terminal; terminal.guard();"

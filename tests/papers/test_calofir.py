@@ -47,8 +47,8 @@ def run(name, values=None, save_every=1):
 def open_loop(loop):
     """The loop with the constant flow u_s of each setpoint instead of the law."""
     flow = [calofir.C1 * np.sqrt(h * (1 - calofir.KAPPA)) for h in (0.48, 0.30)]
-    law = OpenLoop(signal=ramps([flow[0]], [(600.0, 0, flow[1])], ramp=0.0))
-    return dataclasses.replace(loop, controller=law)
+    control = OpenLoop(signal=ramps([flow[0]], [(600.0, 0, flow[1])], ramp=0.0))
+    return dataclasses.replace(loop, controller=control)
 
 
 @pytest.mark.parametrize(
@@ -61,18 +61,20 @@ def open_loop(loop):
 )
 def test_equilibria(h1, h3, z3, u):
     """Notes S2.2, by the law's own plan and by the balance of the network."""
-    law = CASES["backstepping"].loop.controller
-    h3r, flow = law.prepare((jnp.array([h1]),), None, None)
+    controller = CASES["backstepping"].loop.controller
+    h3r, flow = controller.prepare((jnp.array([h1]),), None, None)
     np.testing.assert_allclose(
         [h3r[0], np.sqrt(h1 - h3r[0]), flow[0] / 1e-4], [h3, z3, u], atol=5.1e-8
     )
-    x, q = equilibrium(law.model, [h1])
+    x, q = equilibrium(controller.model, [h1])
     np.testing.assert_allclose([x[1], q[0] / 1e-4], [h3, u], rtol=1e-6)  # the pipe's knee of 1e-4 m
 
 
-def command(law, x, r):
-    plan = jax.tree.map(lambda a: a[0], law.prepare((jnp.array([r]),), None, None))
-    return law.step((), Tick(t=0.0, r=(r,), dr=(0.0,), ddr=(0.0,), plan=plan), Estimate(x=x))[0][0]
+def command(controller, x, r):
+    plan = jax.tree.map(lambda a: a[0], controller.prepare((jnp.array([r]),), None, None))
+    return controller.step(
+        (), Tick(t=0.0, r=(r,), dr=(0.0,), ddr=(0.0,), plan=plan), Estimate(x=x)
+    )[0][0]
 
 
 LEVELS = st.tuples(
@@ -86,22 +88,22 @@ LEVELS = st.tuples(
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(LEVELS)
-def test_the_law_is_a_feedback_linearisation_and_the_papers_form(point):
+def test_the_controller_is_a_feedback_linearisation_and_the_papers_form(point):
     """Notes S4.2: with sigma, pi; and eqs. (16)-(21) as mended in notes S4.1, with z0 and Q0. Both
     to round-off of the largest term.
     """
     h1, share, r, K_phi, K_y = point
     h3 = share * h1
-    law = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
-    q = float(command(law, (h1, h3), r))
+    controller = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
+    q = float(command(controller, (h1, h3), r))
     s, Z, h3r = np.sqrt(h3), np.sqrt(h1 - h3), calofir.KAPPA * r
     e, w = h3 - h3r, A * Z - B * s
     sigma, pi = K_phi + K_y, K_phi * K_y + A * A
     terms = np.array([A, -B * s / (2 * Z), B / (2 * s) * w / A, -sigma * w / A, -pi * e / A])
     scale = 2 * calofir.A * Z * np.abs(terms).max()
     np.testing.assert_allclose(q, 2 * calofir.A * Z * terms.sum(), atol=1e-13 * scale + 3e-17)
-    mirrored = float(command(with_values(law, {"K_phi": K_y, "K_y": K_phi}), (h1, h3), r))
-    np.testing.assert_allclose(q, mirrored, atol=1e-13 * scale + 3e-17)
+    permuted = float(command(with_values(controller, {"K_phi": K_y, "K_y": K_phi}), (h1, h3), r))
+    np.testing.assert_allclose(q, permuted, atol=1e-13 * scale + 3e-17)
     z0, Q0, z3r = 0.6, 1e-4, np.sqrt(r - h3r)
     eta1, eta2 = (h3 - h3r) / z0, (Z - z3r) / z0
     f = -B / z0 * np.sqrt(z0 * eta1 + h3r) + A / z0 * z3r
@@ -118,10 +120,12 @@ def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
     with a knee of 1e-12 m.
     """
     plant = rig.set_values(CASES["backstepping"], {"plant.knee": 1e-12}).loop.plant
-    law = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
+    controller = with_values(CASES["backstepping"].loop.controller, {"K_phi": K_phi, "K_y": K_y})
     r, h3r = 0.30, calofir.KAPPA * 0.30
     rate = jax.jit(
-        lambda x: jnp.stack(plant.derivative(0.0, tuple(x), (command(law, tuple(x), r),), None))
+        lambda x: jnp.stack(
+            plant.derivative(0.0, tuple(x), (command(controller, tuple(x), r),), None)
+        )
     )
     found = solve_ivp(
         lambda t, x: np.asarray(rate(x)),
@@ -434,22 +438,22 @@ def test_the_rig_in_centimetres():
         units=("cm", "cm^3/s"),
         knee=m.knee * 100,
     )
-    law = case.loop.controller
+    control = case.loop.controller
     # same sum; product less the difference of the two a^2
     K = np.sort(np.roots([1.0, -0.4, 0.1 * 0.3 + A**2 * (1 - 100)]))
-    law_cm = dataclasses.replace(
-        law,
+    controller_cm = dataclasses.replace(
+        control,
         model=cm,
         K_phi=K[0],
         K_y=K[1],
-        level_floor=law.level_floor * 100,
-        difference_floor=law.difference_floor * 100,
+        level_floor=control.level_floor * 100,
+        difference_floor=control.difference_floor * 100,
     )
     bank, ref = case.loop.actuator, case.loop.reference
     in_cm = dataclasses.replace(
         case.loop,
         plant=cm,
-        controller=law_cm,
+        controller=controller_cm,
         x0=case.loop.x0 * 100,
         actuator=dataclasses.replace(bank, high=bank.high * 1e6),
         reference=dataclasses.replace(ref, initial=ref.initial * 100, targets=ref.targets * 100),
@@ -482,9 +486,9 @@ def test_the_tanks_in_the_other_order():
         for p, x in ((m, (0.3, 0.1)), (turned, (0.1, 0.3)))
     )
     np.testing.assert_array_equal(one, other[::-1])
-    law = dataclasses.replace(CASES["backstepping"].loop.controller, model=turned)
+    controller = dataclasses.replace(CASES["backstepping"].loop.controller, model=turned)
     with pytest.raises(InputError, match="two coupled tanks"):
-        law.check(CASES["backstepping"].loop.reference)
+        controller.check(CASES["backstepping"].loop.reference)
 
 
 def verdicts(always=None, instead=None):

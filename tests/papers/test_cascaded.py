@@ -128,7 +128,7 @@ def test_gradients_against_central_differences(name, names):
     assert np.all(np.abs(slopes) > 1e-7)
 
 
-def test_the_pi_reaches_its_setpoints_and_open_loop_rests_at_its_own():
+def test_the_pi_reaches_its_setpoints_and_open_loop_stays_at_its_own():
     for name, within in (("pi", 0.02), ("open-loop", 0.06)):
         e = np.asarray(jaxtank.simulate(CASES[name].loop, CASES[name].clock).e[:, 0])
         assert np.abs(e[[99, 299, 499, 699]]).max() < within, name

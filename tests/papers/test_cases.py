@@ -102,10 +102,10 @@ def test_what_a_case_frees_is_a_leaf_within_its_range(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NEW)
-def test_a_case_is_shown(name, capsys):
+def test_a_case_is_printed(name, capsys):
     assert main.main(["show", name]) == 0
-    said = capsys.readouterr().out
-    assert "departures from the paper" in said and "controller." in said
+    printed = capsys.readouterr().out
+    assert "departures from the paper" in printed and "controller." in printed
 
 
 @pytest.mark.slow
@@ -148,8 +148,8 @@ def test_a_paper_is_compared_and_every_difference_has_a_reason(paper):
 
 def test_printed_units_follow_the_rig(capsys):
     assert main.main(["simulate", "calofir/backstepping", "--set", "clock.duration=50"]) == 0
-    said = capsys.readouterr().out
-    assert " m " in said and "m^3/s" in said and "cm" not in said
+    printed = capsys.readouterr().out
+    assert " m " in printed and "m^3/s" in printed and "cm" not in printed
     assert (
         jaxtank.core.tree.describe(presets.find("khalid/gpc").loop, "plant.pump_gain")["unit"]
         == "m^3/(s U0)"

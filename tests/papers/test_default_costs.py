@@ -11,7 +11,7 @@ from tuning.problem.problem import Problem
 
 # the others compile for long
 QUICK = ("gouta2022/pi", "mirakhorli/sfc", "calofir/backstepping", "cascaded/pi")
-ROUGH = {
+COARSE = {
     # why the slope is only good to this share of the largest one
     "mirakhorli/smc-printed": (
         np.inf,
@@ -33,8 +33,8 @@ SHORT = {"clock.duration": 200.0}
 def tolerance(name):
     for part in ("table1", "constrained"):
         if name.endswith(part) or f"-{part}-" in name:
-            return next(share for key, (share, _) in ROUGH.items() if key.endswith(f"*-{part}"))
-    return ROUGH.get(name.removesuffix("-warm"), (1e-5,))[0]
+            return next(share for key, (share, _) in COARSE.items() if key.endswith(f"*-{part}"))
+    return COARSE.get(name.removesuffix("-warm"), (1e-5,))[0]
 
 
 def cases():

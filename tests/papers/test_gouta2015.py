@@ -423,7 +423,7 @@ def command(kind, area, at):
 
 
 @pytest.mark.parametrize("at, area, kind, expected", UNIT_VECTORS)
-def test_unit_vectors_of_the_laws(at, area, kind, expected):
+def test_unit_vectors_of_the_controllers(at, area, kind, expected):
     np.testing.assert_allclose(command(kind, area, at)[1], expected, atol=2e-6)
 
 

@@ -190,7 +190,7 @@ def test_the_reference_is_that_of_the_text():
     np.testing.assert_allclose(np.diff(r[0])[1000:] / 0.01, dr[0][1000:-1], atol=2e-4)
 
 
-def test_a_pour_arrives_whole_and_lifts_the_tank_by_what_the_paper_reports():
+def test_an_inflow_pulse_arrives_whole_and_lifts_the_tank_by_what_the_paper_reports():
     r = run("chadpc")
     assert 2.0 < r.d_hat[(r.t > 499) & (r.t < 530), 1].max() < 2.04  # "about 2 cm/s"
     for dt in (0.01, 0.1, 0.7):
@@ -223,13 +223,13 @@ def test_pump_fault():
 def held_at(level):
     """A short unsaturated run: a steady setpoint, levels a little off it, a pour."""
     from jaxtank.signals.base import Constant
-    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.inflows import pulses
 
     return lambda loop: dataclasses.replace(
         loop,
         reference=Constant(level=np.array(level)),
         x0=np.array(level) + np.array([0.05, -0.04]),
-        disturbance=pours(2, [(5.0, 4.0, 0, 60.0)]),
+        disturbance=pulses(2, [(5.0, 4.0, 0, 60.0)]),
     )
 
 
@@ -278,13 +278,13 @@ def test_k_and_l_are_interchangeable_in_the_loop():
 
 def quietly(loop):
     from jaxtank.signals.base import Constant
-    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.inflows import pulses
 
     return dataclasses.replace(
         loop,
         reference=Constant(level=np.array([12.0, 10.0])),
         x0=np.array([12.0, 10.0]),
-        disturbance=pours(2, [(5.0, 4.0, 0, 60.0)]),
+        disturbance=pulses(2, [(5.0, 4.0, 0, 60.0)]),
     )
 
 
@@ -349,7 +349,7 @@ def test_baselines(name):
         np.testing.assert_allclose(found[key], expected, atol=tolerance)
 
 
-def test_predictive_laws_beside_the_baselines():
+def test_predictive_controllers_beside_the_baselines():
     """Notes S7.3: limit cycles of the printed gains at 0.5 s (2 %), and S tuned for it."""
     for name, u, e in (
         ("enmpc", (7.19, 7.52), (0.364, 0.711)),
@@ -482,7 +482,7 @@ def test_gradient_of_the_default_cost(name):
             assert error < 1e-5 * max(abs(found[1]), flat), (entry, slopes[n][index], found)
 
 
-def test_laws_refuse_what_they_cannot_invert(gouta):
+def test_controllers_refuse_what_they_cannot_invert(gouta):
     four = gouta("ngpc").loop.plant
     loop = CASES["chadpc"].loop
     wrong = dataclasses.replace(loop, controller=dataclasses.replace(loop.controller, model=four))
@@ -503,17 +503,17 @@ def test_published_parameters_are_those_of_the_cases():
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
 
     loop = CASES[name].loop
-    law, watch, level = loop.controller, loop.observer, quietly(loop)
+    control, watch, level = loop.controller, loop.observer, quietly(loop)
     m = in_metres(loop.plant)
     small = lambda part: dataclasses.replace(part, model=m) if hasattr(part, "model") else part
-    if hasattr(law, "Kc"):
-        law = dataclasses.replace(law, Kc=law.Kc * 100)
+    if hasattr(control, "Kc"):
+        control = dataclasses.replace(control, Kc=control.Kc * 100)
     volume = jaxtank.with_values(level.disturbance, {"volume": level.disturbance.volume * 1e-6})
     reference = jaxtank.with_values(level.reference, {"level": level.reference.level / 100})
     metres = dataclasses.replace(
         level,
         plant=m,
-        controller=small(law),
+        controller=small(control),
         observer=small(watch),
         reference=reference,
         disturbance=volume,

@@ -34,7 +34,7 @@ DT = 2.0
 PRESET = presets.load("khalid")
 
 
-def law(kind, **changes):
+def control(kind, **changes):
     return dataclasses.replace(khalid.build(kind).controller, **changes)
 
 
@@ -194,8 +194,8 @@ def test_slopes_of_laguerre_functions_by_their_pole(pole):
     np.testing.assert_allclose(jax.jacrev(f)(jnp.float64(pole)), slope, atol=1e-13)
 
 
-def test_cost_of_the_laguerre_law():
-    Omega, Psi, _ = law("laguerre").design(DT)
+def test_cost_of_the_laguerre_controller():
+    Omega, Psi, _ = control("laguerre").design(DT)
     np.testing.assert_allclose(
         np.diag(Omega), [0.28060482, 0.23929632, 0.2014798, 0.16722567], atol=5e-9
     )
@@ -209,7 +209,7 @@ def test_cost_equals_brute_force(kind):
     not name its x_e and eta.
     """
     rng = np.random.default_rng(1)
-    part = law(kind)
+    part = control(kind)
     A, B, C = (
         np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
     )
@@ -229,7 +229,7 @@ def test_cost_equals_brute_force(kind):
 )
 def test_gpc_is_that_of_its_own_matrices(kind, Nc):
     """Eqs. 21-22 with F and Phi written out."""
-    part = law(kind)
+    part = control(kind)
     A, B, C = (
         np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
     )
@@ -249,8 +249,8 @@ def test_gpc_is_that_of_its_own_matrices(kind, Nc):
 
 @pytest.mark.parametrize("kind, N", [("laguerre", 4), ("laguerre", 10), ("laguerre-mimo", 3)])
 def test_laguerre_with_pole_0_is_gpc(kind, N):
-    flat = law(kind, a=np.zeros(law(kind).a.shape), N=N)
-    pulses = law(kind.replace("laguerre", "gpc"), Nc=N)
+    flat = control(kind, a=np.zeros(control(kind).a.shape), N=N)
+    pulses = control(kind.replace("laguerre", "gpc"), Nc=N)
     np.testing.assert_allclose(flat.gain(DT), pulses.gain(DT), rtol=1e-11)
     # pumps within samples, as GPC has them
     order = np.arange(N * flat.model.pumps).reshape(flat.model.pumps, N).T.ravel()
@@ -281,7 +281,7 @@ GAINS = [
 
 @pytest.mark.parametrize("kind, printed, radius, condition", GAINS)
 def test_gains(kind, printed, radius, condition):
-    part = law(kind)
+    part = control(kind)
     K = np.asarray(part.gain(DT))
     digits = 6 if condition else 5  # as printed
     np.testing.assert_allclose(K, printed, rtol=1e-6 if condition else 0, atol=0.5 * 10.0**-digits)
@@ -297,14 +297,14 @@ def test_gains_with_other_horizons():
     """Notes H6: with few functions the gain depends on the horizon, with eight it does not; the
     condition of Omega grows.
     """
-    short, long = (law("laguerre", Np=n) for n in (40, 800))
+    short, long = (control("laguerre", Np=n) for n in (40, 800))
     assert float(short.gain(DT)[0, 2]) == pytest.approx(9.76, abs=5e-3)
-    assert np.linalg.cond(np.asarray(law("laguerre", Np=100).design(DT)[0])) == pytest.approx(
+    assert np.linalg.cond(np.asarray(control("laguerre", Np=100).design(DT)[0])) == pytest.approx(
         820, rel=0.02
     )
     assert np.linalg.cond(np.asarray(long.design(DT)[0])) == pytest.approx(1.4e4, rel=0.05)
     assert float(long.gain(DT)[0, 2]) == pytest.approx(13.3, abs=0.05)
-    assert float(law("laguerre", N=8).gain(DT)[0, 2]) == pytest.approx(8.96, abs=0.1)
+    assert float(control("laguerre", N=8).gain(DT)[0, 2]) == pytest.approx(8.96, abs=0.1)
 
 
 # S7.2: one pump
@@ -417,10 +417,9 @@ def test_four_variables_come_within_five_percent_of_the_ten_of_gpc():
         for kind in ("laguerre", "gpc")
     )
     np.testing.assert_allclose(few, many, rtol=0.05)
-    assert law("laguerre").design(DT)[0].shape == (4, 4) and law("gpc").design(DT)[0].shape == (
-        10,
-        10,
-    )
+    assert control("laguerre").design(DT)[0].shape == (4, 4) and control("gpc").design(DT)[
+        0
+    ].shape == (10, 10)
 
 
 # S7.3: two pumps
@@ -538,7 +537,7 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
         9350e-6,
         [78.5e-6 * c * np.sqrt(2 * 9.8) for c in (0.0 if pumps == 1 else 1.0, 1.0, 0.5)],
     )
-    part = law(kind)
+    part = control(kind)
     A, B, C = (
         np.asarray(m) for m in incremental_model(part.model, jnp.array(part.operating_point), DT)
     )
@@ -664,7 +663,7 @@ COARSE = dataclasses.replace(khalid.CLOCK, substeps=2, duration=398.0)
 
 @pytest.mark.slow_for("laguerre")
 @pytest.mark.parametrize("kind", ["laguerre", pytest.param("gpc", marks=LATER)])
-def test_a_programme_whose_limits_are_far_is_the_linear_law(kind):
+def test_a_programme_whose_limits_are_far_is_the_linear_controller(kind):
     loop = khalid.build(kind, mode=QP)
     far = {
         "controller.du_limit": 50.0,
@@ -1011,15 +1010,15 @@ def test_every_case_passes_the_door():
         ),
     ],
 )
-def test_errors_at_the_door(values, message):
+def test_errors_by_input_validation(values, message):
     with pytest.raises(InputError, match=message):
         rig.check(rig.set_values(PRESET.cases["laguerre-constrained"], values))
 
 
 def test_control_horizon_within_the_prediction_horizon():
     with pytest.raises(InputError, match=r"controller\.Nc = 41"):
-        dataclasses.replace(law("gpc"), Nc=41).check(None)
-    assert isinstance(law("gpc"), GPC)
+        dataclasses.replace(control("gpc"), Nc=41).check(None)
+    assert isinstance(control("gpc"), GPC)
 
 
 @LATER

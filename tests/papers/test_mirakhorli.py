@@ -246,7 +246,7 @@ def test_f_and_g_of_equation_4_against_derivatives():
     np.testing.assert_allclose(f[0], printed, rtol=1e-12)
 
 
-def test_f_and_g_of_the_printed_law_at_the_set_point():
+def test_f_and_g_of_the_printed_controller_at_the_set_point():
     f, (m11, m22), (m12, m21) = acceleration(lower_tanks(PLANT, X0), 0.0)
     np.testing.assert_allclose(f, (-0.005653, -0.009935), atol=1e-6)
     np.testing.assert_allclose(
@@ -448,12 +448,14 @@ def test_memberships():
         np.testing.assert_allclose(derivative(membership)(1.0, 1.0, 0.5), 1.5, rtol=1e-12)
 
 
-def command(law, x, r, state=None):
-    plan = jax.tree.map(lambda a: a[0], law.prepare(tuple(np.array([v]) for v in r), None, None))
+def command(controller, x, r, state=None):
+    plan = jax.tree.map(
+        lambda a: a[0], controller.prepare(tuple(np.array([v]) for v in r), None, None)
+    )
     tick = Tick(t=0.0, r=r, dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1, plan=plan)
     return np.array(
-        law.step(
-            law.init(x, tuple(U0)) if state is None else state,
+        controller.step(
+            controller.init(x, tuple(U0)) if state is None else state,
             tick,
             Estimate(x=tuple(map(float, x))),
         )[0]
@@ -477,18 +479,18 @@ def test_an_error_of_tank_2_alone_decides_on_one_input(pairing, moved):
     assert abs(blended[moved] - plain[moved]) > 0.1
 
 
-def test_the_blend_rests_where_its_laws_rest():
+def test_the_blend_has_the_steady_state_of_its_controllers():
     for kind in ("sfc", "smc", "hybrid", "lqi"):
-        law = load("mirakhorli").cases[kind].loop.controller
+        controller = load("mirakhorli").cases[kind].loop.controller
         np.testing.assert_allclose(
-            command(law, X0, SETPOINT), U0, atol=7e-5
+            command(controller, X0, SETPOINT), U0, atol=7e-5
         )  # the smooth root of the surface moves its rest by that
 
 
 def test_the_first_command_from_empty_tanks():
     """Notes H5: at h = 0 the smooth root makes the law ask for (.38, .53) V only, with phi 0.02."""
-    law = dataclasses.replace(sliding(PLANT), phi=number(0.02))
-    np.testing.assert_allclose(command(law, (0.0,) * 4, SETPOINT), (0.38, 0.53), atol=6e-3)
+    controller = dataclasses.replace(sliding(PLANT), phi=number(0.02))
+    np.testing.assert_allclose(command(controller, (0.0,) * 4, SETPOINT), (0.38, 0.53), atol=6e-3)
 
 
 # S7.1: reference runs
@@ -515,10 +517,10 @@ class SmoothRoots(TankNetwork):
             self.orifice[0] * q[2],
             self.orifice[1] * q[3],
         ]
-        poured = (out[2], out[3], 0.0, 0.0)
+        inflow = (out[2], out[3], 0.0, 0.0)
         return tuple(
             (p + i - o) / a
-            for p, i, o, a in zip(pumped, poured, out, [self.area[i] for i in range(4)])
+            for p, i, o, a in zip(pumped, inflow, out, [self.area[i] for i in range(4)])
         )
 
 
@@ -691,12 +693,12 @@ def test_measures_of_the_library_are_those_of_the_tables():
         case.clock,
         ["overshoot_percent", "rise_time", "settling_time", "ise", "input_travel"],
     )
-    told = [response(trajectory, i) for i in range(2)]
+    reported = [response(trajectory, i) for i in range(2)]
     np.testing.assert_allclose(
-        found["overshoot_percent"], [r["overshoot"] for r in told], atol=1e-9
+        found["overshoot_percent"], [r["overshoot"] for r in reported], atol=1e-9
     )
-    np.testing.assert_allclose(found["rise_time"], [r["rise"] for r in told], atol=1e-9)
-    np.testing.assert_allclose(found["settling_time"], [r["settling"] for r in told], atol=1e-9)
+    np.testing.assert_allclose(found["rise_time"], [r["rise"] for r in reported], atol=1e-9)
+    np.testing.assert_allclose(found["settling_time"], [r["settling"] for r in reported], atol=1e-9)
     np.testing.assert_allclose(
         np.asarray(found["ise"]) - ise(trajectory), 7.2, atol=1e-3
     )  # the measure is a left sum: Ts/2 e(0)^2 more
@@ -756,7 +758,7 @@ def test_cost_and_its_slopes(kind, prototype_root):
 # S4.2 and S7.2: the law as printed, and as a relay
 
 
-def test_the_printed_law_never_arrives():
+def test_the_printed_controller_never_arrives():
     _, trajectory = run("smc-printed")
     np.testing.assert_allclose(trajectory.x[2000:, :2].max(axis=0), (7.53, 6.42), atol=0.01)
     np.testing.assert_allclose(
@@ -781,7 +783,7 @@ def test_the_printed_law_never_arrives():
         {"controller__switch": "tanh", "controller__phi": 300.0},
     ],
 )
-def test_neither_sampling_nor_a_boundary_layer_cures_the_printed_law(values):
+def test_neither_sampling_nor_a_boundary_layer_cures_the_printed_controller(values):
     _, trajectory = run("smc-printed", **values)
     assert np.all(trajectory.x[-1, :2] < 9.0)
     late = trajectory.u[len(trajectory.u) // 2 :]
@@ -790,7 +792,7 @@ def test_neither_sampling_nor_a_boundary_layer_cures_the_printed_law(values):
 
 
 @pytest.mark.parametrize("slope, chatters", [(0.040, False), (0.050, True)])
-def test_when_the_printed_law_chatters(slope, chatters):
+def test_when_the_printed_controller_chatters(slope, chatters):
     """One-sample gain (lambda + ks/phi) rho(G^-1 D) below 1: lambda + ks/phi < 0.0418 1/s, rho =
     23.92 s (from rest at the set point).
     """
@@ -867,8 +869,12 @@ TABLE_3 = [
 def test_rows_beside_table_3_of_the_paper(row):
     high, factor, blend, *rows = row
     pumps = {"actuator.high": high, "plant.pump_gain": tuple(factor * k for k in (27.43, 19.55))}
-    laws = (("smc-printed", {"controller.ks": 100.0}), ("sfc", {}), ("hybrid", relay(*blend, high)))
-    for (name, values), (overshoot, arrival, settling, mean_square) in zip(laws, rows):
+    controllers = (
+        ("smc-printed", {"controller.ks": 100.0}),
+        ("sfc", {}),
+        ("hybrid", relay(*blend, high)),
+    )
+    for (name, values), (overshoot, arrival, settling, mean_square) in zip(controllers, rows):
         found = response(
             run(name, **{k.replace(".", "__"): v for k, v in {**pumps, **values}.items()})[1]
         )
@@ -891,7 +897,7 @@ def test_rows_beside_table_3_of_the_paper(row):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dt, travel", [(0.01, 693.0), (0.1, 69.0), (1.0, 7.0)])
-def test_chatter_of_the_corrected_law_with_a_sign(dt, travel):
+def test_chatter_of_the_corrected_controller_with_a_sign(dt, travel):
     """Volts per second at rest at 12/12, inversely as the sample; the ripple of tank 1 is 0.058 cm
     at
     0.1 s. 4 and 7 %: a limit cycle that is cut anywhere.
@@ -937,7 +943,7 @@ EFFORTS = [  # upper limit, start, setpoint, J of SFC, SMC-C (phi 0.1), HYB-R (3
 
 
 @pytest.mark.parametrize("high, start, target, costs", EFFORTS)
-def test_costs_of_the_untuned_laws(high, start, target, costs):
+def test_costs_of_the_untuned_controllers(high, start, target, costs):
     rest = {
         "x0": tuple(X0),
         "actuator__initial": tuple(U0),
@@ -945,12 +951,12 @@ def test_costs_of_the_untuned_laws(high, start, target, costs):
         "reference__targets": target,
     }
     u = equilibrium(PLANT, target)[1]
-    laws = (
+    controllers = (
         ("sfc", {}),
         ("smc", {}),
         ("hybrid", {k.replace(".", "__"): v for k, v in relay(3.0, 1.0, high).items()}),
     )
-    for (name, values), cost in zip(laws, costs):
+    for (name, values), cost in zip(controllers, costs):
         values = {"actuator__high": high, **values, **(rest if start == "rest" else {})}
         _, t = run(name + ("-warm" if start else ""), **values)
         found = np.trapezoid((t.e**2).sum(axis=1) + 3 * ((t.u - u) ** 2).sum(axis=1), t.t)
@@ -1047,11 +1053,11 @@ STEADY = [  # reading, u_max, mean error (tank 1, tank 2) of the last 100 s [cm]
 ]
 
 
-def after_change(reading, high, law):
+def after_change(reading, high, controller):
     """Errors (samples, 2) [cm] of the last 100 s of 700 s that begin at rest at 12/12 with the
     plant changed; the law is not told.
     """
-    name, values = OTHERS[law]
+    name, values = OTHERS[controller]
     start = {
         "x0": tuple(X0),
         "actuator.initial": tuple(U0),
@@ -1066,10 +1072,12 @@ def after_change(reading, high, law):
 
 @pytest.mark.slow_for("k1 x 0.7-6.0-LQI-error26")
 @pytest.mark.parametrize(
-    "reading, high, law, error", STEADY, ids=lambda v: v if isinstance(v, str) else None
+    "reading, high, controller, error", STEADY, ids=lambda v: v if isinstance(v, str) else None
 )
-def test_steady_errors_once_an_outlet_has_changed(reading, high, law, error):
-    np.testing.assert_allclose(after_change(reading, high, law).mean(axis=0), error, atol=0.01)
+def test_steady_errors_once_an_outlet_has_changed(reading, high, controller, error):
+    np.testing.assert_allclose(
+        after_change(reading, high, controller).mean(axis=0), error, atol=0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -1094,13 +1102,15 @@ def test_integral_action_from_empty_tanks():
 
 
 def test_the_integrator_stands_while_a_pump_is_at_its_limit():
-    law = load("mirakhorli").cases["lqi"].loop.controller
+    controller = load("mirakhorli").cases["lqi"].loop.controller
     tick, state = (
         Tick(t=0.0, r=SETPOINT, dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1),
         ((1.0, 2.0), (-3.0, 0.5)),
     )
-    np.testing.assert_allclose(law.track(state, tick, (4.0, 2.0), (4.0, 2.0))[0], (0.7, 2.05))
-    np.testing.assert_allclose(law.track(state, tick, (6.0, 2.0), (5.0, 2.0))[0], (1.0, 2.0))
+    np.testing.assert_allclose(
+        controller.track(state, tick, (4.0, 2.0), (4.0, 2.0))[0], (0.7, 2.05)
+    )
+    np.testing.assert_allclose(controller.track(state, tick, (6.0, 2.0), (5.0, 2.0))[0], (1.0, 2.0))
 
 
 # what must hold of any law here
@@ -1161,7 +1171,7 @@ def test_slopes_of_the_default_cost_against_differences(name):
             )
 
 
-def test_the_printed_law_has_no_useful_slopes():
+def test_the_printed_controller_has_no_useful_slopes():
     """Every voltage is a limit, 0 or 5 V, and jumps as the surface crosses zero: the derivative of
     a sign is 0, so every slope is 0, while the cost itself moves in steps.
     """
@@ -1197,7 +1207,7 @@ def test_tanks_in_another_order_give_the_same_run(name):
     case = load("mirakhorli").cases[name]
     tanks, pumps = [1, 0, 3, 2], [1, 0]
 
-    def mirrored(rig_):
+    def permuted(rig_):
         order = {
             "area": tanks,
             "rim": tanks,
@@ -1210,20 +1220,20 @@ def test_tanks_in_another_order_give_the_same_run(name):
             rig_, **{n: np.asarray(getattr(rig_, n))[o] for n, o in order.items()}
         )
 
-    law, more = case.loop.controller, {}
-    if hasattr(law, "K"):
-        more["K"] = np.asarray(law.K)[np.ix_(pumps, tanks)]
+    control, more = case.loop.controller, {}
+    if hasattr(control, "K"):
+        more["K"] = np.asarray(control.K)[np.ix_(pumps, tanks)]
     if name == "lqi":
         more["Q"] = np.array([1.0, 0.7, 0.1, 0.2, 1e-3, 2e-3])[[1, 0, 3, 2, 5, 4]]
-        law = dataclasses.replace(law, Q=more["Q"][[1, 0, 3, 2, 5, 4]])
+        control = dataclasses.replace(control, Q=more["Q"][[1, 0, 3, 2, 5, 4]])
     area = number([120.0, 140.0, 150.0, 130.0])
     rig_ = dataclasses.replace(case.loop.plant, area=area)
-    law = dataclasses.replace(law, model=rig_)
-    here = dataclasses.replace(case.loop, plant=rig_, controller=law)
+    control = dataclasses.replace(control, model=rig_)
+    here = dataclasses.replace(case.loop, plant=rig_, controller=control)
     there = dataclasses.replace(
         here,
-        plant=mirrored(rig_),
-        controller=dataclasses.replace(law, model=mirrored(rig_), **more),
+        plant=permuted(rig_),
+        controller=dataclasses.replace(control, model=permuted(rig_), **more),
     )
     one, other = (jaxtank.simulate(loop, Clock(dt=0.1, duration=100.0)) for loop in (here, there))
     np.testing.assert_allclose(np.asarray(other.x)[:, tanks], one.x, rtol=1e-9, atol=1e-11)
@@ -1242,10 +1252,10 @@ POWERS = {"surface": 0, "ks": 1, "phi": 1, "b": 1, "w": 1, "K": -1, "operating_p
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
 
     case = load("mirakhorli").cases[name]
-    m, law = in_metres(case.loop.plant), case.loop.controller
-    scaled = {n: getattr(law, n) * 1e-2**p for n, p in POWERS.items() if hasattr(law, n)}
+    m, control = in_metres(case.loop.plant), case.loop.controller
+    scaled = {n: getattr(control, n) * 1e-2**p for n, p in POWERS.items() if hasattr(control, n)}
     if name == "lqi":
-        scaled["Q"] = law.Q * 1e4
+        scaled["Q"] = control.Q * 1e4
     reference = dataclasses.replace(
         case.loop.reference,
         initial=case.loop.reference.initial / 100,
@@ -1254,7 +1264,7 @@ def test_the_rig_in_metres_runs_as_in_centimetres(name):
     loop = dataclasses.replace(
         case.loop,
         plant=m,
-        controller=dataclasses.replace(law, model=m, **scaled),
+        controller=dataclasses.replace(control, model=m, **scaled),
         reference=reference,
         x0=case.loop.x0 / 100,
     )
@@ -1277,7 +1287,7 @@ def test_batches_and_reverse_through_the_design_of_a_gain():
 
 
 @pytest.mark.parametrize(
-    "law, words",
+    "control, words",
     [
         (
             SlidingMode(
@@ -1297,10 +1307,10 @@ def test_batches_and_reverse_through_the_design_of_a_gain():
         ),
     ],
 )
-def test_a_law_that_does_not_fit_is_refused_at_the_door(law, words):
+def test_a_controller_that_does_not_fit_is_refused_by_input_validation(control, words):
     case = load("mirakhorli").cases["sfc"]
     with pytest.raises(InputError, match=words):
-        jaxtank.simulate(dataclasses.replace(case.loop, controller=law), case.clock)
+        jaxtank.simulate(dataclasses.replace(case.loop, controller=control), case.clock)
 
 
 def test_names_of_the_contract():
@@ -1326,8 +1336,10 @@ def test_every_published_number_that_can_be_measured_is():
     assert set(found) <= set(published)
     verdicts = {name: claim.verdict for name, claim in found.items() if hasattr(claim, "verdict")}
     assert verdicts["SFC rises more slowly"] == verdicts["chattering of the SMC"] == "reproduced"
-    assert [verdicts[f"overshoot, {law}"] for law in ("SMC", "SFC", "hybrid")] == ["partly"] * 3
-    assert [verdicts[f"rise time, {law}"] for law in ("SMC", "SFC", "hybrid")] == [
+    assert [verdicts[f"overshoot, {controller}"] for controller in ("SMC", "SFC", "hybrid")] == [
+        "partly"
+    ] * 3
+    assert [verdicts[f"rise time, {controller}"] for controller in ("SMC", "SFC", "hybrid")] == [
         "not reproduced"
     ] * 3
     assert (
@@ -1343,7 +1355,7 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
     """
     swapped = {"sfc": "lqi", "sfc-warm": "lqi-warm"}
 
-    def told(instead, always):
+    def reported(instead, always):
         def other(name, values=None, save_every=1):
             values = {
                 **{k.replace(".", "__"): _hash(v) for k, v in (values or {}).items()},
@@ -1353,8 +1365,8 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
 
         return measured(other)["zero steady-state error of the SFC"].verdict
 
-    assert told(swapped, {}) == "reproduced"
-    assert told({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
+    assert reported(swapped, {}) == "reproduced"
+    assert reported({}, {"plant__pump_gain": (0.9 * 27.43, 19.55)}) == "not reproduced"
 
 
 def _hash(value):

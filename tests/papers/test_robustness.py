@@ -33,12 +33,12 @@ def errors(everything):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("law, spread, mean, sd, p05, p50, p95, rest", ROWS)
-def test_rows_of_the_study(everything, errors, law, spread, mean, sd, p05, p50, p95, rest):
+@pytest.mark.parametrize("controller, spread, mean, sd, p05, p50, p95, rest", ROWS)
+def test_rows_of_the_study(everything, errors, controller, spread, mean, sd, p05, p50, p95, rest):
     """Within three standard errors of two samples of 200 (the study's draws are in another order);
     of a quantile by the binomial law.
     """
-    values = errors[0][law, spread]
+    values = errors[0][controller, spread]
     assert values.mean() == pytest.approx(mean, abs=3 * sd * np.sqrt(2 / N))
     kurtosis = np.mean((values - values.mean()) ** 4) / values.var() ** 2
     assert values.std(ddof=1) == pytest.approx(
@@ -48,7 +48,7 @@ def test_rows_of_the_study(everything, errors, law, spread, mean, sd, p05, p50, 
         half = 3 * np.sqrt(2 * p * (1 - p) / N)
         low, high = np.quantile(values, (max(0.0, p - half), min(1.0, p + half)))
         assert low <= expected <= high
-    found = everything[0][law, spread]
+    found = everything[0][controller, spread]
     ends = [round(t / robustness_table.EVERY) for t in robustness_table.CHANGES]
     worst = np.abs(found.errors[:, ends]).max(axis=(1, 2))
     assert worst.mean() == pytest.approx(rest, abs=3 * worst.std() * np.sqrt(2 / N))

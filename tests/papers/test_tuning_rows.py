@@ -107,12 +107,12 @@ def test_no_row_loses_and_limits_hold(name):
 
 
 @SLOW
-@pytest.mark.parametrize("law", ["ngpc", "backstepping", "backstepping-ff"])
-def test_plant_b_comes_within_half_of_what_no_law_could_beat(law):
+@pytest.mark.parametrize("controller", ["ngpc", "backstepping", "backstepping-ff"])
+def test_plant_b_comes_within_half_of_the_open_loop_optimum(controller):
     asked = BOUNDS["gouta2015-B-60"]
     best = _bound("gouta2015-B-60")
     assert best.holds and asked.limits == {"max_level": "rim"}
-    assert tuned(f"gouta2015-B-60-clip-free-{law}").objective["after"] <= 1.5 * best.cost
+    assert tuned(f"gouta2015-B-60-clip-free-{controller}").objective["after"] <= 1.5 * best.cost
 
 
 @functools.cache
@@ -133,7 +133,7 @@ def test_chadpc_with_a_delay(delay, ratio):
 
 
 @SLOW
-def test_state_feedback_is_better_by_a_fifth_on_plants_and_seeds_unseen():
+def test_state_feedback_is_better_by_a_fifth_on_plants_and_seeds_out_of_sample():
     """mirakhorli notes S10: 10846 to 8566 in sum over nine plants at twice the step; the published
     K costs the same to 2 % here.
     """
@@ -189,7 +189,7 @@ def test_integral_action_beats_tuned_state_feedback_before_it_is_tuned():
         ("khalid-mimo-constrained-M3", 1.7),
     ],
 )
-def test_gains_of_the_predictive_laws(name, least):
+def test_gains_of_the_predictive_controllers(name, least):
     assert gain(name) >= least
 
 

@@ -243,18 +243,18 @@ def test_load_answers_with_a_case_where_one_is_named():
         presets.load("cascade")
 
 
-def told(result):
+def reported(result):
     """What a search came to: its method, gains and every evaluation."""
     return result.method, result.parameters, result.history, result.message
 
 
 def test_solver_options_are_the_keywords_they_stand_for(own, tuned):
-    assert told(tuning.tune(own, tuning.TRF(**FEW), validation=0)) == told(tuned)
+    assert reported(tuning.tune(own, tuning.TRF(**FEW), validation=0)) == reported(tuned)
     problem = tuning.Problem(own, free=own.free, limits={})
-    assert told(tuning.tune(problem, tuning.TRF(**FEW), validation=0)) == told(tuned)
+    assert reported(tuning.tune(problem, tuning.TRF(**FEW), validation=0)) == reported(tuned)
     by_name = tuning.tune(own, method="slsqp", **QUICK)
-    assert told(tuning.tune(own, tuning.SQP(**FEW), validation=0)) == told(by_name)
-    assert by_name.method == "slsqp" and told(by_name) != told(tuned)
+    assert reported(tuning.tune(own, tuning.SQP(**FEW), validation=0)) == reported(by_name)
+    assert by_name.method == "slsqp" and reported(by_name) != reported(tuned)
 
 
 def test_solver_options_name_a_method_and_keep_its_numbers():
@@ -425,11 +425,11 @@ def test_every_result_has_the_same_ways_out(tuned):
 
 
 def test_tune_keeps_its_log_in_the_checkpoint_and_goes_on_from_it(own, tuned, tmp_path):
-    assert told(tuning.tune(own, "trf", **QUICK, checkpoint=tmp_path)) == told(tuned)
+    assert reported(tuning.tune(own, "trf", **QUICK, checkpoint=tmp_path)) == reported(tuned)
     lines = (tmp_path / "evaluations.jsonl").read_text().splitlines()
     (tmp_path / "evaluations.jsonl").write_text("\n".join(lines[:4]) + "\n")
     again = tuning.tune(own, tuning.TRF(**FEW), validation=0, checkpoint=tmp_path, resume=True)
-    assert told(again) == told(tuned)
+    assert reported(again) == reported(tuned)
     assert (tmp_path / "evaluations.jsonl").read_text().splitlines() == lines
 
 
@@ -596,7 +596,7 @@ def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, ki
 
 
 @pytest.mark.parametrize("kind", ("tuning", "identification"))
-def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_and_says_so(
+def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     results, kind, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(f"tuning.report.{kind}.figures", lambda *_: {})

@@ -4,12 +4,14 @@ import importlib.util
 import json
 import math
 import re
+import sys
+import tomllib
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from helpers import registries_kept
+from helpers import command, registries_kept
 
 import jaxtank
 import tuning
@@ -73,6 +75,73 @@ def test_a_controller_from_outside_runs_and_is_tuned_by_the_commands(added, tmp_
     gain = found["parameters"]["controller.Kc[0]"]
     assert gain["unit"] == "V/V" and gain["before"] == 1.0 and gain["after"] != 1.0
     assert found["objective"]["after"] < found["objective"]["before"]
+
+
+PROJECT = """
+[project]
+name = "fake-control"
+version = "1.0"
+[project.entry-points."jaxtank.components"]
+biased-proportional = "fake_control:BiasedProportional"
+no-component = "fake_control:np"
+not-there = "fake_absent:Anything"
+"""
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """A distribution with the controller of the page and the table of entry points of PROJECT."""
+    section = PAGE.read_text().split("## Add a controller\n")[1].split("\n## ")[0]
+    (code,) = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
+    (table,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
+    points = tomllib.loads(PROJECT)["project"]["entry-points"]
+    assert points.keys() == tomllib.loads(table)["project"]["entry-points"].keys()
+    site = tmp_path / "site"
+    (site / "fake_control-1.0.dist-info").mkdir(parents=True)
+    (site / "fake_control.py").write_text(code.rsplit("\n\n\nrig.register", 1)[0] + "\n")
+    (site / "fake_control-1.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: fake-control\nVersion: 1.0\n"
+    )
+    lines = [f"[{g}]\n" + "\n".join(f"{k} = {v}" for k, v in p.items()) for g, p in points.items()]
+    (site / "fake_control-1.0.dist-info" / "entry_points.txt").write_text("\n".join(lines))
+    with registries_kept():
+        yield lambda: monkeypatch.syspath_prepend(site)
+    sys.modules.pop("fake_control", None)
+
+
+def test_the_command_finds_a_controller_of_an_installed_package(installed, tmp_path):
+    """Not before it is installed; other kinds of the package are offered, not imported."""
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    (tmp_path / "fake_control.py").write_text("raise SystemExit('imported from beside the rig')")
+    found = command("simulate", str(path))
+    assert found.code == 2 and "unknown law kind 'biased-proportional'" in found.err
+    installed()
+    path.write_text(RIG.replace("biased-", "biassed-"))
+    found = command("show", str(path))
+    assert found.code == 2 and "nearest: biased-proportional" in found.err
+    assert "fake_control" not in sys.modules
+    path.write_text(RIG)
+    found = command("simulate", str(path), "--json")
+    assert found.code == 0, found.err
+    assert found.json["parameters"]["controller.bias"] == [4.0]
+    assert 'kind = "biased-proportional"' in rig.dump(rig.load(path))
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("no-component", "no component"),
+        ("not-there", "package fake-control cannot be imported (ModuleNotFoundError"),
+    ],
+)
+def test_a_package_that_cannot_be_used_is_named_in_one_line(installed, tmp_path, kind, why):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.replace("biased-proportional", kind))
+    installed()
+    found = command("simulate", str(path))
+    assert found.code == 2 and found.err.count("\n") == 1 and not found.out
+    assert why in found.err
 
 
 def test_a_measure_from_outside_is_evaluated_limited_and_minimised(added, capsys):

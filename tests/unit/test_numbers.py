@@ -42,7 +42,7 @@ print(json.dumps([{n: [x.hex() for x in v] for n, v in flat.items()}, sorted(pla
 """
 
 
-def told(devices, option):
+def reported(devices, option):
     """({quantity: (n,)}, where it was) of a fresh process."""
     env = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", flags.SWITCH)} | {
         flags.SWITCH: option
@@ -62,34 +62,34 @@ def told(devices, option):
 
 @pytest.fixture(scope="module")
 def plain():
-    return told(1, "1")[0]
+    return reported(1, "1")[0]
 
 
 @pytest.mark.slow
 def test_another_process_and_the_second_of_two_devices_give_the_same_bits(plain):
-    again, places = told(2, "1")
+    again, places = reported(2, "1")
     assert places == [1]
     for name, values in plain.items():
         np.testing.assert_array_equal(again[name], values, name)
 
 
 @pytest.mark.slow
-def test_the_option_off_gives_the_same_noisy_runs_lanes_and_slopes(plain):
+def test_the_option_off_gives_the_same_noisy_runs_batches_and_slopes(plain):
     """To 1e-12 (methods 2.1: the last bits of a step; what adds up over 2,000 of them). A slope is
     a sum of terms of either sign.
     """
-    off, _ = told(1, "0")
+    off, _ = reported(1, "0")
     for name, values in plain.items():
         np.testing.assert_allclose(
             off[name], values, rtol=1e-10 if "slope" in name else 1e-12, err_msg=name
         )
 
 
-def test_a_lane_is_the_run_alone(plain):
+def test_a_batch_member_is_the_run_alone(plain):
     for name in ("rms_error_total", "input_travel", "max_level"):
-        alone, lanes = plain[f"one {name}"], plain[f"lanes {name}"]
-        np.testing.assert_allclose(lanes.reshape(3, -1)[1], alone, rtol=1e-12, err_msg=name)
-        assert np.all(np.ptp(lanes.reshape(3, -1), axis=0) > 0)
+        alone, batch = plain[f"one {name}"], plain[f"lanes {name}"]
+        np.testing.assert_allclose(batch.reshape(3, -1)[1], alone, rtol=1e-12, err_msg=name)
+        assert np.all(np.ptp(batch.reshape(3, -1), axis=0) > 0)
 
 
 FLOAT32 = """

@@ -97,7 +97,7 @@ def test_its_levels_are_those_of_another_integrator(case):
     np.testing.assert_allclose(np.asarray(run.x)[:, 0], level, atol=2e-6)
 
 
-def test_slopes_by_law_and_plant_are_those_of_differences(case):
+def test_slopes_by_controller_and_plant_are_those_of_differences(case):
     names = ("controller.Kc", "plant.drain", "plant.slope")
     point = np.array([1.0, 1.2, 0.5])
 
@@ -113,8 +113,13 @@ def test_slopes_by_law_and_plant_are_those_of_differences(case):
         )
 
 
+<<<<<<< HEAD
 def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
     result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
+=======
+def test_it_is_tuned_under_limits_drawn_and_validated(case):
+    result = tuning.tune(case, starts=1, screening=4, validation=4)
+>>>>>>> w5
     assert result.success and result.objective["after"] < 0.9 * result.objective["before"]
     found = tuning.ensemble(result.tuned, samples=8, fan=False)
     assert (
@@ -126,7 +131,7 @@ def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
         jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
 
 
-def test_what_was_tuned_is_saved_without_a_rig_file_and_says_so(case, tmp_path):
+def test_what_was_tuned_is_saved_without_a_rig_file_with_a_note(case, tmp_path):
     """Neither class has a name in a rig file; all but rig.toml is written."""
     result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
     (tmp_path / "rig.toml").write_text("of an earlier result")

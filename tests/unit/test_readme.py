@@ -11,6 +11,8 @@ from helpers import RANK, RIGS, ROOT
 
 import jaxtank
 import tuning as package
+from jaxtank import rig
+from jaxtank.core.errors import InputError
 from tuning.cli import main
 from tuning.cli.commands import identification, tuning
 from tuning.cli.parser import parser
@@ -130,11 +132,27 @@ def test_the_controller_of_ones_own_is_tuned(capsys):
 
 
 def test_the_rigs_shown_are_the_one_that_is_tested():
-    (short,), (full,) = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
+    (short,), (full, plant) = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
     assert full == RIG.read_text()
     assert tomllib.loads(short) == tomllib.loads(full)
     assert len([line for line in short.splitlines() if line.strip()]) <= 15
-    assert blocks("toml") == [short, full]
+    assert blocks("toml") == [short, full, plant]
+    of_file = tomllib.loads((RIGS / "two_tanks.toml").read_text())
+    tables = tomllib.loads(plant)
+    assert len(tables) == 5 and tables == {name: of_file[name] for name in tables}
+
+
+def test_what_the_page_states_of_outputs_holds():
+    """The default, and what a PID refuses: both for the rig of two tanks in the page."""
+    text = (RIGS / "two_tanks.toml").read_text()
+    line = 'outputs = ["lower"]\n'
+    assert text.count(line) == 1
+    assert rig.loads(text).loop.plant.outputs == (1,)
+    assert rig.loads(text.replace(line, "")).loop.plant.outputs == (0,)
+    both = text.replace('outputs = ["lower"]', 'outputs = ["upper", "lower"]')
+    both = both.replace("initial = [4.0]", "initial = [4.0, 4.0]")
+    with pytest.raises(InputError, match=r"1 .*2|2 .*1"):
+        rig.loads(both)
 
 
 def test_commands_parse():

@@ -81,8 +81,8 @@ def test_equals_scipy(n, rows):
         options=options,
     )
     x = np.asarray(solve(H, f, G, l, u))
-    slack = np.minimum(u - G @ x, G @ x - l)
-    assert slack.min() > -1e-9 and np.sum(slack < 1e-6) >= 2  # feasible, and rows bind
+    margin = np.minimum(u - G @ x, G @ x - l)
+    assert margin.min() > -1e-9 and np.sum(margin < 1e-6) >= 2  # feasible, and rows bind
     np.testing.assert_allclose(x, found.x, atol=2e-6)  # what trust-constr reaches
     assert 0.5 * x @ H @ x + f @ x <= found.fun + 1e-10
 

@@ -106,7 +106,7 @@ def test_portion_has_half_slopes_at_its_ends():
         ),
     ],
 )
-def test_with_equal_values_it_is_the_plain_law(name, gains, variable, knots):
+def test_with_equal_values_it_is_the_plain_controller(name, gains, variable, knots):
     """Knots within the range of the run. 1e-11: the laws amplify a last digit of a product that is
     formed in another order.
     """
@@ -125,7 +125,7 @@ def test_with_equal_values_it_is_the_plain_law(name, gains, variable, knots):
 
 
 @pytest.mark.parametrize("variable", ["r1", "h2"])
-def test_at_every_sample_the_law_has_the_gains_of_that_sample(gouta, variable):
+def test_at_every_sample_the_controller_has_the_gains_of_that_sample(gouta, variable):
     case = on(
         gouta("backstepping", {"clock.duration": 150.0}), ("k", "k1"), variable, values=VALUES
     )
@@ -374,7 +374,7 @@ def test_all_else_is_kept(gouta):
         ),
     ],
 )
-def test_a_bad_schedule_is_told(gouta, gains, knots, words):
+def test_a_bad_schedule_is_reported(gouta, gains, knots, words):
     with pytest.raises(InputError) as caught:
         schedule(gouta("backstepping"), gains, knots)
     assert all(word in str(caught.value) for word in words), str(caught.value)
@@ -415,7 +415,7 @@ class Odd(Controller):
 
 
 @pytest.mark.parametrize(("gain", "words"), [("start", "in its init"), ("branch", "Python's if")])
-def test_a_law_of_ones_own_is_looked_at_too(gouta, gain, words):
+def test_a_controller_of_ones_own_is_looked_at_too(gouta, gain, words):
     case = gouta("backstepping")
     case = case.replace(
         loop=dataclasses.replace(
@@ -539,7 +539,7 @@ def test_a_rig_file_may_set_gains_before_and_values_after(tmp_path):
         ),
     ],
 )
-def test_a_bad_schedule_in_a_file_is_told_in_one_line(text, words, tmp_path):
+def test_a_bad_schedule_in_a_file_is_reported_in_one_line(text, words, tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(HEAD + text)
     with pytest.raises(InputError) as caught:

@@ -95,7 +95,7 @@ def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
         b"\xff",
     ],
 )
-def test_names_of_logs_are_told_escaped(say, tmp_path, content):
+def test_names_of_logs_are_reported_escaped(say, tmp_path, content):
     if content is not None:
         (tmp_path / RED).write_bytes(content.encode() if isinstance(content, str) else content)
     code, out, err = say(*IDENTIFY, RED)
@@ -137,7 +137,7 @@ def test_a_number_that_is_finite_is_not_called_infinite(value, words):
         rig.loads(text.replace(line, f"area = {value}", 1))
 
 
-def test_a_number_of_thousands_of_digits_in_a_rig_file_is_told_in_our_words():
+def test_a_number_of_thousands_of_digits_in_a_rig_file_is_reported_in_our_words():
     with pytest.raises(InputError, match="has more digits than can be read") as caught:
         rig.loads("[clock]\ndt = " + "1" * 10_000)
     assert "sys." not in str(caught.value)

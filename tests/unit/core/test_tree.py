@@ -85,7 +85,7 @@ def test_later_values_win(loop):
         ("plant.area[0]", jnp.ones(2), "(2,)"),
     ],
 )
-def test_a_wrong_shape_is_told(loop, name, value, shape):
+def test_a_wrong_shape_is_reported(loop, name, value, shape):
     with pytest.raises(InputError) as caught:
         with_values(loop, {name: value})
     assert name in str(caught.value) and shape in str(caught.value)
@@ -114,7 +114,7 @@ NO_NUMBERS += [
 
 
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=range(len(NO_NUMBERS)))
-def test_what_is_no_number_is_told(loop, value):
+def test_what_is_no_number_is_reported(loop, value):
     with pytest.raises(
         InputError, match=r"plant\.area = .*must be a real number or a list of real numbers"
     ):
@@ -126,7 +126,7 @@ def test_what_is_no_number_is_told(loop, value):
     [True, None, 1 + 2j, np.array([1j, 1, 1, 1]), jnp.ones(4) > 0, jax.random.key(0)],
     ids=range(6),
 )
-def test_a_leaf_that_is_no_number_is_told_at_the_door(loop, value):
+def test_a_leaf_that_is_no_number_is_reported_by_input_validation(loop, value):
     with pytest.raises(
         InputError, match=r"^plant\.drain = .*: must be a real number or an array of real numbers$"
     ):
@@ -149,7 +149,7 @@ def test_real_numbers_of_every_kind_are_taken(loop):
         np.testing.assert_array_equal(found, np.broadcast_to(np.array(value, dtype=float), 4))
 
 
-def test_complex_values_are_told_inside_a_trace(loop):
+def test_complex_values_are_reported_inside_a_trace(loop):
     with pytest.raises(InputError, match=r"plant\.area"):
         jax.jit(lambda v: with_values(loop, {"plant.area": v}).plant.area)(1j)
     np.testing.assert_array_equal(
@@ -204,14 +204,14 @@ def test_a_static_field_is_described_but_is_no_leaf(loop):
         "plant.area[0]\n",
     ],
 )
-def test_a_malformed_name_is_told(loop, name):
+def test_a_malformed_name_is_reported(loop, name):
     for ask in (get_value, lambda tree, name: with_values(tree, {name: 1.0})):
         with pytest.raises(InputError, match="is not a parameter name"):
             ask(loop, name)
 
 
 @pytest.mark.parametrize("name", ["plant.area[4]", "plant.area[0,0]", "controller.k[0]"])
-def test_an_entry_that_is_not_there_is_told_with_the_shape(loop, name):
+def test_an_entry_that_is_not_there_is_reported_with_the_shape(loop, name):
     for ask in (get_value, lambda tree, name: with_values(tree, {name: 1.0})):
         with pytest.raises(InputError) as caught:
             ask(loop, name)
@@ -287,7 +287,7 @@ def test_an_absent_lag_can_be_differentiated_once_it_is_set(loop):
         ("actuator.lag[1]", -1.0, "actuator.lag[1] = -1 s: must be at least 0 s"),
     ],
 )
-def test_a_value_out_of_range_is_told_with_name_entry_and_unit(loop, name, value, message):
+def test_a_value_out_of_range_is_reported_with_name_entry_and_unit(loop, name, value, message):
     bad = with_values(loop, {name: value})
     with pytest.raises(InputError) as caught:
         check_leaves(bad)
@@ -380,7 +380,7 @@ def test_a_component_is_frozen(loop):
         ),
     ],
 )
-def test_arguments_in_each_others_place_are_told(gouta, call, words):
+def test_arguments_in_each_others_place_are_reported(gouta, call, words):
     with pytest.raises(InputError) as caught:
         call(gouta("backstepping"))
     assert words in str(caught.value) and "\n" not in str(caught.value)

@@ -57,8 +57,8 @@ def test_weights_of_lqi_are_asked_for_in_no_unit_of_another_rig(tmp_path, capsys
         "[reference]\ninitial = [0.2]\n"
     )
     assert main.main(["simulate", str(file)]) == 2
-    told = capsys.readouterr().err
-    assert "needs Q" in told and "cm" not in told and told.count("\n") == 1
+    reported = capsys.readouterr().err
+    assert "needs Q" in reported and "cm" not in reported and reported.count("\n") == 1
     file.write_text(file.read_text().replace("R = [1.0]", "Q = [1.0, 1.0]"))
     assert main.main(["simulate", str(file)]) == 2
     assert "needs R [1/(m^3/s)^2]" in capsys.readouterr().err

@@ -123,10 +123,10 @@ class Compiled:
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
     """Within 1e-9 of the pumps' range."""
     case, run, signals = replayed(name)
-    told = Compiled(case, tmp_path).run(case, run, signals)
+    reported = Compiled(case, tmp_path).run(case, run, signals)
     reach = max(1.0, float(np.abs(run.applied).max()))
-    assert len(told) == SAMPLES and np.ptp(run.applied) > 0
-    np.testing.assert_allclose(told, run.applied, atol=1e-9 * reach, rtol=0)
+    assert len(reported) == SAMPLES and np.ptp(run.applied) > 0
+    np.testing.assert_allclose(reported, run.applied, atol=1e-9 * reach, rtol=0)
 
 
 @needs_gcc
@@ -151,10 +151,10 @@ def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, mo
         np.stack([np.asarray(v) for v in part], axis=1)
         for part in case.loop.reference.sample(case.clock)
     ]
-    told = Compiled(case, tmp_path).run(case, run, signals)
+    reported = Compiled(case, tmp_path).run(case, run, signals)
     assert np.ptp(run.applied) > 0.1 * np.abs(run.applied).max()
     np.testing.assert_allclose(
-        told, run.applied, atol=1e-9 * float(np.abs(run.applied).max()), rtol=0
+        reported, run.applied, atol=1e-9 * float(np.abs(run.applied).max()), rtol=0
     )
 
 
@@ -178,9 +178,9 @@ TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # gouta2022 n
 def test_c_in_single_precision(name, values, share, tmp_path):
     """Within 1e-4 of the pumps' range."""
     case, run, signals = replayed(name, values=values)
-    told = Compiled(case, tmp_path, "float").run(case, run, signals)
+    reported = Compiled(case, tmp_path, "float").run(case, run, signals)
     np.testing.assert_allclose(
-        told, run.applied, atol=share * float(np.abs(run.applied).max()), rtol=0
+        reported, run.applied, atol=share * float(np.abs(run.applied).max()), rtol=0
     )
 
 
@@ -272,13 +272,13 @@ def matlab(text):
 def test_matlab_gives_the_inputs_of_the_loop(name):
     # it begins with the first readings, the loop with the true levels
     case, run, signals = replayed(name, noise=0.0)
-    law, s, u = (
+    controller, s, u = (
         matlab(export(case, "m")),
         None,
         list(map(float, np.asarray(case.loop.actuator.initial))),
     )
     for k in range(2000):
-        u, s = law(s, run.t[k], run.y[k], *(v[k] for v in signals), u)
+        u, s = controller(s, run.t[k], run.y[k], *(v[k] for v in signals), u)
         np.testing.assert_allclose(
             u, run.applied[k], atol=1e-9 * max(1.0, float(np.abs(run.applied).max())), rtol=0
         )
@@ -401,13 +401,13 @@ def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
 
 def test_matlab_of_the_functions_that_a_controller_of_ones_own_may_use():
     case, errors = own()
-    law = matlab(export(case, "m"))
+    controller = matlab(export(case, "m"))
     for error in errors:
-        _, state = law(None, 0.0, [error + 3.0, 1.0], [3.0], [0.0], [0.0], [0.0])
+        _, state = controller(None, 0.0, [error + 3.0, 1.0], [3.0], [0.0], [0.0], [0.0])
         np.testing.assert_allclose(state, expected(error + 3.0 - 3.0), rtol=1e-12, atol=1e-15)
 
 
-def test_what_cannot_be_exported_is_told():
+def test_what_cannot_be_exported_is_reported():
     with pytest.raises(InputError, match="plays a signal back"):
         export(presets.find("cascaded/open-loop"))
     for option, words in (
@@ -560,7 +560,7 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(separator):
         title=f"t{separator}taken = 1; */",
     )
     for language, marks in (("c", (" *", "/*")), ("m", ("%",))):
-        lines = export(case, language, name="law").split("\n")
+        lines = export(case, language, name="controller").split("\n")
         assert all(line.startswith(marks) for line in lines if "taken" in line)
         assert len(lines) == len(
             export(presets.find("cascaded/pi"), language, name="law").split("\n")
@@ -587,11 +587,11 @@ def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
     text = HOSTILE_RIG.format(name='"r"').replace('["cm", "V"]', f'["cm", "{unit}"]')
     (tmp_path / "rig.toml").write_text(text)
     assert main.main(["export", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert (
-        said.out == ""
-        and said.err.count("\n") == 1
-        and "units: entry = " in said.err
+        printed.out == ""
+        and printed.err.count("\n") == 1
+        and "units: entry = " in printed.err
         and not (tmp_path / "out").exists()
     )
 
@@ -631,7 +631,7 @@ def test_a_case_whose_name_is_none_of_the_language_asks_for_one(name):
     case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
     with pytest.raises(InputError, match=f"'{name}' gives no name for the function; --name NAME"):
         export(case)
-    assert "void law_step(" in export(case, name="law")
+    assert "void law_step(" in export(case, name="controller")
 
 
 @pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])

@@ -337,8 +337,8 @@ def test_against_a_fit_written_without_the_library(case, away):
     def slopes(q):
         h = 1e-5 * np.abs(q)
         both = np.concatenate([q + np.diag(h), q - np.diag(h)])
-        told = rungekutta(both[:, :4], both[:, 4:], u).transpose(1, 0, 2).reshape(16, -1)
-        return ((told[:8] - told[8:]) / (2 * h[:, None])).T / 0.1
+        reported = rungekutta(both[:, :4], both[:, 4:], u).transpose(1, 0, 2).reshape(16, -1)
+        return ((reported[:8] - reported[8:]) / (2 * h[:, None])).T / 0.1
 
     own = least_squares(
         residual, [0.5, 0.5, 20, 20, 5, 5, 5, 5], slopes, x_scale="jac", xtol=1e-12, ftol=1e-12
@@ -427,13 +427,13 @@ def test_the_scale_of_areas_drains_and_gains_is_refused(case, clean):
         {"plant.area[1]", "plant.area[3]", "plant.drain[1]", "plant.orifice[1]"},
     ]
     for direction in found.directions:
-        told = {
+        reported = {
             n: f
             for n, f in direction["parameters"].items()
             if n.startswith(("plant.area", "plant.drain", "plant.orifice"))
         }
-        assert set(told) in columns
-        np.testing.assert_allclose(list(told.values()), 1.1, rtol=0.01)
+        assert set(reported) in columns
+        np.testing.assert_allclose(list(reported.values()), 1.1, rtol=0.01)
         # every reading stays where it is
         value = with_values(
             case.loop,
@@ -444,8 +444,10 @@ def test_the_scale_of_areas_drains_and_gains_is_refused(case, clean):
         )
         before = with_values(case.loop, {n: p["value"] for n, p in found.parameters.items()})
         u = clean.u
-        told = [played(case.replace(loop=loop), T, u, np.zeros(4), 1) for loop in (value, before)]
-        np.testing.assert_allclose(told[0], told[1], atol=0.02)
+        reported = [
+            played(case.replace(loop=loop), T, u, np.zeros(4), 1) for loop in (value, before)
+        ]
+        np.testing.assert_allclose(reported[0], reported[1], atol=0.02)
     assert found.remedies and "by itself" in found.remedies[-1]
 
 
@@ -607,7 +609,7 @@ def test_a_run_played_back_is_the_run(name, values):
     run = jaxtank.simulate(one.loop, one.clock)
     log = tuning.log(t=np.asarray(run.t), u=np.asarray(run.applied), y=np.asarray(run.x))
     record = simulation.padded([log], float(one.loop.actuator.delay))
-    told = simulation.play(
+    reported = simulation.play(
         simulation.rig_of(one.loop),
         record.dt,
         record.u,
@@ -627,7 +629,7 @@ def test_a_run_played_back_is_the_run(name, values):
         shifted = record.u[0, lead:]
         again = tuning.log(t=cut.t, u=shifted, y=cut.y)
         record = simulation.padded([again], 0.0)
-        told = simulation.play(
+        reported = simulation.play(
             simulation.rig_of(one.loop),
             record.dt,
             record.u,
@@ -635,10 +637,10 @@ def test_a_run_played_back_is_the_run(name, values):
             channels=record.channels,
             substeps=one.clock.substeps,
         )
-        np.testing.assert_allclose(np.asarray(told)[0], cut.y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(np.asarray(reported)[0], cut.y, rtol=1e-9, atol=1e-9)
         assert not np.allclose(np.diff(cut.y, axis=0), 0)
     else:
-        np.testing.assert_allclose(np.asarray(told)[0], log.y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(np.asarray(reported)[0], log.y, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -930,7 +932,7 @@ def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
         ({"starts": 0}, "starts"),
     ],
 )
-def test_refused_at_the_door(case, clean, options, words):
+def test_refused_by_input_validation(case, clean, options, words):
     with pytest.raises(InputError, match=words):
         tuning.identify(case, clean, **({"free": FREE} | options))
 
@@ -1020,13 +1022,13 @@ def test_what_is_identified_is_what_is_tuned_for(identified):
         jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0))[0],
     )
     assert gain[0] != 27.43 and np.array_equal(case.loop.controller.model.pump_gain, gain)
-    lanes = {run.name: run.case.loop for run in tuning.Problem(case).runs}
-    assert lanes["pump 1 +30 %"].plant.pump_gain.tolist() == [1.3 * gain[0], gain[1]]
-    np.testing.assert_array_equal(lanes["pump 1 -20 %"].x0, levels)
-    assert all(np.array_equal(loop.sensor.noise, case.loop.sensor.noise) for loop in lanes.values())
+    batch = {run.name: run.case.loop for run in tuning.Problem(case).runs}
+    assert batch["pump 1 +30 %"].plant.pump_gain.tolist() == [1.3 * gain[0], gain[1]]
+    np.testing.assert_array_equal(batch["pump 1 -20 %"].x0, levels)
+    assert all(np.array_equal(loop.sensor.noise, case.loop.sensor.noise) for loop in batch.values())
 
 
-def test_every_picture_says_of_which_rig_it_is(identified):
+def test_every_picture_states_of_which_rig_it_is(identified):
     page = (identified[0] / "out" / "report.html").read_text()
     for words in ("correlation of the estimates", "profile likelihood", "measured less simulated"):
         assert f">mirakhorli/sfc: {words}</text>" in page
@@ -1087,10 +1089,10 @@ def test_a_rig_whose_setpoints_its_own_plant_cannot_hold_is_read_back(tmp_path):
     again = rig.load(tmp_path / "out" / "rig.toml")
     assert not again.reachable and "(12, 2) cm have no steady state" in rig.unreachable(again)
     np.testing.assert_allclose(again.loop.plant.split, [0.42, 0.34], atol=0.01)
-    said = json.loads(out)["message"]
+    printed = json.loads(out)["message"]
     assert (
-        rig.unreachable(again) in said
-        and "reachable = false" in said
+        rig.unreachable(again) in printed
+        and "reachable = false" in printed
         and rig.unreachable(again) in err
     )
 
@@ -1128,7 +1130,7 @@ def test_the_page_names_what_matters(identified):
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "printed"),
     [
         ((), 2, "needs --data"),
         (("--data", "LOG", "--free", "plant.pump_gain[0]=5"), 2, "--free"),
@@ -1157,12 +1159,12 @@ def test_the_page_names_what_matters(identified):
         (("--plan", "--noise", "-1"), 2, "--noise"),
     ],
 )
-def test_wrong_words_in_one_line(tmp_path, words, code, said):
+def test_wrong_words_in_one_line(tmp_path, words, code, printed):
     (tmp_path / "log.csv").write_text(csv_text())
     words = [str(tmp_path / "log.csv") if w == "LOG" else w for w in words]
     folder = () if "--plan" in words else ("--out", str(tmp_path / "out"))
     got, out, err = command("identify", "mirakhorli/sfc", *words, *folder, "--quiet")
-    assert (got, out) == (code, "") and err.count("\n") == 1 and said in err
+    assert (got, out) == (code, "") and err.count("\n") == 1 and printed in err
     assert not (tmp_path / "out").exists()
 
 
@@ -1197,19 +1199,19 @@ def test_a_log_that_cannot_tell_writes_no_rig(tmp_path, resting):
     rig_file.write_text(rig.dump(warm))
     rows = "\n".join(f"{t:g},3,2.8,{a:.4f},{b:.4f}" for t, (a, b) in zip(log.t[::3], log.y[::3]))
     path.write_text(f"t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm]\n{rows}\n")
-    code, said, told = command(
+    code, printed, reported = command(
         "identify", str(rig_file), "--data", str(path), *FLAGS[2:], "--out", str(out), "--quiet"
     )
     assert (
         code == 5
-        and told.count("\n") == 1
-        and "not identifiable from these data" in told
-        and "no rig is written" in told
+        and reported.count("\n") == 1
+        and "not identifiable from these data" in reported
+        and "no rig is written" in reported
     )
     assert (
         not (out / "rig.toml").exists()
-        and "not identifiable" in said
-        and "What would identify them separately" in said
+        and "not identifiable" in printed
+        and "What would identify them separately" in printed
     )
 
 
@@ -1298,11 +1300,11 @@ def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
     mean = np.loadtxt(folder / "log.csv", delimiter=",", skiprows=1)[:, 1].mean()
     level = (k * mean / s) ** 2 / (2 * 981.0)
     G = s * np.sqrt(981.0 / (2.0 * level))
-    law = found.loop.controller
-    assert float(law.Kc[0]) == pytest.approx(0.5 * G / k, rel=1e-4)
-    assert float(law.Ti[0]) == pytest.approx(50.0 / G, rel=1e-4)
+    controller = found.loop.controller
+    assert float(controller.Kc[0]) == pytest.approx(0.5 * G / k, rel=1e-4)
+    assert float(controller.Ti[0]) == pytest.approx(50.0 / G, rel=1e-4)
     assert float(found.loop.x0[0]) == pytest.approx(level, rel=1e-4) and float(
-        law.bias[0]
+        controller.bias[0]
     ) == pytest.approx(mean)
     assert (
         set(found.free) == {"controller.Kc", "controller.Ti"}
@@ -1395,9 +1397,11 @@ def test_the_cascaded_tanks(cascaded):
         and cascaded.validation["held_back"]["rmse"][0] <= 0.35
     )
     assert cascaded.quality["widened"] > 2  # the model, not the noise, is what is left
-    told = cascaded.estimation.predicted(cascaded.estimation.unknowns(cascaded.fit))[0, :, 0]
+    reported = cascaded.estimation.predicted(cascaded.estimation.unknowns(cascaded.fit))[0, :, 0]
     y = cascaded.estimation.data.y[0, :, 0]
-    assert np.sqrt(np.mean((told - y) ** 2)) == pytest.approx(cascaded.quality["rmse"][0], rel=1e-9)
+    assert np.sqrt(np.mean((reported - y) ** 2)) == pytest.approx(
+        cascaded.quality["rmse"][0], rel=1e-9
+    )
 
 
 @pytest.mark.parametrize(
@@ -1430,8 +1434,8 @@ def test_a_parameter_that_no_reading_depends_on_is_named_with_a_remedy(free, adv
     )
     words = ["identify", "cascaded/pi", "--data", str(path), "--starts", "1", "--quiet"]
     words += ["--column", "t=t [s]", "--column", "pump1=pump1 [V]", "--column", "h2=h2 [V]"]
-    code, said, told = command(*words, *free)
-    assert code == 5 and told.count("\n") == 1 and advice in told
-    assert "not identifiable from these data: plant.caught[0]: no rig is written" in told
-    assert "plant.caught[0] is not identifiable: " in " ".join(said.split())
-    assert "What would identify it:" in said and "separately" not in told + said
+    code, printed, reported = command(*words, *free)
+    assert code == 5 and reported.count("\n") == 1 and advice in reported
+    assert "not identifiable from these data: plant.caught[0]: no rig is written" in reported
+    assert "plant.caught[0] is not identifiable: " in " ".join(printed.split())
+    assert "What would identify it:" in printed and "separately" not in reported + printed

@@ -119,7 +119,7 @@ def test_a_plain_file(read):
         "exponents",
     ],
 )
-def test_the_same_log_in_other_clothes(read, content):
+def test_the_same_data_in_other_columns_and_units(read, content):
     assert same(read(content), read(text()))
 
 
@@ -407,18 +407,18 @@ def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path)
     content, words = BAD[name]
     path, out = tmp_path / "log.csv", tmp_path / "out"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    code, said, told = command(
+    code, printed, reported = command(
         "identify", "mirakhorli/sfc", "--data", str(path), "--out", str(out), "--quiet"
     )
-    assert code == 5 and said == "" and not out.exists()
+    assert code == 5 and printed == "" and not out.exists()
     assert (
-        told.count("\n") == 1
-        and told.endswith("\n")
-        and told.startswith(("jaxtank: log", "jaxtank: file"))
-        and "log.csv" in told
+        reported.count("\n") == 1
+        and reported.endswith("\n")
+        and reported.startswith(("jaxtank: log", "jaxtank: file"))
+        and "log.csv" in reported
     )
     with pytest.raises(DataError, match=words):
-        raise DataError(told.strip())
+        raise DataError(reported.strip())
 
 
 @pytest.mark.parametrize(
@@ -454,26 +454,26 @@ def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path)
 def test_a_log_with_a_column_twice_is_refused(header, columns, words, tmp_path):
     (tmp_path / "log.csv").write_text(bad(header=header))
     options = [word for column in columns for word in ("--column", column)]
-    code, said, told = command(
+    code, printed, reported = command(
         "identify", "mirakhorli/sfc", "--data", str(tmp_path / "log.csv"), *options, "--quiet"
     )
-    assert code == 5 and said == "" and told.count("\n") == 1
-    assert re.search(words, told), told
+    assert code == 5 and printed == "" and reported.count("\n") == 1
+    assert re.search(words, reported), reported
 
 
 def test_no_file_and_a_folder(tmp_path):
     for path, words in ((tmp_path / "none.csv", "does not exist"), (tmp_path, "is not a file")):
-        code, said, told = command(
+        code, printed, reported = command(
             "identify", "mirakhorli/sfc", "--data", str(path), "--out", str(tmp_path / "out")
         )
-        assert code == 5 and said == "" and told.count("\n") == 1 and words in told
+        assert code == 5 and printed == "" and reported.count("\n") == 1 and words in reported
     assert not (tmp_path / "out").exists()
 
 
 def test_one_bad_log_among_several(tmp_path):
     (tmp_path / "good.csv").write_text(text())
     (tmp_path / "bad.csv").write_text(bad(changed(3, 0, "2")))
-    code, _, told = command(
+    code, _, reported = command(
         "identify",
         "mirakhorli/sfc",
         "--data",
@@ -481,7 +481,7 @@ def test_one_bad_log_among_several(tmp_path):
         "--data",
         str(tmp_path / "bad.csv"),
     )
-    assert code == 5 and "bad.csv, line 5" in told
+    assert code == 5 and "bad.csv, line 5" in reported
 
 
 def test_a_pump_without_a_true_limit_may_be_faint():

@@ -65,9 +65,9 @@ def refused(tmp_path, capsys, monkeypatch):
                 *options,
             ]
         )
-        said = capsys.readouterr()
-        (line,) = said.err.splitlines()
-        assert code == 5 and said.out == ""
+        printed = capsys.readouterr()
+        (line,) = printed.err.splitlines()
+        assert code == 5 and printed.out == ""
         return line
 
     return run

@@ -292,7 +292,7 @@ def test_the_option_off_gives_the_same_numbers():
 
 
 @pytest.mark.slow
-def test_float32_keeps_what_rounding_takes_and_says_what_is_lost():
+def test_float32_keeps_what_rounding_takes_and_states_what_is_lost():
     """Levels, error and its slope of a run in float32 beside float64. Plain float32 sums are 5e-3
     cm and 6e-5 off (methods 2.5).
     """
@@ -316,7 +316,7 @@ def test_float32_keeps_what_rounding_takes_and_says_what_is_lost():
     assert slope == pytest.approx(true_slope, rel=1e-4)
 
 
-def operations_in_lanes(program, lanes):
+def operations_in_batch(program, batch):
     """Arithmetic on all lanes in the fused parts of a compiled program's largest loop body, and how
     many calls wall them off.
     """
@@ -325,7 +325,7 @@ def operations_in_lanes(program, lanes):
     body = max((parts[name] for name in re.findall(r"body=(%[\w.-]+)", text)), key=len)
     fused = [parts[name] for name in re.findall(r"calls=(%[\w.-]+)", body)]
     done = re.findall(
-        rf"= f64\[{lanes}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused)
+        rf"= f64\[{batch}\]\S* (?:add|subtract|multiply|divide|select|sqrt)\(", "\n".join(fused)
     )
     return len(done), sum(
         " call(" in line and 'inlineable="false"' in line for line in body.splitlines()
@@ -346,7 +346,7 @@ def test_what_several_read_is_made_once(gouta):
             jaxtank.with_values(case.loop, v), case.clock, MEASURES, None, False
         )
     )
-    count, walls = operations_in_lanes(jax.jit(run).lower(gains).compile(), 64)
+    count, walls = operations_in_batch(jax.jit(run).lower(gains).compile(), 64)
     assert walls == 4  # the voltages, and the rates of three Runge-Kutta stages
     assert 250 < count < 650
 
@@ -368,7 +368,7 @@ def test_materialised_values_pass_every_transformation():
         assert found == pytest.approx(slope, rel=1e-14)
 
 
-def test_bench_says_why_a_loop_is_slow(gouta):
+def test_bench_states_why_a_loop_is_slow(gouta):
     """The reasons that `jaxtank bench CASE` prints, each from a program or a run that has the
     fault.
     """
@@ -412,7 +412,7 @@ def test_compensated_sums_lose_nothing():
     assert nothing(np.float64(0.0)) == 0.0
 
 
-def test_loops_over_lanes_stay_loops():
+def test_loops_over_batches_stay_loops():
     """LLVM would unroll sixteen lanes into sixteen single runs, 36 against 11 ns per step and lane:
     the program is longer, and says so.
     """

@@ -230,7 +230,7 @@ def test_straight_through_is_not_what_we_do(gouta):
     np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((1, 2)))
 
 
-def test_nan_is_told_with_time_tank_and_parameters(gouta):
+def test_nan_is_reported_with_time_tank_and_parameters(gouta):
     case = gouta("ngpc", {"clock.duration": 5.0})
 
     class Broken(type(case.loop.controller)):

@@ -112,7 +112,7 @@ def test_the_steady_gain_is_scipys(measured):
     np.testing.assert_allclose(L, P @ C.T @ np.linalg.inv(C @ P @ C.T + N), rtol=1e-8, atol=1e-12)
 
 
-def test_near_rest_both_filters_agree_once_settled():
+def test_near_the_steady_state_both_filters_agree_once_settled():
     """Small moves about the operating point: what differs is the curvature of the roots and RK4,
     both of second order.
     """
@@ -217,6 +217,6 @@ def test_the_loop_still_compiles_to_one_function(gouta, make):
     ],
 )
 @pytest.mark.parametrize("make", [kalman, extended])
-def test_at_the_door(make, changes, words):
+def test_by_input_validation(make, changes, words):
     with pytest.raises(InputError, match=words):
         make(**changes).check(PLANT)

@@ -100,7 +100,7 @@ def test_five_intervals_against_another_solver():
     np.testing.assert_allclose(found.cost, best, rtol=1e-3)
 
 
-def test_it_goes_below_the_law_and_keeps_the_limit(climb, climbed):
+def test_it_goes_below_the_controller_and_keeps_the_limit(climb, climbed):
     again = jaxtank.evaluate(
         open_loop(climb.loop, climbed.u.T, 1.0), climb.clock, ["rms_error_total", "max_level"]
     )
@@ -124,10 +124,12 @@ def test_a_looser_limit_and_a_finer_grid_cost_less(climb, climbed):
     assert 0 < looser.gain_percent < 100
 
 
-def test_what_is_said_of_it(climbed):
-    told = json.loads(json.dumps(climbed.to_json(), allow_nan=False))
+def test_what_is_reported_of_it(climbed):
+    reported = json.loads(json.dumps(climbed.to_json(), allow_nan=False))
     assert (
-        told["intervals"] == 60 and told["cost"] == climbed.cost and "certificate" in told["note"]
+        reported["intervals"] == 60
+        and reported["cost"] == climbed.cost
+        and "certificate" in reported["note"]
     )
     text = str(climbed)
     assert "limits held; tightest: max_level of tank" in text and "not a certificate" in text
@@ -153,19 +155,19 @@ def test_a_bound_is_saved_with_its_inputs_and_a_picture(climbed, tmp_path):
         pytest.param("khalid", "gpc", {}, marks=pytest.mark.slow),
     ],
 )
-def test_never_above_the_law_itself(paper, name, values):
+def test_never_above_the_controller_itself(paper, name, values):
     """On the same run without noise; dead zone, delay and lag act on the inputs as on the law's."""
     case = short(paper, name, values)
     found = bound(case, objective={"ise": 1.0})
     quiet = rig.set_values(case, {"sensor.noise": 0.0})
-    law = jaxtank.evaluate(quiet.loop, quiet.clock, ["ise", "max_level"])
-    assert found.closed_loop["cost"] == pytest.approx(float(np.sum(law["ise"])), rel=1e-6)
+    controller = jaxtank.evaluate(quiet.loop, quiet.clock, ["ise", "max_level"])
+    assert found.closed_loop["cost"] == pytest.approx(float(np.sum(controller["ise"])), rel=1e-6)
     assert found.holds and found.closed_loop["holds"]
     assert found.cost <= found.closed_loop["cost"] and found.gain_percent >= 0
 
 
 @pytest.mark.slow
-def test_a_law_that_no_search_beats_is_its_own_bound():
+def test_a_controller_that_no_search_beats_is_its_own_bound():
     """One pair of inputs for the whole run cannot follow what a law of 600 samples can: the law's
     own are the bound, and said to be.
     """
@@ -176,9 +178,9 @@ def test_a_law_that_no_search_beats_is_its_own_bound():
         and found.gain_percent == 0.0
         and found.interval == case.clock.dt
     )
-    law = jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"]
+    controller = jaxtank.evaluate(case.loop, case.clock, "rms_error_total")["rms_error_total"]
     assert (
-        found.cost == pytest.approx(float(law), rel=1e-9)
+        found.cost == pytest.approx(float(controller), rel=1e-9)
         and found.grids[-1]["cost"] > 2 * found.cost
     )
     assert "its own inputs are the bound" in str(found)

@@ -165,7 +165,7 @@ def test_equilibria_of_the_four_tank(r, upper, u, area):
 
 
 @pytest.mark.parametrize("r, tank", [((16, 3), 4), ((3, 16), 3), ((16, 7), 4)])
-def test_no_equilibrium_is_told_with_the_tank(r, tank):
+def test_no_equilibrium_is_reported_with_the_tank(r, tank):
     with pytest.raises(EquilibriumError, match=f"tank {tank}"):
         equilibrium(state_coupled_four_tank(FAST_AREA), r)
 

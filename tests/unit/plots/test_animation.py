@@ -72,7 +72,7 @@ def test_the_fragment_for_notebooks_asks_nothing_of_the_network_and_is_the_same_
 
 
 @pytest.mark.parametrize("seconds", [0, 61, "6", None])
-def test_a_length_that_no_film_can_have_is_refused(short, tmp_path, seconds):
+def test_a_length_that_no_laminar_zone_can_have_is_refused(short, tmp_path, seconds):
     with pytest.raises(InputError, match="1 to 60 s"):
         animation.animate(*short, tmp_path / "run.gif", seconds=seconds)
     assert not list(tmp_path.iterdir())

@@ -162,7 +162,7 @@ def test_margins_are_shares_of_the_limit_with_the_nearest_first(ax):
     assert list(ax.lines[0].get_ydata()) == [1]  # a bar without length is marked
 
 
-def test_margins_beyond_what_can_be_shown_are_counted(ax):
+def test_margins_beyond_what_can_be_printed_are_counted(ax):
     diagnostics.margins(
         ax, [limit(f"tank {i}", 10.0 + i, 30.0) for i in range(diagnostics.MANY + 3)]
     )
@@ -239,7 +239,7 @@ def test_a_rig_of_many_tanks_is_drawn_on_one_page():
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 12])
-def test_every_run_is_drawn_and_can_be_told_from_the_others(count):
+def test_every_run_is_drawn_and_distinguished_from_the_others(count):
     loop = presets.find("mirakhorli/sfc").loop
     runs = {f"run {i}": made(x=columns(*np.full((4, 1001), 1.0 + 0.1 * i))) for i in range(count)}
     figure = responses.responses(loop, runs)

@@ -55,12 +55,12 @@ def words(ax):
 def test_every_part_of_a_papers_rig_is_drawn_and_nothing_is_drawn_over(ax, name):
     plant = plant_of(name)
     schematic(ax, plant)
-    said = words(ax)
+    printed = words(ax)
     assert (
-        sum(t.startswith("tank ") for t in said) == plant.tanks
-        and sum(t.startswith("pump ") for t in said) == plant.pumps
+        sum(t.startswith("tank ") for t in printed) == plant.tanks
+        and sum(t.startswith("pump ") for t in printed) == plant.pumps
     )
-    assert sum("controlled" in t for t in said) == len(plant.outputs) and said.count(
+    assert sum("controlled" in t for t in printed) == len(plant.outputs) and printed.count(
         "overflow"
     ) == len(plant.spills)
     dashes = [line for line in ax.lines if line.get_linestyle() == "--"]
@@ -141,7 +141,7 @@ def test_a_closed_orifice_is_not_drawn_and_a_level_past_a_rim_stays_in_the_pictu
     assert short.height == tall.height / 2 and water(ax)[0].get_height() < 1.1 * short.height
 
 
-def test_a_rig_that_pours_in_a_circle_is_drawn_all_the_same(ax):
+def test_a_rig_whose_tanks_feed_each_other_is_drawn_all_the_same(ax):
     rig = network(
         area=[1.0] * 3,
         drain=0.1,

@@ -122,7 +122,7 @@ def test_the_gauss_newton_matrix_is_that_of_the_trajectory(case):
         jaxtank.sensitivities(case.loop, case.clock, ["iae"], values, squares={"iae": 1.0})
 
 
-def test_slopes_by_what_a_law_prepares_beforehand():
+def test_slopes_by_what_a_controller_prepares_beforehand():
     """State feedback computes its steady states before the loop: a parameter of its model acts
     through them too.
     """
@@ -214,7 +214,7 @@ def test_minibatches_come_near_the_whole(case):
         tuning.tune(case, "slsqp", batch=2, **options)
 
 
-def lanes(case):
+def members(case):
     """{scenario: loop} of what `tune` judges a case by."""
     return {run.name: run.case for run in Problem(case).runs}
 
@@ -230,7 +230,7 @@ def test_scenarios_of_a_preset_are_changes_of_the_case_as_it_stands():
         "reference.targets": 10.0,
     }
     case = rig.set_values(presets.find("mirakhorli/sfc"), {**own, "clock.duration": 200.0})
-    found = lanes(case)
+    found = members(case)
     gains = {
         name: found[name].loop.plant.pump_gain.tolist() for name in found if name.startswith("pump")
     }
@@ -241,12 +241,14 @@ def test_scenarios_of_a_preset_are_changes_of_the_case_as_it_stands():
     }
     assert found["outlet 1 -10 %"].loop.plant.drain[0] == 0.9 * 0.6
     levels, inputs = jaxtank.analysis.equilibrium(case.loop.plant, (10.0, 10.0))
-    for name, lane in found.items():
-        assert np.all(lane.loop.sensor.noise == 0.2)
-        assert lane.clock.duration == (200.0 if name == "own start" else 150.0)
-        np.testing.assert_array_equal(lane.loop.x0, np.zeros(4) if name == "own start" else levels)
+    for name, scenario in found.items():
+        assert np.all(scenario.loop.sensor.noise == 0.2)
+        assert scenario.clock.duration == (200.0 if name == "own start" else 150.0)
         np.testing.assert_array_equal(
-            lane.loop.actuator.initial, np.zeros(2) if name == "own start" else inputs
+            scenario.loop.x0, np.zeros(4) if name == "own start" else levels
+        )
+        np.testing.assert_array_equal(
+            scenario.loop.actuator.initial, np.zeros(2) if name == "own start" else inputs
         )
 
 
@@ -256,19 +258,26 @@ def test_scenarios_of_a_preset_as_shipped_have_the_numbers_of_its_paper():
     """
     case = presets.find("mirakhorli/sfc")
     found, (levels, inputs) = (
-        lanes(case),
+        members(case),
         jaxtank.analysis.equilibrium(case.loop.plant, (12.0, 12.0)),
     )
     assert found["own start"].clock == case.clock and not np.any(found["own start"].loop.x0)
-    rest = [lane for name, lane in found.items() if name != "own start"]
-    for lane in rest:
-        assert lane.clock.duration == 300.0 and np.all(lane.loop.reference.initial == 12.0)
-        np.testing.assert_array_equal(lane.loop.x0, levels)
-        np.testing.assert_array_equal(lane.loop.actuator.initial, inputs)
-        assert lane.loop.controller.model.pump_gain.tolist() == [27.43, 19.55]  # the model stays
+    rest = [scenario for name, scenario in found.items() if name != "own start"]
+    for scenario in rest:
+        assert scenario.clock.duration == 300.0 and np.all(scenario.loop.reference.initial == 12.0)
+        np.testing.assert_array_equal(scenario.loop.x0, levels)
+        np.testing.assert_array_equal(scenario.loop.actuator.initial, inputs)
+        assert scenario.loop.controller.model.pump_gain.tolist() == [
+            27.43,
+            19.55,
+        ]  # the model stays
     plants = [
-        (*lane.loop.plant.pump_gain.tolist(), lane.loop.plant.drain[0], lane.loop.plant.split[0])
-        for lane in rest
+        (
+            *scenario.loop.plant.pump_gain.tolist(),
+            scenario.loop.plant.drain[0],
+            scenario.loop.plant.split[0],
+        )
+        for scenario in rest
     ]
     assert plants == [
         (1.3 * 27.43, 19.55, 0.50265, 0.42),
@@ -284,13 +293,14 @@ def test_scenarios_of_a_preset_as_shipped_have_the_numbers_of_its_paper():
         ("calofir/backstepping", 1e-3),
     ):
         assert all(
-            np.all(lane.loop.sensor.noise == noise) for lane in lanes(presets.find(name)).values()
+            np.all(scenario.loop.sensor.noise == noise)
+            for scenario in members(presets.find(name)).values()
         )
 
 
 def test_a_warm_case_is_tuned_from_its_warm_start():
     case = presets.find("mirakhorli/sfc-warm")
-    start = lanes(case)["own start"].loop
+    start = members(case)["own start"].loop
     np.testing.assert_array_equal(
         start.x0, jaxtank.analysis.equilibrium(case.loop.plant, (6.0, 6.0))[0]
     )
@@ -381,8 +391,8 @@ def test_scenarios_that_cannot_be_run_are_refused(case, scenarios, words):
 def test_validation_is_of_runs_the_search_never_saw(case):
     case = case.replace(uncertain={"plant.drain": 0.1})
     problem = Problem(case, scenarios=SEVERAL[:2], seed=0)
-    lanes = validation.perturbed(problem, 6, 0)
-    drains = np.array([lane.case.loop.plant.drain for lane in lanes])
+    members = validation.perturbed(problem, 6, 0)
+    drains = np.array([scenario.case.loop.plant.drain for scenario in members])
     base = np.array([problem.runs[i % 2].case.loop.plant.drain for i in range(6)])
     assert (
         len(np.unique(drains[:, :2])) == 12
@@ -394,12 +404,15 @@ def test_validation_is_of_runs_the_search_never_saw(case):
     )
     found, cloud = validation.validate(problem, own, tuned, 6, 0)
     costs = []
-    for lane in lanes:
+    for scenario in members:
         costs.append(
             [
                 float(
                     jaxtank.evaluate(
-                        with_values(lane.case.loop, v), lane.case.clock, "rms_error_total", lane.key
+                        with_values(scenario.case.loop, v),
+                        scenario.case.clock,
+                        "rms_error_total",
+                        scenario.key,
                     )["rms_error_total"]
                 )
                 for v in (own, tuned)
@@ -458,18 +471,20 @@ def test_curvature_and_the_flattest_direction():
     assert abs(first @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-6)
     step = np.log(1.1) / np.log(1e4) / vectors[1, 0] * vectors[:, 0]
     # rounded, and run as they are said
-    said = np.log([found["least_sensitive"]["factors"][n] for n in ("k", "l")]) / np.log(1e4)
+    printed = np.log([found["least_sensitive"]["factors"][n] for n in ("k", "l")]) / np.log(1e4)
     assert found["least_sensitive"]["changes_percent"] == pytest.approx(
-        50 * said @ problem.H @ said, rel=1e-9
+        50 * printed @ problem.H @ printed, rel=1e-9
     )
     # what rounding may cost
-    assert 50 * said @ problem.H @ said == pytest.approx(50 * step @ problem.H @ step, rel=0.05)
+    assert 50 * printed @ problem.H @ printed == pytest.approx(
+        50 * step @ problem.H @ step, rel=0.05
+    )
     assert found["least_sensitive"]["factors"]["l"] == 1.1
     words = diagnostics.direction_words(problem, found)
     assert "k x 1.0" in words and "l x 1.1" in words
 
 
-def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
+def test_the_least_sensitive_direction_is_that_of_the_numbers():
     """Beside a steep valley, a thousandth of the other parameter is what keeps the objective where
     it is.
     """
@@ -485,13 +500,13 @@ def test_what_is_said_of_the_flattest_direction_is_true_of_the_numbers_said():
     words = diagnostics.direction_words(
         problem, diagnostics.curvature(problem, Search(problem, best, lambda s: None), best)
     )
-    said = re.fullmatch(
+    printed = re.fullmatch(
         r"least sensitive direction: controller\.k x (\S+) with controller\.k1 (\S+) changes"
         r" the objective by (\S+) %",
         words,
     )
-    assert said, words
-    ratio, change, percent = map(float, said.groups())
+    assert printed, words
+    ratio, change, percent = map(float, printed.groups())
     by_hand = [
         b.to_unit(v) for b, v in zip(problem.bounds, (ratio * np.sqrt(0.001 * 50.0), 2.5 + change))
     ]
@@ -528,7 +543,7 @@ def test_trf_on_a_quadratic_is_one_step_from_its_answer():
 
 
 @pytest.mark.slow
-def test_mirror_images_are_named_and_counted_once():
+def test_permuted_gains_are_named_and_counted_once():
     case = rig.set_values(presets.find("calofir/backstepping"), {"clock.substeps": 1})
     result = tuning.tune(case, nominal=True, starts=4, screening=16, validation=0)
     a, b = (result.parameters[n]["after"] for n in ("controller.K_phi", "controller.K_y"))
@@ -559,7 +574,9 @@ def test_the_trade_off_of_a_limit(case):
     ] == "infeasible"
     costs = [p["objective"] for p in points[:3]]
     assert costs == sorted(costs) and costs[2] > 1.05 * costs[0]
-    alone = tuning.tune(case, nominal=True, limits={"max_level": 31.0}, starts=4, screening=16, validation=0)
+    alone = tuning.tune(
+        case, nominal=True, limits={"max_level": 31.0}, starts=4, screening=16, validation=0
+    )
     assert points[2]["objective"] == pytest.approx(alone.objective["after"], rel=2e-3)
     assert points[3]["violation"] > 0.12  # a share of the limit: more than 3 cm
 

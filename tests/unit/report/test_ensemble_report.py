@@ -26,7 +26,7 @@ def row(page, label):
     return [cell.strip() for cell in line.removeprefix(label).split("  ") if cell.strip()]
 
 
-def test_a_single_draw_is_told_without_a_spread(case):
+def test_a_single_draw_is_reported_without_a_spread(case):
     """The rig has two tanks: a measure of several entries has no spread either."""
     one = tuning.ensemble(case, samples=1, **OPTIONS)
     page = repr(one)
@@ -92,7 +92,7 @@ def test_two_draws_have_a_spread(case):
     assert "spread:" not in repr(tuning.ensemble(case, samples=2, **OPTIONS))
 
 
-def test_a_fan_of_some_draws_says_of_which(case, monkeypatch):
+def test_a_fan_of_some_draws_states_of_which(case, monkeypatch):
     from tuning.report.studies import uncertainty
 
     monkeypatch.setattr(importlib.import_module("tuning.uncertainty.study"), "FAN_DRAWS", 3)

@@ -71,10 +71,16 @@ def case(gouta):
 def results(case, tmp_path_factory):
     """{kind: (what saves itself to a folder, names of its pictures)}."""
     tuned = tuning.tune(
-        case, nominal=True, starts=1, screening=2, iterations=3, validation=4, limits={"max_level": 30.0}
+        case,
+        nominal=True,
+        starts=1,
+        screening=2,
+        iterations=3,
+        validation=4,
+        limits={"max_level": 30.0},
     )
     cloud = tuning.ensemble(case, samples=4, limits={"max_level": 9.0})
-    felt = tuning.sensitivity(
+    sensitive = tuning.sensitivity(
         case, {"plant.drain[0]": tuning.Uniform(relative=0.05)}, measures=["rms_error_total"]
     )
     folder = tmp_path_factory.mktemp("logs")
@@ -123,7 +129,7 @@ def results(case, tmp_path_factory):
             ],
         ),
         "uncertainty": (cloud.save, ["fan", "violations", "rig"]),
-        "sensitivity": (felt.save, ["tornado"]),
+        "sensitivity": (sensitive.save, ["tornado"]),
         "identify": (found.save, ["fit", "residuals", "rig"]),
         "compare": (lambda *a: papers.save(pages, *a), ["rig-calofir"]),
     }
@@ -256,13 +262,13 @@ def test_results_are_on_the_disk_before_any_picture_is_drawn(
 def test_the_numbers_of_a_tuning_are_on_its_page(results, folders):
     read = Reader((folders["tune"] / "report.html").read_text(encoding="utf-8"))
     result = results["tune"][0].__self__
-    for said in (
+    for printed in (
         *result.message.split("; "),
         *result.parameters,
         tables.number(result.objective["after"]),
         "seed",
     ):
-        assert " ".join(said.split()) in read.words
+        assert " ".join(printed.split()) in read.words
     warned = [a for tag, a in read.tags if a.get("class", "").startswith("status")]
     assert ("warn" in warned[0]["class"]) == (not result.success)
     assert "[controller]" in read.words or "controller" in rig.dump(result.tuned)
@@ -299,7 +305,7 @@ def test_a_picture_of_very_many_points_is_kept_small():
     assert "data:image/png" in text and len(text) < html.LARGEST
 
 
-def test_compare_and_show_write_where_they_are_told(tmp_path, monkeypatch, capsys):
+def test_compare_and_show_write_to_the_folder_asked_for(tmp_path, monkeypatch, capsys):
     row = {
         "quantity": "q",
         "unit": "m",
@@ -401,7 +407,7 @@ def test_a_browser_opens_the_page_without_complaint(results, folders, tmp_path, 
 
 
 @browser
-def test_a_complaint_would_be_heard(tmp_path):
+def test_a_complaint_would_be_reported(tmp_path):
     (tmp_path / "bad.html").write_text(
         "<!DOCTYPE html><title>x</title><script>console.error('oh')</script>"
     )

@@ -43,7 +43,7 @@ def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case)
     ("weights", "words"),
     [((1.0, 1.0), "the mean of 2 scenarios"), ((1.0, 3.0), "the weighted mean of 2 scenarios")],
 )
-def test_scenarios_are_told_as_such(case, weights, words):
+def test_scenarios_are_reported_as_such(case, weights, words):
     scenarios = tuple(
         Scenario(f"s{i}", {"controller.Kc": 1.0 + i}, weight=w) for i, w in enumerate(weights)
     )

@@ -33,7 +33,7 @@ AT_MOST = ".".join("a" * MOST)
         f'x = """"""\n{DOTS} = 1\n',
     ],
 )
-def test_a_key_of_more_parts_than_any_name_is_told(text):
+def test_a_key_of_more_parts_than_any_name_is_reported(text):
     assert tomllib.loads(text)  # TOML it is
     with pytest.raises(
         InputError,
@@ -59,7 +59,7 @@ def test_dots_of_numbers_texts_and_remarks_are_no_key(text):
     check_keys(text)
 
 
-def test_more_words_than_any_rig_has_are_told():
+def test_more_words_than_any_rig_has_are_reported():
     check_keys("x = [" + "1.0, " * (MOST_WORDS // 2 - 1) + "]")
     for text in (
         "".join(f"{AT_MOST[:-2]}.b{i} = 1\n" for i in range(MOST_WORDS // MOST)),

@@ -127,9 +127,9 @@ def test_a_name_of_any_text_is_read_back(gouta, name, tmp_path):
     "name", ["of\tmine", "two\nlines", "\x1b[2J", "\x7f", "an unprintable \U000e0001 tag"]
 )
 def test_a_name_that_a_terminal_would_obey_is_refused(gouta, name):
-    for said in (f"name = {toml(name)}", f"[[scenario]]\nname = {toml(name)}"):
+    for printed in (f"name = {toml(name)}", f"[[scenario]]\nname = {toml(name)}"):
         with pytest.raises(InputError, match="printable") as caught:
-            rig.loads(f'case = "gouta2015/ngpc"\n{said}\n')
+            rig.loads(f'case = "gouta2015/ngpc"\n{printed}\n')
         assert str(caught.value).isprintable()
     with pytest.raises(InputError, match="printable"):
         rig.dump(gouta("ngpc").replace(name=name))
@@ -403,7 +403,7 @@ def label(text):
 
 
 @pytest.mark.parametrize(("text", "words"), BAD.items(), ids=map(label, BAD))
-def test_a_bad_file_is_told_in_one_line_that_names_it(text, words, tmp_path):
+def test_a_bad_file_is_reported_in_one_line_that_names_it(text, words, tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
@@ -446,7 +446,7 @@ def unreadable(path, prepare):
     return str(caught.value)
 
 
-def test_what_is_no_text_file_is_told(tmp_path):
+def test_what_is_no_text_file_is_reported(tmp_path):
     assert "does not exist" in unreadable(tmp_path / "missing.toml", lambda p: None)
     assert "does not exist" in unreadable(tmp_path / "nul\0.toml", lambda p: None)
     assert "not a file" in unreadable(tmp_path / "folder.toml", lambda p: p.mkdir())
@@ -548,15 +548,15 @@ def test_a_large_whole_number_is_the_float_next_to_it(line, big):
     assert [s.weight for s in whole.scenarios] == [s.weight for s in real.scenarios]
 
 
-def test_a_large_setpoint_is_told_as_the_float_next_to_it():
+def test_a_large_setpoint_is_reported_as_the_float_next_to_it():
     """No steady state has it: the answer is that, whole number or not."""
     for form in ("initial = [BIG, 3.0]", "changes = [[20.0, 1, BIG]]"):
-        told = []
+        reported = []
         for text in (str(LARGE), repr(float(LARGE))):
             with pytest.raises(EquilibriumError) as caught:
                 rig.loads(reference(form.replace("BIG", text)))
-            told.append(str(caught.value))
-        assert told[0] == told[1]
+            reported.append(str(caught.value))
+        assert reported[0] == reported[1]
 
 
 def test_names_without_quotation_marks_are_dotted_names(gouta):

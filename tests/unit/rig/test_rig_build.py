@@ -217,7 +217,7 @@ def test_neither_case_nor_tanks(tmp_path, capsys):
     assert "[[tank]]" in capsys.readouterr().err
 
 
-def test_a_law_of_a_paper_on_a_rig_of_ones_own():
+def test_a_controller_of_a_paper_on_a_rig_of_ones_own():
     """Backstepping of gouta2015 on its own rig, written tank by tank: the run of the preset."""
     case = presets.find("gouta2015/backstepping")
     case = rig.set_values(case, {"clock.dt": 0.1, "clock.duration": 200.0})
@@ -253,7 +253,7 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
     the film or of a law's floors.
     """
 
-    def levels(unit, c, law):  # c: how many of the unit are one cm
+    def levels(unit, c, controller):  # c: how many of the unit are one cm
         text = f"""
             units = ["{unit}", "{unit}^3/s"]
             [[tank]]
@@ -276,7 +276,7 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
             gravity = {981 * c}
             bottom = true
             [law]
-            {law(c)}
+            {controller(c)}
             [reference]
             initial = [{2 * c}]
             changes = [[30.0, 1, {0.005 * c}]]
@@ -297,11 +297,11 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
         loop, found = levels(unit, c, pid)
         np.testing.assert_allclose(found, cm, atol=1e-9)
         assert f"below {knee:g} {unit}," in " ".join(equations.physics(loop.plant))
-        law = levels(unit, c, floored)[0].controller
-        assert float(law.level_floor) == float(law.difference_floor) == knee
+        controller = levels(unit, c, floored)[0].controller
+        assert float(controller.level_floor) == float(controller.difference_floor) == knee
 
 
-def test_gravity_and_film_of_a_network_are_those_of_its_unit():
+def test_gravity_and_laminar_zone_of_a_network_are_those_of_its_unit():
     one = {"area": 1.0, "drain": 1.0, "pump_gain": 1.0, "feeds": [(0, None)], "rim": 1.0}
     file = 'units = ["{}", "V"]\n[[tank]]\narea = 1e6\nrim = 1.0\ndrain = 1e-3\n'
     file += '[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n[law]\nkind = "open-loop"\n'

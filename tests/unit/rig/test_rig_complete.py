@@ -92,19 +92,19 @@ def test_what_is_written_is_read_where_the_plant_has_lost_a_steady_state(tankwis
 
 
 @pytest.mark.parametrize(
-    ("name", "quiet", "told"),
+    ("name", "quiet", "reported"),
     [("rig.toml", False, True), ("rig.toml", True, False), ("fit.csv", False, False)],
 )
-def test_a_written_rig_that_says_unreachable_is_told(name, quiet, told, capsys):
+def test_a_written_rig_that_states_unreachable_is_reported(name, quiet, reported, capsys):
     case = rig.set_values(
         presets.find("gouta2015/backstepping"), {"reference.initial": [16.0, 3.0]}
     )
     args = types.SimpleNamespace(out="found/", quiet=quiet)
     options.report_unreachable(case, [pathlib.Path("found") / name], args)
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     assert (
-        said
-        == told
+        printed
+        == reported
         * f"jaxtank: found/rig.toml: note: {rig.unreachable(case)}; the file says reachable = false"
         " for it\n"
     )
@@ -197,9 +197,9 @@ def test_the_example_of_the_module_can_be_used():
     assert again.loop.safety_filter.rate.tolist() == [1.0] * 4
 
 
-def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
+def test_faults_inflow_pulses_and_a_sine_over_a_preset_are_those_of_python():
     from jaxtank.plants.faults import faults
-    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.inflows import pulses
     from jaxtank.signals.setpoints import Sine
 
     text = (
@@ -217,7 +217,7 @@ def test_faults_pours_and_a_sine_over_a_preset_are_those_of_python():
     np.testing.assert_array_equal(jax.tree.leaves(loop.reference.second), jax.tree.leaves(sine))
     assert jax.tree.structure(loop.reference.first) == jax.tree.structure(old.reference)
     for ours, theirs in (
-        (loop.disturbance, pours(4, [(30.0, 2.0, 1, 40.0)])),
+        (loop.disturbance, pulses(4, [(30.0, 2.0, 1, 40.0)])),
         (loop.faults, faults(old.plant, [("pump_gain[1]", 10, 20, 0.6, 0.0)])),
     ):
         assert jax.tree.structure(ours) == jax.tree.structure(theirs)
@@ -245,7 +245,7 @@ def test_what_a_preset_has_can_be_taken_away():
     assert rig.loads('case = "calofir/backstepping-perturbed"\nfault = []\n').loop.faults is None
 
 
-def test_another_law_and_observer_over_a_preset():
+def test_another_controller_and_observer_over_a_preset():
     text = (
         'case = "gouta2022/pi"\n[law]\nkind = "enmpc"\nTp = 0.5\ncompensation ='
         ' "single"\n[observer]\nkind = "disturbance"\nl = 2.0\n[values]\n"controller.Tp" ='
@@ -423,20 +423,20 @@ def test_what_is_wrong_is_named_with_its_unit_and_range(text, words):
 
 
 def test_init_of_the_command(tmp_path, capsys):
-    def said(*args):
+    def printed(*args):
         code = main.main(["init", "gouta2015/backstepping", *args])
         return code, capsys.readouterr().out
 
     case = presets.find("gouta2015/backstepping")
-    assert said() == (0, rig.complete(case)) and said("--short") == (0, rig.short(case))
-    assert said("--tanks") == (0, rig.complete(case, tankwise=True))
+    assert printed() == (0, rig.complete(case)) and printed("--short") == (0, rig.short(case))
+    assert printed("--tanks") == (0, rig.complete(case, tankwise=True))
     assert main.main(["init", "gouta2015/ngpc", "--short", "--tanks"]) == 2
     assert parameters(case.loop)
 
 
-def test_what_a_preset_says_in_more_tables_does_not_come_back():
+def test_what_a_preset_states_in_more_tables_does_not_come_back():
     """A short file without [uncertain], or with one pour of two, would have the preset's."""
-    from jaxtank.signals.inflows import pours
+    from jaxtank.signals.inflows import pulses
 
     case = presets.find("gouta2015/ngpc").replace(uncertain={})
     assert rig.loads(rig.short(case)).uncertain == {}
@@ -446,7 +446,7 @@ def test_what_a_preset_says_in_more_tables_does_not_come_back():
     first = [(t, d, i, v) for (t, d, i), v in zip(own.events, np.asarray(own.volume).tolist())][:1]
     assert len(own.events) > 1
     case = case.replace(
-        loop=case.loop.__class__(**{**vars(case.loop), "disturbance": pours(own.width, first)})
+        loop=case.loop.__class__(**{**vars(case.loop), "disturbance": pulses(own.width, first)})
     )
     assert rig.loads(rig.short(case)).loop.disturbance.events == own.events[:1]
 
@@ -479,44 +479,46 @@ def test_show_tells_what_tanks_and_pumps_are_called(tmp_path, capsys):
     )
     (tmp_path / "rig.toml").write_text(text)
     assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert (
-        "controlled: h1 (left)" in said
-        and "The names of its file: tank 1 is 'left', pump 1 is 'P-101'." in said
+        "controlled: h1 (left)" in printed
+        and "The names of its file: tank 1 is 'left', pump 1 is 'P-101'." in printed
     )
     assert main.main(["show", str(tmp_path / "rig.toml"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["names"] == {"tank": ["left"], "pump": ["P-101"]}
     assert main.main(["show", "gouta2015/ngpc"]) == 0
-    said = capsys.readouterr().out
-    assert "controlled: h1, h2\n" in said and "names of its file" not in said
+    printed = capsys.readouterr().out
+    assert "controlled: h1, h2\n" in printed and "names of its file" not in printed
 
 
 @pytest.mark.parametrize(
     "line", ["area = 20.0", "rim = 30.0", "drain = 1.0", "level = 3.0", "gain = 5.0", "high = 12.0"]
 )
 def test_a_large_whole_number_of_a_tank_is_the_float_next_to_it(line):
-    key, big, told = line.split(" = ")[0], 10**20, []
+    key, big, reported = line.split(" = ")[0], 10**20, []
     for value in (str(big), repr(float(big))):
         try:
-            told.append(rig.dump(rig.loads(TANK.replace(line, f"{key} = {value}"))))
+            reported.append(rig.dump(rig.loads(TANK.replace(line, f"{key} = {value}"))))
         except InputError as error:
-            told.append(str(error))
-    assert told[0] == told[1]
+            reported.append(str(error))
+    assert reported[0] == reported[1]
 
 
 @pytest.mark.parametrize("option", ["--dt", "--set", "--free"])
 def test_a_whole_number_that_no_float_holds_is_refused_in_one_line(option, capsys):
-    said = {"--dt": "", "--set": "controller.k=", "--free": "controller.k=0.1:"}[option] + "9" * 400
+    printed = {"--dt": "", "--set": "controller.k=", "--free": "controller.k=0.1:"}[
+        option
+    ] + "9" * 400
     assert (
         main.main(
-            ["tune" if option == "--free" else "show", "gouta2015/backstepping", option, said]
+            ["tune" if option == "--free" else "show", "gouta2015/backstepping", option, printed]
         )
         == 2
     )
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_numpy_says_nothing_beside_a_refusal():
+def test_numpy_states_nothing_beside_a_refusal():
     text = TANK.replace("area = 20.0", "area = 1e-300").replace(
         "[[pump]]", "[[tank]]\narea = 9.0\nrim = 9.0\n[[pump]]"
     )
@@ -533,7 +535,7 @@ def test_numpy_says_nothing_beside_a_refusal():
         rig.loads(TANK + "[reference]\ninitial = [1e308]\n")
 
 
-def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
+def test_the_limit_at_the_rim_states_what_it_is_where_rims_are_physics():
     about = "limit on overflow_volume"
     assert about in rig.complete(presets.find("cascaded/pi")).replace("\n# ", " ")
     assert about not in rig.complete(presets.find("gouta2015/ngpc")).replace("\n# ", " ")
@@ -577,15 +579,15 @@ def test_the_limit_at_the_rim_says_what_it_is_where_rims_are_physics():
         ),
     ],
 )
-def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_path, capsys):
+def test_what_can_hardly_be_meant_is_reported_and_not_refused(change, words, tmp_path, capsys):
     text = TANK.replace("drain = 1.0", "drain = 0.2").replace("gain = 5.0", "gain = 50.0")
     (tmp_path / "rig.toml").write_text(text + change, encoding="utf-8")
     (sentence,) = rig.case_warnings(rig.load(tmp_path / "rig.toml"))
     assert words in sentence
     assert main.main(["show", str(tmp_path / "rig.toml")]) == 0
     # of steps: test_step_length.py
-    told = [line for line in capsys.readouterr().err.splitlines() if "runs empty" not in line]
-    assert told == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
+    reported = [line for line in capsys.readouterr().err.splitlines() if "runs empty" not in line]
+    assert reported == [f"jaxtank: {tmp_path / 'rig.toml'}: note: {sentence}"]
 
 
 @pytest.mark.parametrize(
@@ -595,18 +597,18 @@ def test_what_can_hardly_be_meant_is_told_and_not_refused(change, words, tmp_pat
         ["--dt", "7", "--set", "clock.duration=300"],
     ],
 )
-def test_a_run_of_another_length_than_asked_for_is_told(options, capsys, tmp_path):
+def test_a_run_of_another_length_than_asked_for_is_reported(options, capsys, tmp_path):
     assert (
         main.main(["simulate", "mirakhorli/sfc", *options, "--json", "--out", str(tmp_path)]) == 0
     )
-    said, told = capsys.readouterr()
+    printed, reported = capsys.readouterr()
     note = (
         "jaxtank: note: clock.duration = 300 s is no whole number of samples of clock.dt = 7 s: the"
         " run ends at 301 s"
     )
-    assert told.splitlines()[0] == note
+    assert reported.splitlines()[0] == note
     assert (tmp_path / "trajectory.csv").read_text().splitlines()[-1].startswith("301,")
-    assert json.loads(said)["clock"]["duration"] == 300.0
+    assert json.loads(printed)["clock"]["duration"] == 300.0
     assert main.main(["show", "mirakhorli/sfc", *options, "--quiet"]) == 0
     assert capsys.readouterr().err == ""
 
@@ -622,10 +624,10 @@ def test_a_doubt_calls_a_tank_by_its_name():
         .replace("level = 3.0", "level = 31.0")
         .replace("gain = 5.0", "gain = 90.0")
     )
-    told = rig.case_warnings(rig.loads(named))
+    reported = rig.case_warnings(rig.loads(named))
     assert (
-        told[0].startswith("tank 1 ('left') starts at 31 cm")
-        and "above the rim of tank 1 ('left')" in told[1]
+        reported[0].startswith("tank 1 ('left') starts at 31 cm")
+        and "above the rim of tank 1 ('left')" in reported[1]
     )
 
 

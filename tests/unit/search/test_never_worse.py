@@ -231,7 +231,13 @@ def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank
 def test_a_controller_that_no_longer_follows_is_not_converged(watertank):
     """The least total variation of the input is that of gains at their lower ends."""
     result = tuning.tune(
-        watertank, nominal=True, objective={"input_travel": 1.0}, limits={}, starts=2, screening=4, validation=0
+        watertank,
+        nominal=True,
+        objective={"input_travel": 1.0},
+        limits={},
+        starts=2,
+        screening=4,
+        validation=0,
     )
     codes = [m.code for m in result.messages]
     assert result.status == "not_converged" and "no-longer-follows" in codes

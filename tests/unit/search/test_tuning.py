@@ -31,7 +31,9 @@ FAST = {"clock.dt": 0.1, "clock.duration": 400.0}
 @pytest.mark.slow
 def test_ngpc_on_tracking_error_alone(gouta):
     """RMS 0.0820 -> at most 0.0405 cm, Tp near 5.15 s."""
-    result = tuning.tune(gouta("ngpc"), nominal=True, free={"controller.Tp": (1.0, 60.0)}, limits={})
+    result = tuning.tune(
+        gouta("ngpc"), nominal=True, free={"controller.Tp": (1.0, 60.0)}, limits={}
+    )
     assert result.success and result.method == "trf"
     np.testing.assert_allclose(result.objective["before"], 0.0820, atol=5e-5)
     assert result.objective["after"] <= 0.0405
@@ -161,7 +163,12 @@ def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     """
     case = gouta("ngpc", {"reference.ramp": 30.0, "controller.Tp": Tp})
     result = tuning.tune(
-        case, nominal=True, free={"controller.Tp": (1.0, 100.0)}, objective=PENALISED, limits={}, starts=4
+        case,
+        nominal=True,
+        free={"controller.Tp": (1.0, 100.0)},
+        objective=PENALISED,
+        limits={},
+        starts=4,
     )
     np.testing.assert_allclose(result.parameters["controller.Tp"]["after"], 7.33, atol=0.15)
     np.testing.assert_allclose(result.objective["after"], 1.796, rtol=5e-3)

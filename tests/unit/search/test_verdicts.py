@@ -76,7 +76,8 @@ def test_a_limit_in_cubic_metres_is_met_where_it_is_tight():
     """
     case = presets.find("calofir/backstepping")
     result = tuning.tune(
-        case, nominal=True,
+        case,
+        nominal=True,
         limits={"max_level": "rim", "input_travel": 1e-3},
         starts=2,
         screening=16,
@@ -100,14 +101,18 @@ def quick():
 def test_a_search_cut_short_does_not_say_that_limits_cannot_be_met(quick):
     """The same limit is met with the usual number of iterations."""
     hard = {"max_level": 30.0}
-    short = tuning.tune(quick, nominal=True, limits=hard, starts=1, screening=1, iterations=1, validation=0)
+    short = tuning.tune(
+        quick, nominal=True, limits=hard, starts=1, screening=1, iterations=1, validation=0
+    )
     assert short.status == "not_converged" and "before the search ended" in short.message
     assert not all(c["margin"] >= 0 for c in short.constraints)
 
 
 def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure(quick):
     impossible = {"max_level": 20.0, "input_travel": 1.0}
-    result = tuning.tune(quick, nominal=True, limits=impossible, starts=1, screening=4, validation=0)
+    result = tuning.tune(
+        quick, nominal=True, limits=impossible, starts=1, screening=4, validation=0
+    )
     assert result.status == "infeasible"
     missed = [c for c in result.constraints if c["margin"] < 0]
     assert len(missed) > 1 and all(c["name"] in result.message for c in missed[:4])
@@ -121,7 +126,13 @@ def test_what_is_missed_is_told_in_full_and_is_the_least_by_one_measure(quick):
 @pytest.mark.slow
 def test_a_staircase_is_not_called_an_optimum(quick):
     result = tuning.tune(
-        quick, nominal=True, objective={"settling_time": 1.0}, limits={}, starts=1, screening=4, validation=0
+        quick,
+        nominal=True,
+        objective={"settling_time": 1.0},
+        limits={},
+        starts=1,
+        screening=4,
+        validation=0,
     )
     assert result.status == "not_converged" and "changes in steps" in result.message
 
@@ -144,7 +155,13 @@ def test_what_is_given_twice_or_empty_is_refused(words, capsys):
 @pytest.mark.slow
 def test_a_lowest_level_is_told_with_its_time(quick):
     result = tuning.tune(
-        quick, nominal=True, limits={"min_level": 0.2}, starts=1, screening=1, iterations=2, validation=0
+        quick,
+        nominal=True,
+        limits={"min_level": 0.2},
+        starts=1,
+        screening=1,
+        iterations=2,
+        validation=0,
     )
     assert all(0 <= c["time_s"] <= 1200 for c in result.constraints)
 

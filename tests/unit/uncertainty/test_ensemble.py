@@ -164,7 +164,7 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
             )
 
 
-def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
+def test_a_manifest_states_what_its_shards_are_of_and_is_not_trusted(case, whole, tmp_path):
     tuning.ensemble(case, TWO, **OPTIONS, folder=tmp_path, shard=(1, 1), limits={"max_level": 31.0})
     there, options = manifest.restore(tmp_path)
     assert options["distributions"] == TWO and options["limits"] == {"max_level": 31.0}
@@ -173,7 +173,7 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
         whole,
     )
     path = tmp_path / "manifest.json"
-    said = json.loads(path.read_text())
+    printed = json.loads(path.read_text())
     for change, words in (
         ({"origin": None}, "does not say"),
         ({"origin": {"rig": None, "limits": {}}}, "no rig file describes"),
@@ -196,7 +196,7 @@ def test_a_manifest_says_what_its_shards_are_of_and_is_not_trusted(case, whole, 
             "not a distribution",
         ),
     ):
-        path.write_text(json.dumps(said | change))
+        path.write_text(json.dumps(printed | change))
         with pytest.raises(InputError, match=words):
             manifest.restore(tmp_path)
     every = {
@@ -261,17 +261,18 @@ def test_quantiles_of_a_linear_gaussian_case():
     level = 1.0 + 20.0 * 3.0 * found.values["plant.pump_gain"][:, 0] / 10.0
     np.testing.assert_allclose(found.measures["max_level"][:, 0], level, rtol=1e-12)
     summary = found.summary()["max_level"]
-    law = stats.truncnorm(-3, 3, loc=13.0, scale=0.6)
+    control = stats.truncnorm(-3, 3, loc=13.0, scale=0.6)
     assert summary["mean"][0] == pytest.approx(13.0, abs=2e-3) and summary["sd"][
         0
-    ] == pytest.approx(law.std(), rel=5e-3)
+    ] == pytest.approx(control.std(), rel=5e-3)
     for name, p in (("p05", 0.05), ("p50", 0.5), ("p95", 0.95)):
-        assert summary[name][0] == pytest.approx(law.ppf(p), abs=5e-3)
+        assert summary[name][0] == pytest.approx(control.ppf(p), abs=5e-3)
     tail = (
-        stats.truncnorm.expect(lambda x: x, (-3, 3), loc=13.0, scale=0.6, lb=law.ppf(0.95)) / 0.05
+        stats.truncnorm.expect(lambda x: x, (-3, 3), loc=13.0, scale=0.6, lb=control.ppf(0.95))
+        / 0.05
     )
     assert summary["cvar95"][0] == pytest.approx(tail, abs=0.01)
-    assert found.violations()[0]["probability"] == pytest.approx(law.sf(14.0), abs=2e-3)
+    assert found.violations()[0]["probability"] == pytest.approx(control.sf(14.0), abs=2e-3)
 
 
 def test_the_worst_side_of_a_minimum_is_its_lower_one(whole):
@@ -442,7 +443,7 @@ def test_plateaus_without_a_steady_state_are_counted(gouta):
 
 
 @pytest.mark.parametrize(
-    "distribution, law",
+    "distribution, controller",
     [
         (tuning.Uniform(low=1.0, high=3.0), stats.uniform(1.0, 2.0)),
         (tuning.Uniform(relative=0.1), stats.uniform(1.8, 0.4)),
@@ -453,9 +454,11 @@ def test_plateaus_without_a_steady_state_are_counted(gouta):
         (tuning.Normal(mean=5.0, sd=1.0), stats.truncnorm(-3, 3, loc=5.0, scale=1.0)),
     ],
 )
-def test_quantiles_are_scipys(distribution, law):
+def test_quantiles_are_scipys(distribution, controller):
     p = np.array([1e-9, 0.01, 0.3, 0.5, 0.9, 1 - 1e-9])
-    np.testing.assert_allclose(distribution.quantile(p, np.float64(2.0)), law.ppf(p), rtol=1e-9)
+    np.testing.assert_allclose(
+        distribution.quantile(p, np.float64(2.0)), controller.ppf(p), rtol=1e-9
+    )
 
 
 def test_discrete_and_correlated_draws(case):
@@ -611,9 +614,9 @@ def test_robust_gains_hold_the_limit_on_every_plant_and_the_certificate_is_of_fr
     assert all(c["margin"] >= 0 for c in result.constraints) and len(result.constraints) == 48
     costs = []
     values = {n: p["after"] for n, p in result.parameters.items()}
-    for lane in result.problem.runs:
-        loop = with_values(lane.case.loop, values)
-        found = jaxtank.evaluate(loop, lane.case.clock, ["rms_error_total", "max_level"])
+    for scenario in result.problem.runs:
+        loop = with_values(scenario.case.loop, values)
+        found = jaxtank.evaluate(loop, scenario.case.clock, ["rms_error_total", "max_level"])
         assert np.asarray(found["max_level"]).max() <= 33.0
         costs.append(float(found["rms_error_total"]))
     # of 12, the worst 5 % are one
@@ -758,8 +761,10 @@ def test_a_limit_that_one_plant_holds_in_place_is_broken_by_one_fresh_plant_in_n
         study, fresh=4096, objective=STUDY, limits={"max_level": 33.0}, starts=1, screening=1
     )
     known = result.certificate
-    law = stats.beta(1, 64)
-    assert known.support == 1 and law.ppf(0.025) < known.broken / 4096 < law.ppf(0.975)
+    controller = stats.beta(1, 64)
+    assert known.support == 1 and controller.ppf(0.025) < known.broken / 4096 < controller.ppf(
+        0.975
+    )
     assert "back-off" in result.message
 
 

@@ -282,11 +282,11 @@ def test_batches_and_seeds(case):
     another one others.
     """
     options = {"method": "sobol", "samples": 16, "measures": ("rms_error", "max_level")}
-    told = []
+    reported = []
     first = sensitivity(
-        case, VARIED, seed=3, progress=lambda done, total: told.append((done, total)), **options
+        case, VARIED, seed=3, progress=lambda done, total: reported.append((done, total)), **options
     )
-    assert told[-1] == (96, 96)
+    assert reported[-1] == (96, 96)
     other = sensitivity(case, VARIED, seed=3, batch=7, **options)
     for a, b in zip(first.columns, other.columns):
         np.testing.assert_allclose(a.effects["total"], b.effects["total"], rtol=1e-9, atol=1e-12)
@@ -332,7 +332,7 @@ def test_noise_may_vary_from_none(case):
         )
 
 
-def test_runs_that_fail_are_counted_and_told(case):
+def test_runs_that_fail_are_counted_and_reported(case):
     study = sensitivity(
         case,
         {
@@ -349,14 +349,14 @@ def test_runs_that_fail_are_counted_and_told(case):
     _, broken = values_of(group, ("max_level",), draws.values(points.reshape(-1, 3)))
     count = int(np.sum(broken))
     assert 0 < count < study.runs and study.failed == count
-    said = study.to_json()
-    assert said["failed"] == count and f"{count} of {study.runs} runs diverged" in " ".join(
-        said["notes"]
+    printed = study.to_json()
+    assert printed["failed"] == count and f"{count} of {study.runs} runs diverged" in " ".join(
+        printed["notes"]
     )
     assert all(c.not_finite >= count for c in study.columns)
     whole = int((~np.asarray(broken).reshape(32, 5).any(axis=1)).sum())
-    assert [m["base_points_used"] for m in said["measures"].values()] == [whole] * 4
-    json.dumps(said, allow_nan=False)
+    assert [m["base_points_used"] for m in printed["measures"].values()] == [whole] * 4
+    json.dumps(printed, allow_nan=False)
 
 
 def test_estimators_leave_out_what_is_not_finite():
@@ -454,25 +454,27 @@ def test_command(tmp_path, method, samples, picture):
         str(tmp_path / "found"),
     )
     assert code == 0
-    said = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
-    assert said["case"] == "cascaded/pi" and said["method"] == method and said["failed"] == 0
-    assert list(said["parameters"]) == ["plant.drain[1]", "plant.pump_gain"]
-    assert said["runs"] == {"local": 1, "morris": 4 * 3, "sobol": 32 * 4}[method]
-    assert {m: v["unit"] for m, v in said["measures"].items()} == {
+    printed = json.loads(out, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+    assert (
+        printed["case"] == "cascaded/pi" and printed["method"] == method and printed["failed"] == 0
+    )
+    assert list(printed["parameters"]) == ["plant.drain[1]", "plant.pump_gain"]
+    assert printed["runs"] == {"local": 1, "morris": 4 * 3, "sobol": 32 * 4}[method]
+    assert {m: v["unit"] for m, v in printed["measures"].items()} == {
         "max_level of tank 1": "V",
         "max_level of tank 2": "V",
         "ise of output 1": "V^2 s",
     }
-    for measure in said["measures"].values():
+    for measure in printed["measures"].values():
         assert set(measure["parameters"]) == {"plant.drain[1]", "plant.pump_gain"}
-    assert any("rounded up to 32" in n for n in said["notes"]) == (method == "sobol")
-    assert json.loads((tmp_path / "found" / "result.json").read_text()) == said
+    assert any("rounded up to 32" in n for n in printed["notes"]) == (method == "sobol")
+    assert json.loads((tmp_path / "found" / "result.json").read_text()) == printed
     rows = list(csv.DictReader((tmp_path / "found" / "sensitivity.csv").open()))
     assert len(rows) == 6 and {r["rank"] for r in rows} == {"1", "2"}
     index = sensitivity_tables.HEADS[method]
     (key,) = [k for k in index if k in ("effect", "mu_star", "total")]
     for row in rows:
-        value = said["measures"][row["measure"]]["parameters"][row["parameter"]][key]
+        value = printed["measures"][row["measure"]]["parameters"][row["parameter"]][key]
         assert float(row[key] or "nan") == pytest.approx(
             np.nan if value is None else value, rel=1e-9, nan_ok=True
         )
@@ -637,12 +639,12 @@ def test_numbers_with_a_unit_say_it(tmp_path):
         and re.search(r"\d cm per cm\^2\b", out)
         and "cm^2 s per cm^2" in out
     )
-    said = json.loads((tmp_path / "result.json").read_text())["measures"]
+    printed = json.loads((tmp_path / "result.json").read_text())["measures"]
     assert (
-        said["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"]
+        printed["max_level of tank 1"]["parameters"]["plant.drain[0]"]["derivative_unit"]
         == "cm per cm^2"
     )
-    assert said["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
+    assert printed["ise of output 1"]["parameters"]["plant.split"]["derivative_unit"] == "cm^2 s"
     rows = list(csv.DictReader((tmp_path / "sensitivity.csv").open()))
     assert {r["derivative unit"] for r in rows if r["measure"].startswith("ise")} == {
         "cm^2 s per cm^2",

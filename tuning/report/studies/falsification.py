@@ -13,9 +13,9 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
+from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
 
 REPRODUCED = 1e-9
 """Share of a level to which the rig file must give it again."""

@@ -1,9 +1,9 @@
 """The report of a feasibility study: text, JSON, a picture, page and folder."""
 
 from jaxtank.core.files import check_folder
+from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
 
 SHOWN = 0.005
 """Share of the plants from which on a need is a row of the table; JSON has all [-]."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxtank.core.files import check_folder
 from jaxtank.plots import responses
+from tuning.problem import provenance
 from tuning.report import artifacts, html, tables
-from tuning.search import provenance
 
 __all__ = ["figures", "json_of", "lines", "save"]
 

@@ -19,10 +19,10 @@ QUICK = {"starts": 1, "screening": 1, "iterations": 1, "validation": 2}
     "words",
     [["uncertainty", "--samples", "2"], ["sensitivity"], ["uncertainty", "--spread", "0.1"]],
 )
-def test_a_rig_with_nothing_uncertain_is_told_how_to_vary(words, capsys):
+def test_a_rig_with_nothing_uncertain_is_answered_with_how_to_vary(words, capsys):
     assert main.main([words[0], ONE_TANK, *words[1:]]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "--vary NAME=" in told and "[uncertain]" in told
+    reported = capsys.readouterr().err
+    assert reported.count("\n") == 1 and "--vary NAME=" in reported and "[uncertain]" in reported
 
 
 def test_the_advice_is_taken(tmp_path, capsys):
@@ -33,7 +33,7 @@ def test_the_advice_is_taken(tmp_path, capsys):
     assert main.main(["sensitivity", str(file), "--quiet"]) == 0
 
 
-def test_without_limits_nothing_is_said_to_hold():
+def test_without_limits_nothing_is_reported_to_hold():
     case = rig.load(ONE_TANK).replace(uncertain={"plant.drain": 0.1})
     page = repr(tuning.tune(case, nominal=True, limits={}, **QUICK))
     assert "validation runs" in page
