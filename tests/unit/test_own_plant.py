@@ -113,13 +113,8 @@ def test_slopes_by_controller_and_plant_are_those_of_differences(case):
         )
 
 
-<<<<<<< HEAD
-def test_it_is_tuned_under_limits_drawn_and_refused_at_the_door(case):
-    result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
-=======
 def test_it_is_tuned_under_limits_drawn_and_validated(case):
-    result = tuning.tune(case, starts=1, screening=4, validation=4)
->>>>>>> w5
+    result = tuning.tune(case, nominal=True, starts=1, screening=4, validation=4)
     assert result.success and result.objective["after"] < 0.9 * result.objective["before"]
     found = tuning.ensemble(result.tuned, samples=8, fan=False)
     assert (

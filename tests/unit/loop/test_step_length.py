@@ -274,13 +274,8 @@ def test_an_answer_states_that_its_run_is_of_steps_too_long(last, substeps, word
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", step_size.StepWarning)
         case = rig.loads(COLANDER.format(last=last, substeps=substeps))
-<<<<<<< HEAD
         result = tuning.tune(case, nominal=True, starts=1, screening=2, iterations=2, validation=0)
-        told = [repr(result), json.dumps(report.json_of(result), ensure_ascii=False)]
-=======
-        result = tuning.tune(case, starts=1, screening=2, iterations=2, validation=0)
         reported = [repr(result), json.dumps(report.json_of(result), ensure_ascii=False)]
->>>>>>> w5
         if words == WRONG:  # the page as well: its pictures take longer than the search
             result.save(tmp_path)
             reported.append((tmp_path / "report.html").read_text())

@@ -32,13 +32,8 @@ SAME = (
 )
 
 
-<<<<<<< HEAD
-def told(result):
-    from tuning.report.tuned import report
-=======
 def reported(result):
-    from tuning.report import tuning as report
->>>>>>> w5
+    from tuning.report.tuned import report
 
     page = report.json_of(result)
     return json.dumps({k: page[k] for k in SAME}, sort_keys=True)
@@ -54,11 +49,7 @@ def whole(gouta, tmp_path_factory):
 
 
 def test_with_and_without_a_log_alike(gouta, whole):
-<<<<<<< HEAD
-    assert told(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == told(whole[0])
-=======
-    assert reported(tuning.tune(gouta("backstepping", FAST), **OPTIONS)) == reported(whole[0])
->>>>>>> w5
+    assert reported(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == reported(whole[0])
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
@@ -66,28 +57,17 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
     data = whole[1]
     (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
     kept = data[: int(share * len(data))].count(b"\n")
-<<<<<<< HEAD
     result = tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
-    assert told(result) == told(whole[0])
-=======
-    result = tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
     assert reported(result) == reported(whole[0])
->>>>>>> w5
     assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
 
 
 def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes(whole[1])
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
-<<<<<<< HEAD
-    assert told(
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
-    ) == told(whole[0])
-=======
     assert reported(
-        tuning.tune(gouta("backstepping", FAST), log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     ) == reported(whole[0])
->>>>>>> w5
 
 
 def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
