@@ -132,7 +132,9 @@ def test_a_rate_above_its_bound_is_found_out(filtered):
 
 def test_a_band_of_0_with_noise_is_found_out(filtered):
     """The limit is passed by the band that the noise needs, 0.06 cm, and no more."""
-    (one,) = filtered(noise=0.01, band=0.0).found
+    found = filtered(noise=0.01, band=0.0)
+    (one,) = found.found
+    assert "more than the band (0) cm" in " ".join(found.to_json()["remarks"])
     assert one.passed and one.margin == pytest.approx(-0.06, rel=0.3)
     (one,) = filtered(noise=0.01).found
     assert not one.passed

@@ -91,6 +91,14 @@ def remarks_of(attack):
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."
         )
+    guard = attack.case.loop.safety_filter
+    if guard is not None and np.any(attack.attacked.band > np.asarray(guard.band) * (1.0 + 1e-12)):
+        bands = (attack.attacked.band, np.asarray(guard.band))
+        wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
+        found.append(
+            f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
+            " safety filter: nothing is proved of such readings."
+        )
     return [*found, BOUND]
 
 
