@@ -157,8 +157,9 @@ def test_ascent_finds_more_than_draws_and_the_filter_holds_all_of_it(gouta):
     case = gouta("backstepping-ff", {"clock.dt": 0.1})
     free = tuning.attack(case)
     assert free.worst.level > 50.0 and free.worst.level > free.worst.drawn + 1.0
-    held = tuning.attack(case.with_safety_filter())
-    assert held.passed == [] and held.worst.level > 0.9999 * 30.0
+    for pumps in ("own", "random"):
+        held = tuning.attack(case.with_safety_filter(), pumps=pumps)
+        assert held.passed == [] and held.worst.level > 0.9999 * 30.0
 
 
 def test_rims_that_are_physics_do_not_hide_what_passes_them():
