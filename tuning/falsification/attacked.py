@@ -53,7 +53,8 @@ class Attacked:
     windows : int
         Windows of equal length in each of which a coefficient of the flows is constant.
     pumps : {"own", "full", "random"}
-        Who commands: the case's controller, pumps at full command, or commands that are variables.
+        What commands the pumps: the case's controller, full command, or commands that are
+        variables.
     start : {"any", "own"}
         Any levels up to the ceiling from which the case's filter can hold its limits, or the
         case's own.

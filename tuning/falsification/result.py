@@ -80,7 +80,7 @@ class Attack(Result):
         [s].
     """
 
-    REPORT = "tuning.report.studies.falsification"
+    REPORT = "tuning.report.studies.falsification_page"
 
     attacked: Attacked
     found: tuple[Found, ...]

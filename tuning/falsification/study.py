@@ -66,7 +66,7 @@ def attack(
     draws : int
         Random draws.
     pumps : {"own", "full", "random"}
-        Who commands the pumps, through the safety filter: the case's controller, full command, or
+        What commands the pumps, through the safety filter: the case's controller, full command, or
         commands that switch at random and are changed by the ascent too.
     start : {"any", "own"}
         Levels at t = 0: any up to the limits (with a filter: from which it can hold them), or the

@@ -132,7 +132,9 @@ def test_a_rate_above_its_bound_is_found_out(filtered):
 
 def test_a_band_of_0_with_noise_is_found_out(filtered):
     """The limit is passed by the band that the noise needs, 0.06 cm, and no more."""
-    (one,) = filtered(noise=0.01, band=0.0).found
+    found = filtered(noise=0.01, band=0.0)
+    (one,) = found.found
+    assert "more than the band (0) cm" in " ".join(found.to_json()["remarks"])
     assert one.passed and one.margin == pytest.approx(-0.06, rel=0.3)
     (one,) = filtered(noise=0.01).found
     assert not one.passed
@@ -155,8 +157,9 @@ def test_ascent_finds_more_than_draws_and_the_filter_holds_all_of_it(gouta):
     case = gouta("backstepping-ff", {"clock.dt": 0.1})
     free = tuning.attack(case)
     assert free.worst.level > 50.0 and free.worst.level > free.worst.drawn + 1.0
-    held = tuning.attack(case.with_safety_filter())
-    assert held.passed == [] and held.worst.level > 0.9999 * 30.0
+    for pumps in ("own", "random"):
+        held = tuning.attack(case.with_safety_filter(), pumps=pumps)
+        assert held.passed == [] and held.worst.level > 0.9999 * 30.0
 
 
 def test_rims_that_are_physics_do_not_hide_what_passes_them():

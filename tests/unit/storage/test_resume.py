@@ -49,7 +49,9 @@ def whole(gouta, tmp_path_factory):
 
 
 def test_with_and_without_a_log_alike(gouta, whole):
-    assert reported(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == reported(whole[0])
+    assert reported(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == reported(
+        whole[0]
+    )
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
@@ -57,7 +59,9 @@ def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
     data = whole[1]
     (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
     kept = data[: int(share * len(data))].count(b"\n")
-    result = tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+    result = tuning.tune(
+        gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS
+    )
     assert reported(result) == reported(whole[0])
     assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
 
@@ -73,17 +77,22 @@ def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch
 def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
     (tmp_path / NAME).write_bytes(whole[1])
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS)
+        tuning.tune(
+            gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS
+        )
     with pytest.raises(InputError, match="what differs: loop"):
         tuning.tune(
-            gouta("backstepping", {**FAST, "controller.k": 0.031}), nominal=True,
+            gouta("backstepping", {**FAST, "controller.k": 0.031}),
+            nominal=True,
             log=tmp_path,
             resume=True,
             **OPTIONS,
         )
     assert (tmp_path / NAME).read_bytes() == whole[1]
     with pytest.raises(InputError, match="holds no checkpoint to continue"):
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS)
+        tuning.tune(
+            gouta("backstepping", FAST), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS
+        )
 
 
 @pytest.mark.parametrize("text", [b"hello\n", b"[1]\n", b'{"jaxtank": 1}\n', b"\xff\xfe\n"])

@@ -25,7 +25,7 @@ def add(commands, parents):
     option(one, "--draws", "N", "random draws, half of them corners (default 64)", "64")
     text = "windows of time in each of which a flow coefficient has its own value (default 4)"
     option(one, "--windows", "N", text, "4")
-    text = "who commands the pumps: own (default: the controller), full, or random switching"
+    text = "what commands the pumps: own (default: the controller), full, or random switching"
     option(one, "--pumps", "KIND", text, "own")
     text = "levels at t = 0: any (default) up to the limits, or own: those of the case"
     option(one, "--start", "KIND", text, "any")

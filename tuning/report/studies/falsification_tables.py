@@ -1,24 +1,22 @@
-"""The report of an attack: text, JSON, pictures, page and folder."""
+"""The result of an attack as text and JSON; imported by `falsification_page`."""
 
-import dataclasses
 import shlex
-from pathlib import Path
 
-import jax
 import numpy as np
 
-from jaxtank import rig as rigs
-from jaxtank.core.files import check_folder
 from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
+<<<<<<< HEAD:tuning/report/studies/falsification.py
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
-
-REPRODUCED = 1e-9
-"""Share of a level to which the rig file must give it again."""
+=======
+from tuning.problem.wording import count
+from tuning.report import tables
+from tuning.problem import provenance
+>>>>>>> w2:tuning/report/studies/falsification_tables.py
 
 BOUND = (
     "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
@@ -91,6 +89,14 @@ def remarks_of(attack):
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."
         )
+    guard = attack.case.loop.safety_filter
+    if guard is not None and np.any(attack.attacked.band > np.asarray(guard.band) * (1.0 + 1e-12)):
+        bands = (attack.attacked.band, np.asarray(guard.band))
+        wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
+        found.append(
+            f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
+            " safety filter: nothing is proved of such readings."
+        )
     return [*found, BOUND]
 
 
@@ -121,7 +127,7 @@ def lines(attack):
         "",
         _table(attack),
         "",
-        _verdict(attack),
+        verdict(attack),
         "",
         f"The run that brings tank {worst.tank + 1} highest by its limit:",
         _parameters(attack, worst),
@@ -180,8 +186,8 @@ def _table(attack):
     return tables.table(rows, heads)
 
 
-def _verdict(attack):
-    """One sentence on the limits."""
+def verdict(attack):
+    """Return one sentence on the limits."""
     unit = attack.case.loop.units[0]
     if not attack.passed:
         return "No limit was passed."
@@ -195,21 +201,21 @@ def _verdict(attack):
 
 def _parameters(attack, one):
     """The Table of the coefficients, start and mean reading errors of one run."""
-    known = {c.name: c for c in attack.attacked.coefficients}
-    loop, rows = attack.case.loop, []
+    attacked, loop, rows = attack.attacked, attack.case.loop, []
+    known = {c.name: c for c in attacked.coefficients}
     for name, value in attack.parameters(one).items():
         values = value if isinstance(value, list) else [value]
         if name in known:
             c = known[name]
             own, ends = c.nominal, f"{c.low:.4g} : {c.high:.4g}"
-            unit = describe(attack.attacked.original.loop, name)["unit"]
+            unit = describe(attacked.original.loop, name)["unit"]
         else:
             part, index = name.rstrip("]").split("[")
-            band = attack.attacked.band[int(index)]
-            top = attack.attacked.ceiling[int(index)]
+            band = attacked.band[int(index)]
+            top = attacked.ceiling[int(index)]
             own = float(loop.x0[int(index)]) if part == "x0" else 0.0
             ends = f"0 : {top:.4g}" if part == "x0" else f"{-band:.4g} : {band:.4g}"
-            ends = "-" if part == "x0" and attack.attacked.start == "own" else ends
+            ends = "-" if part == "x0" and attacked.start == "own" else ends
             unit = local("cm", loop.units)
         shown = "  ".join(tables.number(v) for v in values)
         rows.append([name, unit, tables.number(own), ends, shown])
@@ -226,121 +232,3 @@ def settings(attack, one):
             number = value[at] if isinstance(value, list) else value
             words.append(shlex.quote(f"{name}={number:.6g}"))
     return " ".join(f"--set {word}" for word in words)
-
-
-def runs_of(attack):
-    """Return {"nominal": Trajectory, "worst": Trajectory}, of about 3000 rows each."""
-    case, original = attack.case, attack.attacked.original
-    sensor = original.loop.sensor.without_noise()
-    quiet = original.replace(loop=dataclasses.replace(original.loop, sensor=sensor))
-    worst = case.replace(loop=attack.loop(attack.worst))
-    return {"nominal": artifacts.run_for_people(quiet), "worst": artifacts.run_for_people(worst)}
-
-
-def figures(attack, runs=None):
-    """Return matplotlib figures {name: Figure}: "worst" run beside the nominal one, "ascent"."""
-    import matplotlib.pyplot as plt
-
-    from jaxtank.plots import responses
-
-    runs, worst = runs or runs_of(attack), attack.worst
-    limits = np.array([one.limit for one in attack.found])
-    title = (
-        f"{attack.case.name}: tank {worst.tank + 1} reaches {worst.level:.4g}"
-        f" {attack.case.loop.units[0]}, limit {worst.limit:.4g}"
-    )
-    drawn = {"worst": responses.responses(attack.case.loop, runs, title, limits)}
-    with responses.styled():
-        figure, ax = plt.subplots(figsize=(6.0, 3.4), layout="constrained")
-        for i, limit in enumerate(limits):
-            ax.plot(attack.history[:, i] / limit, marker=".", label=f"tank {i + 1}")
-        ax.axhline(1.0, color=responses.FORBIDDEN, linewidth=1.0, label="limit")
-        ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
-        ax.legend()
-    return drawn | {"ascent": figure}
-
-
-CAPTIONS = {
-    "worst": "The case as it is (dashed), and the run that comes highest by its limit.",
-    "ascent": "The highest level of each tank after each step of the ascent, by its limit.",
-}
-
-
-def page_of(attack, drawn, command=None):
-    """Return the page report.html of an Attack.
-
-    drawn: the figures of `figures`; command: the command line that made it.
-    """
-    worst, unit = attack.worst, attack.case.loop.units[0]
-    return html.document(
-        f"{attack.case.name}: attack",
-        attack.case.title,
-        _verdict(attack),
-        not attack.passed,
-        [
-            ("highest level", f"{worst.level:.5g} {unit} (tank {worst.tank + 1})"),
-            ("its limit", f"{worst.limit:.5g} {unit}"),
-            ("time", f"{attack.wall_s:.1f} s"),
-        ],
-        [],
-        html.drawings(drawn, CAPTIONS),
-        lines(attack),
-        command,
-        provenance.provenance(attack.case, attack.seed),
-    )
-
-
-def rig_of(attack):
-    """Return (text of worst.toml or None, {"level" of its run [cm], "difference" to the level that
-    was found [cm], "same": within REPRODUCED of it, "missing": what no rig file can describe}).
-    """
-    one = attack.worst
-    text, why = artifacts.rig_text(attack.rig(one))
-    missing = attack.not_in_rig(one)
-    if text is None:
-        return None, {"level": None, "difference": None, "same": False, "missing": [why, *missing]}
-    case = rigs.loads(text)
-    run, _ = lp.simulate_compiled(case.loop, case.clock, None, 1)
-    level = np.asarray(run.x)[:, one.tank]
-    rising = level[1:][level[1:] > level[:-1]]
-    highest = float(rising.max()) if rising.size else float(level[-1])
-    difference = highest - one.level
-    same = abs(difference) <= REPRODUCED * one.limit
-    if not same and not missing:
-        missing = ["the safety filter, which is designed anew for this start"]
-    return text, {"level": highest, "difference": difference, "same": same, "missing": missing}
-
-
-def save(attack, folder, command=None):
-    """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html to
-    `folder`; return their paths. command: the command line that made the attack.
-    """
-    check_folder(folder)
-    folder = Path(folder)
-    text, checked = rig_of(attack)
-    runs = runs_of(attack)
-    files = {
-        "result.json": tables.dumps({**json_of(attack), "rig": checked}) + "\n",
-        "trajectory.csv": csv(jax.tree.map(np.asarray, runs["worst"]), attack.case.loop.units),
-    }
-    if text is not None:
-        files["worst.toml"] = f"# {_head(attack, checked)}\n{text}"
-    return artifacts.write_result(
-        folder,
-        files,
-        lambda: figures(attack, runs),
-        lambda drawn: page_of(attack, drawn, command),
-        artifacts.earlier(folder, CAPTIONS),
-    )
-
-
-def _head(attack, checked):
-    """The comment of worst.toml."""
-    one, unit = attack.worst, attack.case.loop.units[0]
-    words = f"the worst found by jaxtank attack: tank {one.tank + 1} at {one.level:.10g} {unit}"
-    if checked["same"]:
-        return f"{words}, which `jaxtank simulate` of this file gives again"
-    return (
-        f"{words}; this file gives {checked['level']:.10g} {unit}: it lacks"
-        f" {', '.join(checked['missing'])}"
-    )
