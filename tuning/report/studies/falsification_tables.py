@@ -6,17 +6,9 @@ import numpy as np
 
 from jaxtank.core.tree import describe, get_value
 from jaxtank.core.units import local
-<<<<<<< HEAD:tuning/report/studies/falsification.py
-from jaxtank.loop import run as lp
-from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance
-from tuning.problem.wording import count
-from tuning.report import artifacts, html, tables
-=======
 from tuning.problem.wording import count
 from tuning.report import tables
-from tuning.problem import provenance
->>>>>>> w2:tuning/report/studies/falsification_tables.py
 
 BOUND = (
     "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
