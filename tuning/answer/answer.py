@@ -32,7 +32,8 @@ class Answer(Shown):
     tightened : share by which the limits were tightened for the search [-].
     coarse_dt : step of the search [s].
     measures : {"before", "after": {measure: value} of the case's own run}.
-    feasibility : which setpoints no controller can hold; None where that is not known.
+    feasibility : a `tuning.Feasibility`, None where it is not known; mended : the Mend that was
+        applied first, None where none was asked for.
 
     Examples
     --------
@@ -55,6 +56,7 @@ class Answer(Shown):
     coarse_dt: float
     measures: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     feasibility: Any = None
+    mended: Any = None
 
     @property
     def held(self) -> bool:
@@ -96,6 +98,7 @@ class Answer(Shown):
                 "idle_limits_of_tanks": list(self.idle),
                 "limits_tightened": self.tightened,
                 "search_dt_s": self.coarse_dt,
+                "mended": None if self.mended is None else dict(self.mended.set),
             }
         )
 

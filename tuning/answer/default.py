@@ -31,6 +31,7 @@ def tune(
     limits: Mapping[str, Any] | None = None,
     distributions: Mapping[str, Any] | None = None,
     safety_filter: bool | None = None,
+    mend: str | None = None,
     scenarios: Sequence[Scenario] | None = None,
     risk: str = "mean",
     choices: Mapping[str, Sequence] | None = None,
@@ -74,6 +75,8 @@ def tune(
     distributions : {name: distribution or share}, the plants of the default answer; what the case
         calls uncertain where None, 5 % of every flow where that is nothing.
     safety_filter : of the default answer; None: where a level comes near its limit.
+    mend : "setpoints", "rims", "orifices", "pumps" or "ramps": make the smallest such change that
+        lets 95 % of the plants follow (of ramps: the nominal run hold its limits), then tune.
     scenarios : tuple of Scenario, () for the case's own run alone.
     risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
     choices : {static name: [values]}, each combination of which is tuned, the best taken.
@@ -122,10 +125,12 @@ def tune(
         check_precision()
         check_options(**{n: common[n] for n in counts})
         assert isinstance(case, Case)
-        return recommend(case, distributions=distributions, safety_filter=safety_filter, **common)
-    if distributions is not None or safety_filter is not None:
-        name = "distributions" if distributions is not None else "safety_filter"
-        raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
+        own = dict(distributions=distributions, safety_filter=safety_filter, mend=mend)
+        return recommend(case, **own, **common)
+    given = {"distributions": distributions, "safety_filter": safety_filter, "mend": mend}
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
     return tuner.tune(
         case,
         method,

@@ -3,6 +3,7 @@
 Imported by `default`.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,6 +20,7 @@ from tuning.answer.judged import FRESH, Judged, judge, matters
 from tuning.answer.result import result_of
 from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, setting_of
 from tuning.answer.stay_put import Found, search_from
+from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.problem import Problem
 from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import noisy, with_noise_drawn
@@ -89,6 +91,7 @@ def recommend(
     limits: Mapping[str, Any] | None = None,
     distributions: Mapping[str, Any] | None = None,
     safety_filter: bool | None = None,
+    mend: str | None = None,
     starts: int = 4,
     iterations: int = 40,
     seed: int = 0,
@@ -99,6 +102,7 @@ def recommend(
 ) -> TuningResult:
     """Return the default answer; parameters and errors as `tuning.tune`."""
     began = time.perf_counter()
+    case, mended = _mended(case, mend, distributions, limits, seed)
     if safety_filter and not case.safety:  # asked for here: the case as given has none
         case = case.without_safety_filter()
     setting = setting_of(case, objective, limits, distributions)
@@ -121,11 +125,29 @@ def recommend(
         before = judge(as_given, task.samples, seed, round_=attempt)
     values = _values(problem, found)
     answer = _answer(setting, before, after, found, problem, values, tightened)
+    answer = dataclasses.replace(answer, feasibility=_feasibility(setting), mended=mended)
     result = result_of(answer, found, problem, values, validation)
     steps = diagnostics.step_warnings(_own(problem), result.tuned, values)
     messages = findings_of(result, steps)
     problem.cache = problem.cache.in_memory()
     return result.replace(messages=messages, wall_s=time.perf_counter() - began)
+
+
+def _mended(case, kind, distributions, limits, seed):
+    """Return the case with the smallest change of one kind, and that Mend; None where none is
+    asked for.
+    """
+    if kind is None:
+        return case, None
+    return apply_mend(case, kind, distributions, seed=seed, limits=limits)
+
+
+def _feasibility(setting):
+    """Return what no gain can mend; None where levels have no limits, or that is not known."""
+    case = setting.case
+    if not np.isfinite(limited_levels(case)).any() or not can_judge(case):
+        return None
+    return feasibility(case, setting.distributions, limits=case.limits)
 
 
 def _as_given(setting):

@@ -36,6 +36,7 @@ KINDS = {
 # options whose values are a few words
 FEW = {
     ("tune", "--method"): ("auto", "trf", "coarse-trf", "slsqp", "lbfgs", "adam"),
+    ("tune", "--mend"): ("setpoints", "rims", "orifices", "pumps", "ramps"),
     ("tune", "--robust"): ("mean", "cvar", "worst"),
     ("sensitivity", "--method"): ("local", "morris", "sobol"),
     ("uncertainty", "--draws"): ("random", "latin", "sobol"),

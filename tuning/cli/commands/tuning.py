@@ -53,6 +53,11 @@ def _add_problem(one):
     repeatable(one, "--choose", "NAME=V1,V2", text)
     text = "plants that judge the answer (default 256; --nominal: 64 runs, 0 for none)"
     option(one, "--validation", "N", text)
+    text = (
+        "make the smallest change of setpoints, rims, orifices, pumps or ramps with which 95 % of"
+        " the plants can hold the setpoints (ramps: the nominal run its limits), then tune"
+    )
+    option(one, "--mend", "KIND", text.replace("%", "%%"))
     one.add_argument(
         "--nominal",
         action="store_true",
@@ -192,7 +197,10 @@ def _not_robust(args, case, task, choices, varied):
     if not _is_nominal(args):
         from tuning.answer.default import tune as finder
 
-        return finder, case, {"distributions": varied, "safety_filter": args.safety_filter}
+        own = {"distributions": varied, "safety_filter": args.safety_filter, "mend": args.mend}
+        return finder, case, own
+    if args.mend is not None:
+        raise InputError("--mend belongs to the default answer, not to --nominal")
     if varied is not None:
         raise InputError("--spread and --vary of tune belong to the default answer and to --robust")
     from tuning.search.tuner import tune as finder

@@ -12,6 +12,9 @@ from tuning.report.tuned.tables import parts_of as all_parts
 
 WIDTH = 80
 
+MATTERS = 0.05
+"""Share of the plants that a need must concern to be a row [-]."""
+
 
 def lines_of(result):
     """Return what is printed of a result with a default answer: about 25 lines of 80 columns."""
@@ -27,11 +30,37 @@ def parts_of(result):
 def of_answer(answer, result=None):
     """Return lines and Tables on an Answer; with the values to set of its result, where given."""
     found = []
-    if answer.feasibility is not None and answer.feasibility.matters:
-        found += [str(answer.feasibility), ""]
+    if answer.feasibility is not None and answer.feasibility.infeasible_for_any_controller > 0:
+        found += [*_beyond(answer), ""]
     if result is not None:
         found += [_values(result, answer), ""]
     return [*found, _effects(answer)]
+
+
+def _beyond(answer):
+    """Lines and a Table on what no gain can mend: the needs of MATTERS of the plants at least."""
+    found = answer.feasibility
+    share = number(100 * found.infeasible_for_any_controller, 2)
+    text = f"No gain can help {share} % of {found.samples} plants: within their limits they have no"
+    lines = [_wrapped(f"{text} steady state at some setpoint.")]
+    rows = [
+        [
+            ", ".join(f"{v:g}" for v in row.setpoints),
+            f"tank {row.tank}" if row.pump is None else f"pump {row.pump}",
+            *(f"{v:.3g}" for v in (row.needed, row.needed_p95, row.limit)),
+            f"{100 * row.share:.0f} %",
+        ]
+        for row in found.plateaus
+        if row.share >= MATTERS
+    ]
+    unit = found.case.loop.units[0]
+    heads = [f"setpoints [{unit}]", "", "needs", "95 % need", "limit", "plants that cannot"]
+    lines += [table(rows, heads)] if rows else []
+    if found.mends:
+        kinds = " | ".join(mend.what for mend in found.mends)
+        words = "; ".join(mend.words for mend in found.mends)
+        lines.append(_wrapped(f"--mend {kinds} helps 95 % of them ({words})."))
+    return lines
 
 
 def json_parts(result) -> dict[str, Any]:
