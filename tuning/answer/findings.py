@@ -129,8 +129,8 @@ def _assumed(result, answer) -> Found:
         unit = setting.case.loop.units[0]
         yield Message(
             "noise-assumed",
-            f"the case states no sensor noise: {setting.noise:.3g} {unit} (0.1 % of the height) is"
-            " assumed; --set sensor.noise=... states it",
+            f"sensor noise of {setting.noise:.3g} {unit} is assumed (0.1 % of the height; --set"
+            " sensor.noise)",
         )
     if not setting.stated:
         yield Message(

@@ -118,7 +118,7 @@ def recommend(
     before = judge(setting.replace(searched=_as_given(setting)), task.samples, seed)
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
-        setting = setting.with_filter()
+        setting = setting.with_filter(near)
     setting, found, problem, after, tightened, attempt = _attempts(task, setting, near)
     if attempt:  # the plants that asked for another search do not judge it
         as_given = setting.replace(searched=_as_given(setting))
@@ -188,7 +188,7 @@ def _attempts(task, setting, near):
         elif after.held.all():
             break
         elif task.may_filter and setting.filter is None and _levels_broken(after):
-            filtered = setting.with_filter()
+            filtered = setting.with_filter(matters(setting, after, NEAR))
             limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
             setting = filtered
         elif limits and found.search and found.search.violation(found.point) == 0:

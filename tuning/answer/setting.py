@@ -38,6 +38,9 @@ SPREAD = 0.05
 NEAR = 0.9
 """Share of its limit that a level must reach on some plant for the limit to matter."""
 
+FREE = 10.0
+"""Limit of a tank that a safety filter leaves alone, in heights of the rig."""
+
 PLANTS = 32
 """Plants that the search runs on."""
 
@@ -101,16 +104,25 @@ class Setting:
         """Return the scenarios of `samples` plants of `case`, the searched case at some clock."""
         return scenarios_of(case, self.distributions, samples, seed)
 
-    def with_filter(self) -> "Setting":
-        """Return the setting with a safety filter; itself where the plant can have none."""
+    def with_filter(self, near: np.ndarray | None = None) -> "Setting":
+        """Return the setting with a safety filter; itself where the plant can have none.
+
+        near : (tanks,) True for tanks whose limits matter, all where None. Where a limit of
+        another tank could only be proved by lowering a level that matters, it is left out.
+        """
         given = dict(self.case.safety or {})
         try:
-            searched = self.searched.without_safety_filter().with_safety_filter(**given)
+            found, rows = self.searched.without_safety_filter().safety_design(**given)
+            if near is not None and not np.all(near) and _lowered(self.case, rows, near):
+                limit = np.where(near, limited_levels(self.case), FREE * height(self.case))
+                given = {"limit": limit.tolist()} | given
+                found, rows = self.searched.without_safety_filter().safety_design(**given)
+                rows = tuple(row for row in rows if near[row.tank])
         except InputError:
             return self
-        found, rows = searched.safety_design(**given)
         # both follow from the noise, which the case as given may not state
         own = {"band": np.asarray(found.band).tolist(), "rate": float(np.max(found.rate))}
+        searched = self.searched.without_safety_filter().with_safety_filter(**given)
         return self.replace(searched=searched, filter=own | given, certificates=rows)
 
     def without_filter(self) -> "Setting":
@@ -126,6 +138,12 @@ class Setting:
         if self.filter is None:
             return found.without_safety_filter()
         return found.without_safety_filter().with_safety_filter(**self.filter)
+
+
+def _lowered(case, rows, near):
+    """Return True if a level that matters is kept below its limit for the sake of another one."""
+    limit = limited_levels(case)
+    return any(near[row.tank] and row.limit < 0.999 * limit[row.tank] for row in rows)
 
 
 def setting_of(

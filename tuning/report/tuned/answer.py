@@ -12,14 +12,17 @@ from tuning.report.tuned.tables import parts_of as all_parts
 
 WIDTH = 80
 
+SHORT = {"rims": " ({})", "orifices": " ({})", "pumps": " ({})"}
+"""How much is said of a mend; that of the setpoints is long, and JSON and page have it."""
+
 MATTERS = 0.05
 """Share of the plants that a need must concern to be a row [-]."""
 
 
 def lines_of(result):
     """Return what is printed of a result with a default answer: about 25 lines of 80 columns."""
-    found = [_wrapped(_headline(result)), "", *of_answer(result.answer, result)]
-    return [*found, "", *(_wrapped(m.text, "- ") for m in result.messages)]
+    found = [_wrapped(_headline(result)), *of_answer(result.answer, result)]
+    return [*found, *(_wrapped(m.text, "- ") for m in result.messages)]
 
 
 def parts_of(result):
@@ -30,6 +33,8 @@ def parts_of(result):
 def of_answer(answer, result=None):
     """Return lines and Tables on an Answer; with the values to set of its result, where given."""
     found = []
+    if answer.mended is not None:
+        found += [_wrapped(f"mended first: {answer.mended.words}")]
     if answer.feasibility is not None and answer.feasibility.infeasible_for_any_controller > 0:
         found += [*_beyond(answer), ""]
     if result is not None:
@@ -40,9 +45,6 @@ def of_answer(answer, result=None):
 def _beyond(answer):
     """Lines and a Table on what no gain can mend: the needs of MATTERS of the plants at least."""
     found = answer.feasibility
-    share = number(100 * found.infeasible_for_any_controller, 2)
-    text = f"No gain can help {share} % of {found.samples} plants: within their limits they have no"
-    lines = [_wrapped(f"{text} steady state at some setpoint.")]
     rows = [
         [
             ", ".join(f"{v:g}" for v in row.setpoints),
@@ -53,13 +55,15 @@ def _beyond(answer):
         for row in found.plateaus
         if row.share >= MATTERS
     ]
+    share = number(100 * found.infeasible_for_any_controller, 2)
+    text = f"No controller can hold every setpoint on {share} % of {found.samples} plants"
+    lines = [_wrapped(text + " within the limits" + (":" if rows else "."))]
     unit = found.case.loop.units[0]
     heads = [f"setpoints [{unit}]", "", "needs", "95 % need", "limit", "plants that cannot"]
     lines += [table(rows, heads)] if rows else []
     if found.mends:
-        kinds = " | ".join(mend.what for mend in found.mends)
-        words = "; ".join(mend.words for mend in found.mends)
-        lines.append(_wrapped(f"--mend {kinds} helps 95 % of them ({words})."))
+        kinds = [f"--mend {m.what}" + SHORT.get(m.what, "").format(m.words) for m in found.mends]
+        lines.append(_wrapped(f"95 % of them follow with {' or '.join(kinds)}"))
     return lines
 
 
