@@ -1,5 +1,7 @@
 """How numbers are put into sentences; any module of `tuning` may import it."""
 
+from collections.abc import Sequence
+
 
 def count(number: int, thing: str) -> str:
     """Return a number with its noun in the singular or the plural.
