@@ -153,7 +153,13 @@ def test_show_tells_every_parameter_with_its_unit_and_range():
         )
     assert rows["controller.k1"].startswith("0.088 1/s 0.001 : 5 gain k1")
     assert rows["plant.rim"].startswith("30 30 30 30 cm")
-    assert {"reference.ramp", "reference.shape*", "plant.overflow*", "clock.dt*", "clock.substeps*"} <= set(rows)
+    assert {
+        "reference.ramp",
+        "reference.shape*",
+        "plant.overflow*",
+        "clock.dt*",
+        "clock.substeps*",
+    } <= set(rows)
     assert "not in use" in rows["actuator.dead_zone"]
     preset = presets.load("gouta2015")
     flat = " ".join(said.out.split())
