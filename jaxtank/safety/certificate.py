@@ -100,6 +100,7 @@ def design(
     low: ArrayLike = 0.0,
     draw: ArrayLike = 0.0,
     drawn: bool = False,
+    predict: bool = True,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -123,6 +124,8 @@ def design(
     low : (n,) levels below which no tank may fall [cm]; 0: none
     draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]
     drawn : whether volumes may leave besides, at any time (no low limit is then proved)
+    predict : predict levels over the inputs under way where the dead time is longer than a hold,
+        and the rig has no pipes, lag, dead zone or volumes that enter besides
 
     Raises
     ------
@@ -146,7 +149,8 @@ def design(
         drawn=drawn,
         **_of_pumps(actuator, dead),
     )
-    bound = rate_bound(setting.hold, setting.delay, setting.lag)
+    setting = setting._replace(predicted=_predicted(setting) if predict else 0)
+    bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
     wanted = _wanted(setting, plant, limit)
     check_low(low, wanted, plant.units[0])
     prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
@@ -168,6 +172,8 @@ def design(
         bottom=bottom,
         draw=np.array(draw),
         kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
+        predicted=setting.predicted,
+        substeps=substeps if setting.predicted else 1,
         **_upper(setting, found),
     ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
 
@@ -191,6 +197,13 @@ def _wanted(setting, plant, limit):
     if np.any(wanted <= 0.0):
         raise InputError("safety_filter: inflow disturbances alone fill a tank to its limit")
     return wanted
+
+
+def _predicted(setting):
+    """Number of inputs under way over which levels can be predicted; 0: none."""
+    samples = math.ceil(setting.delay / setting.hold - 1e-9)
+    other = setting.lag > 0.0 or setting.rates.pipes or setting.dead or setting.drawn
+    return 0 if samples < 2 or other or np.any(setting.spare > 0.0) else samples
 
 
 def _upper(setting, found):
