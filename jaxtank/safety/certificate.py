@@ -135,9 +135,8 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    inflow, draw, low, volume = (
-        np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low, volume)
-    )
+    given = (inflow, draw, low, volume)
+    inflow, draw, low, volume = (np.broadcast_to(np.asarray(v, float), (n,)) for v in given)
     dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
     band = np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,))
     setting = Setting(
@@ -149,7 +148,7 @@ def design(
         drawn=drawn,
         **_of_pumps(actuator, dead),
     )
-    setting = setting._replace(predicted=_predicted(setting) if predict else 0)
+    setting = setting._replace(predicted=predict * _predicted(setting))
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
     wanted = _wanted(setting, plant, limit)
     check_low(low, wanted, plant.units[0])
@@ -168,13 +167,10 @@ def design(
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
         inflow=np.array(inflow),
-        low=np.array(low),
-        bottom=bottom,
         draw=np.array(draw),
-        kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
-        predicted=setting.predicted,
         substeps=substeps if setting.predicted else 1,
         **_upper(setting, found),
+        **_lower(setting, low, bottom),
     ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
 
 
@@ -217,7 +213,14 @@ def _upper(setting, found):
         # of a lagged input every older reading is a part: neighbours count with their `reach`
         "age": setting.delay if setting.lag == 0.0 else UNKNOWN,
         "held": _held(setting, found),
+        "predicted": setting.predicted,
     }
+
+
+def _lower(setting, low, bottom):
+    """The fields of SafetyFilter that hold the low limits."""
+    kept = tuple(i for i, gains in enumerate(setting.rates.pumps) if low[i] > 0.0 and gains)
+    return {"low": np.array(low), "bottom": bottom, "kept": kept}
 
 
 def _of_pumps(actuator, dead):
