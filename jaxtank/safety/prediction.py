@@ -13,18 +13,24 @@ from jaxtank.core.numerics import lower_clip, smooth_sqrt
 from jaxtank.safety.worst_case import Rates, fall, rise
 
 
-def line_of(u: Sequence, samples: int) -> tuple:
+def line_of(u: Sequence[Any], samples: int) -> tuple[Any, ...]:
     """Return the inputs under way of pumps that have run at u (m) [V]: (m) arrays (samples,)."""
     return tuple(jnp.broadcast_to(jnp.asarray(v), (samples,)) for v in u)
 
 
-def moved_on(line: Sequence, u: Sequence) -> tuple:
+def moved_on(line: Sequence[Any], u: Sequence[Any]) -> tuple[Any, ...]:
     """Return the inputs under way (m) a sample later, u (m) the latest [V]; the oldest is first."""
     return tuple(jnp.concatenate([v[1:], jnp.asarray(w)[None]]) for v, w in zip(line, u))
 
 
 def brackets(
-    rates: Rates, tank: int, levels: tuple, line: Sequence, others: tuple, step: Any, substeps: int
+    rates: Rates,
+    tank: int,
+    levels: tuple[Any, ...],
+    line: Sequence[Any],
+    others: tuple[Any, ...],
+    step: Any,
+    substeps: int,
 ) -> tuple:
     """Return (least, largest) level [cm] of a tank without pipes after the inputs under way.
 
@@ -44,8 +50,8 @@ def brackets(
     enters = rise(rates, tank, 0.0 * top, above)
     least_enters = fall(rates, tank, 0.0 * top, below)
     gains = rates.pumps[tank].items()
-    most = sum(jnp.where(line[j] >= 0.0, b, a) * line[j] for j, (a, b) in gains)
-    least = sum(jnp.where(line[j] >= 0.0, a, b) * line[j] for j, (a, b) in gains)
+    most: Any = sum(jnp.where(line[j] >= 0.0, b, a) * line[j] for j, (a, b) in gains)
+    least: Any = sum(jnp.where(line[j] >= 0.0, a, b) * line[j] for j, (a, b) in gains)
     # within the laminar threshold, and where outflow may be limited, nothing leaves for certain
     shallow = lower_clip(rates.empty[tank] + 0.0 * top, rates.knee)
 
