@@ -261,6 +261,7 @@ def levels_for(loop, inputs, start, dt):
     return np.array(path)
 
 
+@pytest.mark.slow_for("2-4.0", "3-4.0", "10-4.0")
 @pytest.mark.parametrize(
     "substeps, dt", [(1, 4.0), (2, 4.0), (3, 4.0), (4, 4.0), (10, 4.0), (10, 0.4)]
 )
