@@ -413,6 +413,7 @@ def test_gradients_from_empty_tanks():
     )
 
 
+@pytest.mark.slow_for("backstepping")
 @pytest.mark.parametrize("name", list(CASES))
 def test_the_loop_compiles_to_one_function(name):
 

@@ -148,6 +148,7 @@ def test_the_share_of_the_overflow_is_caught():
     np.testing.assert_allclose(lost, flow - cascaded.K_LOWER * np.sqrt(10.0), rtol=1e-3)
 
 
+@pytest.mark.slow_for("pi")
 @pytest.mark.parametrize("name", list(CASES))
 def test_the_loop_compiles_to_one_function(name):
 
