@@ -18,7 +18,7 @@ from tuning.answer.answer import Answer
 from tuning.answer.findings import findings_of
 from tuning.answer.judged import FRESH, Judged, judge, matters
 from tuning.answer.result import result_of
-from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, setting_of
+from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, plants_of, setting_of
 from tuning.answer.stay_put import Found, search_from
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.problem import Problem
@@ -139,7 +139,7 @@ def _mended(case, kind, distributions, limits, seed):
     """
     if kind is None:
         return case, None
-    return apply_mend(case, kind, distributions, seed=seed, limits=limits)
+    return apply_mend(case, kind, distributions or plants_of(case), seed=seed, limits=limits)
 
 
 def _feasibility(setting):
