@@ -21,9 +21,9 @@ class Answer(Shown):
     Parameters
     ----------
     setting : what was searched: noise, plants, cost, safety filter.
-    before, after : the published and the tuned case on the same plants, none used by the search.
+    before, after : the case as given and the tuned case on the same validation plants.
     nominal : {"before", "after": total rms error of the case's own run, without noise}.
-    kept : {parameter: True where it stays at its first value}.
+    kept : {parameter: True where it stays at its start}.
     agreed : True if two searches ended at the same cost, or nothing better was found.
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
     idle : numbers of the tanks, from 1, whose limit no plant comes near.

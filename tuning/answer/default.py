@@ -49,15 +49,19 @@ def tune(
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits.
 
-    By default, values for a rig that is not exactly known: the mean over 32 plants drawn from what
-    the case calls uncertain, with sensor noise, of the squared error plus a price on the change of
-    the inputs from sample to sample. A safety filter keeps levels below their limits where they
-    come near them. A parameter stays at its value unless changing it is worth 1 % of the cost. The
-    answer is judged on 256 other plants at the case's own step (`result.answer`).
+    By default, values for a rig that is not exactly known: the mean over 32 plants (sets of
+    coefficients) drawn from what the case calls uncertain, with sensor noise, of the squared error
+    plus a price on changes of the inputs per sample. A safety filter keeps levels below their
+    limits where they come near them. Each parameter goes back to its start, or as near to it as
+    that allows, if all these changes together cost less than 1 %. The answer is judged on 256
+    validation plants at the case's own step (`result.answer`).
 
     With nominal=True the optimum of the case as it is: its own run or scenarios alone, its own
-    objective, no noise and no filter that it does not have; so too where a Problem, a method,
-    scenarios, risk, choices or batch say what is to be solved and how.
+    objective, without adding noise, plants or a filter. Implied by a Problem, a method, scenarios,
+    risk, choices, batch, screening or tolerance.
+
+    Converged: two searches ended within 1 % of each other (nominal: 0.1 %), or differential
+    evolution found nothing better.
 
     Parameters
     ----------
@@ -67,7 +71,8 @@ def tune(
         squares and no limit is active, else slsqp), "slsqp", "trf", "coarse-trf" (trf at a tenth
         of the samples, then at all), "lbfgs" or "adam".
     nominal : True for the optimum of the case as it is, False for the default answer, None for the
-        default answer unless method, scenarios, risk, choices or batch are given.
+        default answer unless method, scenarios, risk, choices, batch, screening or tolerance are
+        given.
     free : {name: (low, high) or Free}; the case's own where None.
     objective : {measure: weight}; where None the case's own (of a preset, the default cost, unless
         nominal).
@@ -76,18 +81,19 @@ def tune(
         calls uncertain where None, 5 % of every flow where that is nothing.
     safety_filter : of the default answer; None: where a level comes near its limit.
     mend : "setpoints", "rims", "orifices", "pumps" or "ramps": make the smallest such change that
-        lets 95 % of the plants follow (of ramps: the nominal run hold its limits), then tune.
+        lets 95 % of the plants hold the setpoints (of ramps: the nominal run keep its limits), then
+        tune.
     scenarios : tuple of Scenario, () for the case's own run alone.
     risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
     choices : {static name: [values]}, each combination of which is tuned, the best taken.
     starts : local searches, 8 if nominal; else at most 4, until two agree.
     seed : of the Sobol points, the plants and the sensor noise.
-    screening : number of Sobol points (nominal: 64).
+    screening : number of Sobol points (64); nominal only.
     iterations : of each local search (60; 40 of the default answer).
     batch : scenarios drawn for each step of adam, None for all.
-    validation : plants that judge the answer (256; 64 runs where nominal, 0 for none).
+    validation : validation plants (256; nominal: 64, 0 for none).
     tolerance : change of the objective, as a share of its first value, below which a search under
-        limits has converged; None for 1e-8 and a last search to 1e-12.
+        limits has converged; None for 1e-8 and a last search to 1e-12; nominal only.
     checkpoint : folder for the log of evaluations, with which a killed search is continued by
         resume=True, to the same bits; `log` is its former name.
     progress : called with a dict after every evaluation. Ctrl-C ends the search with the best

@@ -5,14 +5,14 @@ code                             reported when
 ===============================  =============================================================
 step-too-long                    the integration step is too long for the answer
 interrupted                      Ctrl-C ended the search
-limit-violated-out-of-sample     a limit is violated on the plants that judge the answer
+limit-violated-out-of-sample     a limit is violated on a validation plant
 no-longer-follows                the answer leaves a setpoint that the start held
-not-converged                    searches disagree, and more was found without derivatives
+not-converged                    searches disagree, and differential evolution found better points
 limit-not-certified              the safety filter is on, and a limit is not proved
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
-input-total-variation            the pumps move much more than before
-constraints-tightened            the search kept inside the limits, to hold on other plants
+input-total-variation            the inputs change much more per sample than before
+constraints-tightened            limits were tightened for the search, to hold on other plants
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
 limit-idle                       no plant comes near a limit on a level
@@ -32,7 +32,7 @@ from tuning.search.result import Message, TuningResult
 Found = Iterator[Message]
 
 BUSIER = 20.0
-"""Growth of the change of the inputs from sample to sample above which it is reported [-]."""
+"""Growth of the rms change of the inputs per sample above which it is reported [-]."""
 
 
 def findings_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Message, ...]:
@@ -47,26 +47,27 @@ def findings_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Messag
 
 def _interrupted(result, answer) -> Found:
     if result.status == Status.INTERRUPTED:
-        yield Message("interrupted", "interrupted: these are the best gains so far, not yet judged")
+        yield Message(
+            "interrupted", "interrupted: these are the best gains so far, not yet validated"
+        )
 
 
 def _violated(result, answer) -> Found:
     if answer.after is None or answer.held:
         return
-    held = answer.after.share_held()
     worst = [row for row in result.constraints if row.margin < 0]
     parts = [f"{c.name} is {c.amount()}, limit {c.limit:.4g} {c.unit}" for c in worst[:4]]
     if answer.after.failed.any():
         parts.append(f"{int(answer.after.failed.sum())} runs diverged")
     remedy = (
-        "a limit without a certificate cannot be guaranteed: other --free ranges, or a limit that"
-        " leaves more margin"
+        "a limit that is not proved may be violated on some plants; try other --free ranges, or a"
+        " limit that leaves more margin"
     )
     if answer.setting.filter is None and any(c.measure == "max_level" for c in worst):
         remedy = "--safety-filter keeps levels below their limits"
     yield Message(
         "limit-violated-out-of-sample",
-        f"limits hold on {100 * held['share']:.3g} % of {held['samples']} plants"
+        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples} validation plants"
         f" ({'; '.join(parts)}): {remedy}",
     )
 
@@ -84,8 +85,8 @@ def _not_agreed(result, answer) -> Found:
     if result.status != Status.INTERRUPTED and not answer.agreed:
         yield Message(
             "not-converged",
-            "no two of the local searches ended within 1 % of each other, and a search without"
-            " derivatives found lower points: raise --starts or --iterations, or narrow the ranges"
+            "no two of the local searches ended within 1 % of each other, and differential"
+            " evolution found better points: raise --starts or --iterations, or narrow the ranges"
             " (--free)",
         )
 
@@ -113,7 +114,7 @@ def _bounds(result, answer) -> Found:
         if not p.exercised:
             yield Message(
                 "parameter-not-exercised",
-                f"no run exercises {name}, which is left at {p.after:g} {p.unit}",
+                f"{name} has no effect in any run and is left at {p.after:g} {p.unit}",
             )
         elif p.at_bound:
             end = p.lower if p.at_bound == "lower" else p.upper
@@ -131,8 +132,8 @@ def _busier(result, answer) -> Found:
     if new > BUSIER * old > 0:
         yield Message(
             "input-total-variation",
-            f"the inputs change by {100 * new:.2g} % of their range from sample to sample,"
-            f" {new / old:.0f} times as much as before",
+            f"the rms change of the inputs per sample is {100 * new:.2g} % of their range,"
+            f" {new / old:.0f} times that before",
         )
 
 
@@ -157,8 +158,8 @@ def _tightened(result, answer) -> Found:
     if answer.tightened:
         yield Message(
             "constraints-tightened",
-            f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that it holds"
-            " on other plants",
+            f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that the"
+            " limits hold on validation plants",
         )
 
 

@@ -31,7 +31,7 @@ class Judged(Shown):
     ----------
     cost, error : (N,) objective; total rms error [unit of length].
     level : (N, tanks) highest levels.
-    travel : (N,) rms change of the inputs from sample to sample, as a share of their range [-].
+    travel : (N,) rms change of the inputs per sample, as a share of their range [-].
     held : (N,) True where every limit holds; failed : (N,) True where the run diverged.
     infeasible : (N,) True where no controller can hold a setpoint; None where that is not known.
     limits : the Limits; measures : {name: (N, ...)}.  unit : of length.
@@ -86,7 +86,7 @@ class Judged(Shown):
             numbers |= {
                 "mean total rms error": f"{found['error']:.4g} {self.unit}",
                 "highest levels": f"{levels} {self.unit}",
-                "inputs, sample to sample": f"{found['travel_percent']:.3g} % of their range",
+                "rms change of input per sample": f"{found['travel_percent']:.3g} % of their range",
             }
         if found["failed"]:
             numbers["diverged"] = f"{found['failed']} plants"

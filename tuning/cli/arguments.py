@@ -92,8 +92,15 @@ def shared():
         "case", metavar="CASE", help='"paper/case" (see jaxtank list) or a rig file ending in .toml'
     )
     run = Parser(add_help=False)
-    option(run, "--seed", "N", "seed of the sensor noise and of the search (default 0)", "0")
-    option(run, "--out", "DIR", "folder for result.json, CSV, pictures and the rig")
+    option(
+        run, "--seed", "N", "seed of what is drawn: noise, plants, search points (default 0)", "0"
+    )
+    option(
+        run,
+        "--out",
+        "DIR",
+        "folder for result.json, CSV, pictures and the rig (attack: worst.toml)",
+    )
     return Shared(common, case, run)
 
 
@@ -114,7 +121,8 @@ def changes():
         "--safety-filter",
         action=argparse.BooleanOptionalAction,
         help="caps on the pumps under which no level passes its limit on any plant that the case"
-        " calls uncertain (see jaxtank show); --no-safety-filter: without that of the rig file",
+        " calls uncertain (see jaxtank show); tune: automatic where a level comes near its limit;"
+        " --no-safety-filter: none",
     )
     return found
 
@@ -127,14 +135,14 @@ def uncertain():
         "--spread",
         "FRACTION",
         "one relative half-width for all parameters that the case calls uncertain, as 0.1 for"
-        " +-10 %%",
+        " +-10 %% (tune: not with --nominal)",
     )
     repeatable(
         found,
         "--vary",
         "NAME=DISTRIBUTION",
         "an uncertain parameter, in place of those of the case, as plant.drain=uniform:5%% or"
-        " normal:MEAN:SD",
+        " normal:MEAN:SD (tune: not with --nominal)",
     )
     return found
 

@@ -43,8 +43,8 @@ def attack(
     """Find the highest level of each tank over plants, starts and reading errors of a box.
 
     Random draws first, half of them corners of the box; then, for each tank, ascent along the
-    slopes of its highest level from the `starts` best of them. What it finds is a lower bound of
-    the worst; only a certificate (`jaxtank show`) is a proof.
+    signs of the slopes of its highest level from the `starts` best of them. What it finds is a
+    lower bound of the worst; only what `jaxtank show` reports as proved is proved.
 
     Rims are no physics here: a level that stops at its rim cannot be seen to pass it.
 

@@ -49,7 +49,7 @@ class PlateauNeed:
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mend:
     """The smallest change of one kind that makes the plateaus of 95 % of the plants feasible (of
-    "ramps": that makes the nominal run hold its limits).
+    "ramps": that makes the nominal run keep its limits).
 
     Attributes
     ----------

@@ -34,9 +34,9 @@ def feasibility(
 ) -> Feasibility:
     """Return which plants can hold every plateau of the reference under some controller.
 
-    A plant cannot where the steady state of a plateau needs a level above its limit, a flow that
-    runs backwards, or an input outside the range of its pump. Steady states are solved for all
-    plants at once on the host; nothing is simulated or compiled.
+    A plant cannot hold the setpoints if the steady state of a plateau needs a level above its
+    limit, a flow that runs backwards, or an input outside the range of its pump. Steady states are
+    solved for all plants at once on the host; nothing is simulated or compiled.
 
     Parameters
     ----------
@@ -209,13 +209,14 @@ def apply_mend(
     seed: int = 0,
     limits: Mapping[str, Any] | None = None,
 ) -> tuple[Case, Mend]:
-    """Return a case with the smallest change of one kind that makes it feasible, and that change.
+    """Return a case with the smallest change of one kind that makes its setpoints feasible for 95 %
+    of the plants, and that change.
 
     Parameters
     ----------
     case : Case
     kind : {"setpoints", "rims", "orifices", "pumps", "ramps"}
-        "ramps" are for transients: the shortest with which the nominal run holds its limits.
+        "ramps" are for transients: the shortest with which the nominal run keeps its limits.
     distributions, samples, seed, limits
         As in `feasibility`.
 

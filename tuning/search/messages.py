@@ -12,13 +12,13 @@ infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
 objective-without-slope          the gradient of the objective is zero: it changes in steps
 gradient-not-zero                a slope of the objective is left that no active limit blocks
-kink                             the same, but nothing lower was found along it
+kink                             the same, but no lower value was found along it
 not-converged                    no search converged
 start-violates-limit             the values before tuning violate a limit
 limit-not-applicable             an output has no step, so a limit of its step does not apply
 limit-active                     a limit determines the answer
 no-limit-active                  limits are given, and none is active
-input-total-variation            the pumps move much more than before
+input-total-variation            the total variation of the inputs grew much
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
 parameter-insensitive            10 % of the value hardly changes the objective
@@ -26,11 +26,11 @@ least-sensitive-direction        the smallest eigenvalue of the second derivativ
 nothing-better-found             differential evolution found nothing better than the answer
 starts-agree                     how many searches ended at the answer
 permutation-symmetry             exchanged gains give an equivalent answer
-limit-violated-out-of-sample     a limit is violated on the validation set or on new plants
-limits-hold-out-of-sample        no limit was violated on new plants (`tune_robust`)
+limit-violated-out-of-sample     a limit is violated on a validation plant
+limits-hold-out-of-sample        no limit was violated on validation plants (`tune_robust`)
 scenario-bound                   bound of the violation probability (`tune_robust`)
-constraints-tightened            the search kept inside the limits (`back_off=`)
-support-scenarios                violations on new plants that were to be expected
+constraints-tightened            limits were tightened for the search (`back_off=`)
+support-scenarios                violations on validation plants that were to be expected
 screened-at-true-step            screening points were unstable at the coarse step only
 non-finite-points                trial points gave non-finite numbers
 best-of-choices                  which discrete choice is best (`choices=`)
@@ -126,8 +126,8 @@ def _not_exercised(result: TuningResult) -> Found:
         kept = ", ".join(f"{n} {result[n].after:g} {result[n].unit}" for n in idle)
         yield Message(
             "parameter-not-exercised",
-            f"no run exercises {kept}: any value in the range gives the same run, so the start"
-            " value is kept",
+            f"{kept} {'has' if len(idle) == 1 else 'have'} no effect in any run: any value in the"
+            " range gives the same run, so the start value is kept",
         )
 
 
@@ -178,10 +178,11 @@ def _out_of_sample(result: TuningResult) -> Found:
     if found and share is not None and share < 1.0 and result.problem.limits:
         wanted = {x.measure for x in result.problem.limits if not result.problem.loop.safety_filter}
         caps = "--safety-filter keeps levels below their limits, " if "max_level" in wanted else ""
+        runs = found["samples"] - found["failed"]
         yield Message(
             "limit-violated-out-of-sample",
-            f"on the validation set every limit holds in {100 * share:.0f} % of"
-            f" {found['samples']} runs: {caps}--robust tunes for perturbed plants",
+            f"limits hold on {round(share * runs)} of {runs} validation plants:"
+            f" {caps}--robust tunes for perturbed plants",
         )
 
 

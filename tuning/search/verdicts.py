@@ -214,7 +214,7 @@ def _gradient_left(result: TuningResult) -> Found:
             "the objective has a slope in a direction that no active limit blocks (KKT residual"
             f" {residual:.2g} of the objective per range of a parameter): "
             + (
-                "a kink, because steps along it find nothing lower within the limits"
+                "a kink, because no lower value was found along it within the limits"
                 if kink
                 else "not yet an optimum"
             ),
@@ -271,8 +271,8 @@ def _no_longer_follows(result: TuningResult) -> Found:
         yield Message(
             "no-longer-follows",
             f"output {x.output} no longer follows its setpoint: at the end of a plateau it is"
-            f" {x.after:.3g} {x.unit} off ({100 * x.share:.3g} % of the change), {x.before:.3g}"
-            f" {x.unit} before tuning; {remedy}",
+            f" {x.after:.3g} {x.unit} off ({100 * x.share:.3g} % of the setpoint change),"
+            f" {x.before:.3g} {x.unit} before tuning; {remedy}",
         )
 
 

@@ -215,7 +215,7 @@ def test_the_json_has_the_keys_of_the_contract(result):
 def test_the_answer_fits_a_terminal(result):
     text = str(result)
     assert len(text.splitlines()) <= 25 and max(map(len, text.splitlines())) <= 80
-    assert "limits hold on 24 of 24 new plants, proved for tank 1" in " ".join(text.split())
+    assert "limits hold on 24 of 24 validation plants, proved for tank 1" in " ".join(text.split())
     assert "safety filter" in text and "noise band 0.018 cm" in text
     assert "<table" in result._repr_html_() and "<table" in result.answer._repr_html_()
 
@@ -236,7 +236,7 @@ def test_a_limit_that_no_gain_can_hold_is_said_and_ends_with_4(path):
     words = ["tune", path, "--limit", "max_level=0.9", "--quiet", "--no-safety-filter"]
     said = command(*words, "--validation", "24", "--starts", "2", "--iterations", "4")
     assert said.code == 4
-    assert "limits hold on 0 of 24 new plants" in " ".join(said.out.split())
+    assert "limits hold on 0 of 24 validation plants" in " ".join(said.out.split())
 
 
 @pytest.mark.parametrize(

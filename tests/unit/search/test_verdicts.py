@@ -396,9 +396,9 @@ def test_gains_that_no_run_exercises_are_kept(capsys):
         found["parameters"][n]["after"] == found["parameters"][n]["before"] == 1.6 for n in idle
     )
     assert found["parameters"]["controller.values[0,1]"]["after"] == pytest.approx(3.05, abs=0.02)
-    assert (
-        "no run exercises controller.values[0,0] 1.6 V/cm, controller.values[0,2]"
-        in found["message"]
-    )
-    others = [words for words in found["message"].split("; ") if "no run exercises" not in words]
+    assert "controller.values[0,0] 1.6 V/cm, controller.values[0,2]" in found["message"]
+    assert "controller.values[0,3] 1.6 V/cm have no effect in any run" in found["message"]
+    others = [
+        words for words in found["message"].split("; ") if "no effect in any run" not in words
+    ]
     assert not any(n in words for n in idle for words in others)

@@ -17,7 +17,8 @@ def add(commands, parents):
         "attack",
         parents=[common, case, run, uncertain()],
         help="the worst plant, start and reading errors in the box: can a level pass its limit?",
-        epilog="Exit code 4: a limit is passed.",
+        epilog="Exit codes: 0 no limit was passed, 2 bad input, 4 a limit is passed, 130"
+        " interrupted.",
     )
     one.set_defaults(run=attack)
     option(one, "--starts", "N", "ascents for each tank, from the best draws (default 8)", "8")

@@ -1,5 +1,6 @@
 """`jaxtank tune`: gains under limits, for the scenarios of the case or for many drawn plants."""
 
+import argparse
 import contextlib
 import sys
 from typing import Any
@@ -20,13 +21,26 @@ from tuning.cli.terminal import Line
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
 
+CODES = """exit codes:
+  0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
+       evolution found nothing better), and limits hold on every validation plant (--nominal:
+       in every run or scenario of the case)
+  2    bad input: one line on stderr, nothing written
+  3    not converged
+  4    a limit is violated
+  130  interrupted: the best point so far is printed and written"""
+
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
 
 def add(commands, parents):
     """Add the command to the parser's `commands`."""
     one = commands.add_parser(
-        "tune", parents=[*parents, uncertain()], help="tune the gains of a case under its limits"
+        "tune",
+        parents=[*parents, uncertain()],
+        help="tune the gains of a case under its limits",
+        epilog=CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.set_defaults(run=tune)
     _add_problem(one)
@@ -40,7 +54,10 @@ def _add_problem(one):
     repeatable(one, "--free", "NAME=LOW:HIGH", text)
     text = "a hard limit; MEASURE=none drops one, none drops all"
     repeatable(one, "--limit", "MEASURE=VALUE", text)
-    text = "a term of the objective, which is minimised (default rms_error_total=1)"
+    text = (
+        "a term of the objective, which is minimised (default: that of a rig file's [objective],"
+        " else squared error + a price on changes of the inputs; --nominal: that of the case)"
+    )
     repeatable(one, "--objective", "MEASURE=WEIGHT", text)
     repeatable(
         one,
@@ -51,18 +68,19 @@ def _add_problem(one):
     )
     text = "a static number or text to try the values of"
     repeatable(one, "--choose", "NAME=V1,V2", text)
-    text = "plants that judge the answer (default 256; --nominal: 64 runs, 0 for none)"
+    text = "validation plants (default 256; --nominal: 64, 0 for none)"
     option(one, "--validation", "N", text)
     text = (
-        "make the smallest change of setpoints, rims, orifices, pumps or ramps with which 95 % of"
-        " the plants can hold the setpoints (ramps: the nominal run its limits), then tune"
+        "first make the smallest design change of one kind (setpoints, rims, orifices, pumps or"
+        " ramps) with which 95 % of the plants can hold the setpoints (ramps: with which the"
+        " nominal run keeps its limits)"
     )
     option(one, "--mend", "KIND", text.replace("%", "%%"))
     one.add_argument(
         "--nominal",
         action="store_true",
         help="the optimum of the case as it is, with its own objective: its own run or scenarios,"
-        " without noise, other plants or a safety filter that it does not have; so too with"
+        " without adding noise, plants or a filter; implied by"
         " --scenario, --method, --screening, --batch, --choose, --tradeoff, --bound",
     )
     text = "also: the best objective for N (6) values of one limit"
@@ -70,7 +88,7 @@ def _add_problem(one):
     one.add_argument(
         "--bound",
         action="store_true",
-        help="also: the perfect-information open-loop optimum, which no controller can beat",
+        help="also: the best open-loop inputs found, with perfect information",
     )
 
 
@@ -80,7 +98,7 @@ def _add_search(one):
     option(one, "--method", "NAME", text, "auto")
     text = "local searches (default 4 at most, until two agree; --nominal: 8)"
     option(one, "--starts", "N", text)
-    option(one, "--screening", "N", "Sobol points before them (default 64)")
+    option(one, "--screening", "N", "Sobol points of --nominal (default 64)")
     text = "iterations of each local search (default 40; --nominal: 60)"
     option(one, "--iterations", "N", text)
     option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
@@ -90,7 +108,7 @@ def _add_search(one):
 
 def _add_robust(one):
     """Options on many plants at once."""
-    text = "many drawn plants at once: mean, cvar or worst of their costs, limits held on every one"
+    text = "many drawn plants at once: mean, cvar or worst of their costs, limits kept on every one"
     option(one, "--robust", "RISK", text)
     option(one, "--samples", "N", "plants of --robust (default 64)")
     option(one, "--fresh", "N", "validation plants of --robust (default 1024)")

@@ -9,8 +9,8 @@ SHOWN = 0.005
 """Share of the plants from which on a need is a row of the table; JSON has all [-]."""
 
 CAPTION = (
-    "What the steady states at the plateaus need: of the nominal rig, and exceeded by 5 % of the"
-    " rigs; the line is the limit."
+    "What the steady states at the plateaus need: of the nominal plant, and exceeded by 5 % of"
+    " the plants; the line is the limit."
 )
 
 
@@ -59,7 +59,7 @@ def mend_json(mend):
 
 def lines(found):
     """Return what is printed of a Feasibility: lines and Tables."""
-    bad, samples = int(found.infeasible.sum()), count(found.samples, "rig")
+    bad, samples = int(found.infeasible.sum()), count(found.samples, "plant")
     if not bad:
         return [f"{found.case.name}: each of {samples} has a steady state at every plateau"]
     return [
@@ -82,7 +82,7 @@ def percent(share):
 
 
 def table_of(found):
-    """Return [Table] of what plateaus need, [] where no need is passed by SHOWN of the rigs."""
+    """Return [Table] of what plateaus need, [] where no need is passed by SHOWN of the plants."""
     rows = [
         [
             ", ".join(f"{v:g}" for v in row.setpoints) + f" {found.case.loop.units[0]}",
@@ -94,7 +94,14 @@ def table_of(found):
         for row in found.plateaus
         if row.share >= SHOWN
     ]
-    heads = ["setpoints", "", "needs, nominal", "needs, 95 % of rigs", "limit", "rigs that cannot"]
+    heads = [
+        "setpoints",
+        "",
+        "needs, nominal",
+        "needs, 95 % of plants",
+        "limit",
+        "plants that cannot",
+    ]
     return [tables.table(rows, heads)] if rows else []
 
 
@@ -105,14 +112,14 @@ def mends_of(found):
             return []
         return [
             "no change of setpoints, rims, orifices or pumps alone was found that is enough for"
-            " 95 % of rigs"
+            " 95 % of plants"
         ]
-    head = ["for 95 % of rigs, one of:"]
+    head = ["for 95 % of plants, one of:"]
     return head + [f"  {m.what}: {' '.join(m.options)}" for m in found.mends]
 
 
 def figures(found):
-    """Return {"needs": matplotlib Figure}; {} where every rig can follow."""
+    """Return {"needs": matplotlib Figure}; {} where every plant can follow."""
     from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, grid, plain, styled
 
     rows = [row for row in found.plateaus if row.share >= SHOWN]
@@ -123,8 +130,10 @@ def figures(found):
         ax = axes[0, 0]
         for k, row in enumerate(rows):
             ax.plot([row.needed, row.needed_p95], [k, k], color="0.8", zorder=1)
-            ax.plot(row.needed, k, "o", color=AFTER, label="nominal rig" if k == 0 else None)
-            ax.plot(row.needed_p95, k, "s", color=BEFORE, label="95 % of rigs" if k == 0 else None)
+            ax.plot(row.needed, k, "o", color=AFTER, label="nominal plant" if k == 0 else None)
+            ax.plot(
+                row.needed_p95, k, "s", color=BEFORE, label="95 % of plants" if k == 0 else None
+            )
             ax.plot([row.limit] * 2, [k - 0.3, k + 0.3], color=FORBIDDEN, linewidth=2)
         labels = [
             f"{', '.join(f'{v:g}' for v in row.setpoints)}: "
@@ -149,9 +158,9 @@ def save(found, folder, command=None):
         return html.document(
             f"{found.case.name}: feasibility of the setpoints",
             found.case.title,
-            f"{share} of the rigs cannot hold every setpoint",
+            f"{share} of the plants cannot hold every setpoint",
             found.infeasible_for_any_controller <= 0.05,
-            [("rigs", str(found.samples)), ("infeasible", share)],
+            [("plants", str(found.samples)), ("infeasible", share)],
             [part for part in parts if not isinstance(part, tables.Table)],
             html.drawings(drawn, dict.fromkeys(drawn, CAPTION)),
             [part for part in parts if isinstance(part, tables.Table)],

@@ -14,7 +14,7 @@ from tuning.report.tuned.tables import parts_of as all_parts
 WIDTH = 80
 
 SHORT = {"rims": " ({})", "orifices": " ({})", "pumps": " ({})"}
-"""How much is said of a mend; that of the setpoints is long, and JSON and page have it."""
+"""How much is printed of a mend; that of the setpoints is long, and JSON and page have it."""
 
 MATTERS = 0.05
 """Share of the plants that a need must concern to be a row [-]."""
@@ -37,20 +37,21 @@ def of_answer(answer, result=None):
     if answer.mended is not None:
         found += [_wrapped(f"mended first: {answer.mended.words}")]
     if answer.feasibility is not None and answer.feasibility.infeasible_for_any_controller > 0:
-        found += [*_beyond(answer), ""]
+        found += _beyond(answer)
     if result is not None:
         found += [_values(result, answer), ""]
     return [*found, _effects(answer)]
 
 
 def _beyond(answer):
-    """Lines and a Table on what no gain can mend: the needs of MATTERS of the plants at least."""
+    """Lines and a Table on what no gain can change: the needs of MATTERS of the plants at least."""
     found = answer.feasibility
+    unit = found.case.loop.units[0]
     rows = [
         [
-            ", ".join(f"{v:g}" for v in row.setpoints),
+            ", ".join(f"{v:g}" for v in row.setpoints) + f" {unit}",
             f"tank {row.tank}" if row.pump is None else f"pump {row.pump}",
-            *(f"{v:.3g}" for v in (row.needed, row.needed_p95, row.limit)),
+            *(f"{v:.3g} {row.unit}" for v in (row.needed, row.needed_p95, row.limit)),
             f"{100 * row.share:.0f} %",
         ]
         for row in found.plateaus
@@ -59,12 +60,11 @@ def _beyond(answer):
     share = number(100 * found.infeasible_for_any_controller, 2)
     text = f"No controller can hold every setpoint on {share} % of {found.samples} plants"
     lines = [_wrapped(text + " within the limits" + (":" if rows else "."))]
-    unit = found.case.loop.units[0]
-    heads = [f"setpoints [{unit}]", "", "needs", "95 % need", "limit", "plants that cannot"]
+    heads = ["setpoints", "", "needs", "95 % need", "limit", "plants that cannot"]
     lines += [table(rows, heads)] if rows else []
     if found.mends:
         kinds = [f"--mend {m.what}" + SHORT.get(m.what, "").format(m.words) for m in found.mends]
-        lines.append(_wrapped(f"95 % of them follow with {' or '.join(kinds)}"))
+        lines.append(_wrapped(f"95 % of the plants can follow with {' or '.join(kinds)}"))
     return lines
 
 
@@ -82,9 +82,11 @@ def _headline(result):
     answer, status = result.answer, str(result.status).replace("_", " ")
     start = f"{result.tuned.name}: {status}"
     if answer.after is None:
-        return f"{start}; not judged on other plants ({result.wall_s:.1f} s)"
+        return f"{start}; no validation plants ({result.wall_s:.1f} s)"
     held, samples = int(answer.after.held.sum()), answer.after.samples
-    limited = f"; limits hold on {held} of {samples} new plants" if answer.after.limits else ""
+    limited = (
+        f"; limits hold on {held} of {samples} validation plants" if answer.after.limits else ""
+    )
     tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
     proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
     changed = sum(not stays for stays in answer.kept.values())
@@ -108,8 +110,8 @@ def _values(result, answer):
     rows = []
     for name, p in result.parameters.items():
         stays = answer.kept.get(name, False)
-        remark = "kept: a change is worth less than 1 %" if stays else ""
-        remark = remark if p["exercised"] else "without effect, kept"
+        remark = "kept (costs less than 1 % in all)" if stays else ""
+        remark = remark if p["exercised"] else "kept: no effect in any run"
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] and not remark else remark
         digits = [number(p[side], 4) for side in ("before", "after")]
         rows.append([f"{name} [{p['unit']}]", *digits, remark])
@@ -124,7 +126,7 @@ def _filter_row(answer, before):
         return ["safety filter", was, "off", ""]
     found, unit = answer.setting.searched.loop.safety_filter, before.units[0]
     rate, band = float(np.max(found.rate)), float(np.max(found.band))
-    return ["safety filter", was, "on", f"{rate:.3g} 1/s, noise band {band:.3g} {unit}"]
+    return ["safety filter", was, "on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {unit}"]
 
 
 def _effects(answer):
@@ -144,7 +146,10 @@ def _effects(answer):
         rows.append(["plants that violate a limit", *broken])
     rows += _levels(answer, sides, unit)
     rows.append(
-        ["input, sample to sample [% of range]", *(_mean(100 * s.travel, s, 2) for s in sides)]
+        [
+            "rms change of input per sample [% of range]",
+            *(_mean(100 * s.travel, s, 2) for s in sides),
+        ]
     )
     heads = ["what it gives", "before", "now"]
     return table(rows, heads[: 1 + len(sides)])
