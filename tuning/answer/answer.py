@@ -24,7 +24,8 @@ class Answer(Shown):
     before, after : the case as given and the tuned case on the same validation plants.
     nominal : {"before", "after": total rms error of the case's own run, without noise}.
     kept : {parameter: True where it stays at its start}.
-    agreed : True if two searches ended at the same cost, or nothing better was found.
+    agreed : True if two searches ended within 1 % of each other, or differential evolution found
+        nothing better.
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
     idle : numbers of the tanks, from 1, whose limit no plant comes near.
     tightened : share by which the limits were tightened for the search [-].
