@@ -43,7 +43,7 @@ FAST = {
     },
     "07": {"rigs": "64", "sobol_samples": "16"},
     "08": {"starts, plants, new": "1, 8, 64", "judged": "32"},
-    "09": {"starts": "2", "samples, fresh, iterations": "4, 16, 4"},
+    "09": {"starts": "2", "samples, new, iterations": "4, 16, 4"},
     "10": {"dt": "0.1", "starts, screening, validation": "1, 8, 8", "rigs": "32"},
 }
 
