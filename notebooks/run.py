@@ -1,8 +1,9 @@
 """Execute the notebooks of this folder, top to bottom.
 
 python notebooks/run.py            in full, and keep the outputs in the files
-python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts); the files
-stay as they are python notebooks/run.py 05 08      those alone, by the beginnings of their names
+python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts), without
+                                   changing the files
+python notebooks/run.py 05 08      those alone, by the beginnings of their names
 """
 
 import re
