@@ -42,7 +42,7 @@ class SteadyStates:
     ...     [[8.0, 8.0]]
     ... )
     >>> levels.shape, inputs.round(3).tolist()
-    ((2, 1, 4), [[[2.949, 2.949]], [[5.897, 5.897]]])
+    ((2, 1, 4), [[[2.949, 2.949]], [[5.898, 5.898]]])
     """
 
     def __init__(self, plant: Any, values: Mapping[str, ArrayLike], inflow: ArrayLike = 0.0):

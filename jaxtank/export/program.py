@@ -16,7 +16,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.export.lowering import lower
 from jaxtank.export.statements import Statement
-from jaxtank.loop.closed_loop import initial
+from jaxtank.loop.closed_loop import control_state, initial
 from jaxtank.loop.step import decide
 
 
@@ -39,12 +39,17 @@ def functions(case):
     (1,)
     """
     loop, dt = case.loop, case.clock.dt
+    if loop.safety_filter is not None and loop.safety_filter.predicted:
+        raise InputError(
+            "this controller cannot be exported: its safety filter predicts levels over the dead"
+            " time; safety_filter.predict = false gives one that does not"
+        )
 
     def scalars(array):
         return tuple(array[i] for i in range(array.shape[0]))
 
     def begin(y, u):
-        return loop.observer.init(scalars(y)), loop.controller.init(scalars(y), scalars(u))
+        return loop.observer.init(scalars(y)), control_state(loop, scalars(y), scalars(u))
 
     def step(state, t, y, r, dr, ddr):
         observer, controller = state

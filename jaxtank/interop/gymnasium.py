@@ -18,6 +18,7 @@ import numpy as np
 from jaxtank.loop.closed_loop import initial, inputs
 from jaxtank.loop.step import move
 from jaxtank.loop.validation import check
+from jaxtank.safety.prediction import moved_on
 
 PENALTY = 100.0
 """Weight of a rise past a rim beside a tracking error of the same size [-]."""
@@ -147,8 +148,13 @@ def _advance(loop, clock, samples, state, wanted, y):
     kind, filtered = state.x[0].dtype, 0.0
     applied = tuple(jnp.asarray(v, dtype=kind) for v in wanted)
     if loop.safety_filter is not None:
+        guard, line = loop.safety_filter, None
+        if guard.predicted:
+            controller, line = state.controller
         y = tuple(jnp.asarray(v, dtype=kind) for v in y)
-        applied, filtered = loop.safety_filter.apply(loop.actuator, applied, None, y, clock.dt)
+        applied, filtered = guard.apply(loop.actuator, applied, None, y, clock.dt, line)
+        if line is not None:
+            state = state._replace(controller=(controller, moved_on(line, applied)))
     state, u, spilled, _ = move(loop, clock, state, applied, _now(samples, state))
     y, state = _readings(loop, clock, samples, state)
     return state, y, u, spilled, filtered

@@ -25,6 +25,7 @@ from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal
 
 AWAY = 0.01
@@ -213,11 +214,21 @@ def initial(loop: ClosedLoop, clock: Clock) -> State:
         k=jnp.int32(0),
         x=x0,
         observer=jax.tree.map(same_type, loop.observer.init(x0)),
-        controller=jax.tree.map(same_type, loop.controller.init(x0, u0)),
+        controller=jax.tree.map(same_type, control_state(loop, x0, u0)),
         actuator=jax.tree.map(same_type, loop.actuator.init(clock)),
         sensor=jax.tree.map(same_type, loop.sensor.init(x0)),
         excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
     )
+
+
+def control_state(loop: ClosedLoop, x0: Group, u0: Group) -> Any:
+    """Return the state of the controller before the first sample, from the levels x0 (n) [cm] and
+    the inputs u0 (m) [V]; a pair with the inputs under way where the safety filter predicts.
+    """
+    state, guard = loop.controller.init(x0, u0), loop.safety_filter
+    if guard is None or not guard.predicted:
+        return state
+    return state, line_of(u0, guard.predicted)
 
 
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:

@@ -18,6 +18,7 @@ from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.tree import is_real
 from jaxtank.loop.closed_loop import ClosedLoop, Group, Inputs, State
 from jaxtank.plants.runge_kutta import advance
+from jaxtank.safety.prediction import moved_on
 from jaxtank.xla.barrier import materialised
 
 
@@ -82,17 +83,21 @@ def decide(
     -------
     Decision
     """
+    guard, line = loop.safety_filter, None
+    if guard is not None and guard.predicted:
+        controller, line = controller
     estimate, observer = loop.observer.step(observer, tick, y)
     command, controller = commanded(loop, controller, tick, estimate)
-    guard = loop.safety_filter
     allocates = loop.actuator.allocates or guard is not None
     metric = loop.controller.input_metric(estimate) if allocates else None
     if guard is None:
         applied, filtered = loop.actuator.limit(command, metric), 0.0
     else:
-        applied, filtered = guard.apply(loop.actuator, command, metric, y, tick.dt)
+        applied, filtered = guard.apply(loop.actuator, command, metric, y, tick.dt, line)
     observer = loop.observer.predict(observer, tick, command, applied)
     controller = loop.controller.track(controller, tick, command, applied)
+    if line is not None:
+        controller = controller, moved_on(line, applied)
     return Decision(estimate, command, applied, observer, controller, filtered)
 
 

@@ -172,6 +172,11 @@ SAFETY_FILTER = (
         "rate", "how fast a level may approach its limit (kappa)", unit="1/s", low=0.0, strict=True
     ),
     _optional(
+        "predict",
+        "predict levels over the inputs under way, where that is proved; left out: true",
+        "flag",
+    ),
+    _optional(
         "widths",
         "half width of the interval of each parameter of the plant, by name; left out: those of"
         " [covariance] or [uncertain]",

@@ -100,6 +100,7 @@ def design(
     low: ArrayLike = 0.0,
     draw: ArrayLike = 0.0,
     drawn: bool = False,
+    predict: bool = True,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a rig, and the certificate of each tank.
 
@@ -123,6 +124,8 @@ def design(
     low : (n,) levels below which no tank may fall [cm]; 0: none
     draw : (n,) least inflow disturbance, 0 or negative [cm^3/s]
     drawn : whether volumes may leave besides, at any time (no low limit is then proved)
+    predict : predict levels over the inputs under way where the dead time is longer than a hold,
+        and the rig has no pipes, lag, dead zone or volumes that enter besides
 
     Raises
     ------
@@ -132,9 +135,8 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     n, (least, most) = plant.tanks, box_of(plant, widths)
-    inflow, draw, low, volume = (
-        np.broadcast_to(np.asarray(v, float), (n,)) for v in (inflow, draw, low, volume)
-    )
+    given = (inflow, draw, low, volume)
+    inflow, draw, low, volume = (np.broadcast_to(np.asarray(v, float), (n,)) for v in given)
     dead = np.asarray(actuator.offset if offset is None else offset, dtype=float)
     band = np.broadcast_to(np.asarray(band_of(sensor) if band is None else band, float), (n,))
     setting = Setting(
@@ -146,7 +148,8 @@ def design(
         drawn=drawn,
         **_of_pumps(actuator, dead),
     )
-    bound = rate_bound(setting.hold, setting.delay, setting.lag)
+    setting = setting._replace(predicted=predict * _predicted(setting))
+    bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
     wanted = _wanted(setting, plant, limit)
     check_low(low, wanted, plant.units[0])
     prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
@@ -164,11 +167,10 @@ def design(
         offset=np.broadcast_to(dead, (actuator.pumps,)),
         rate=np.full(n, kappa),
         inflow=np.array(inflow),
-        low=np.array(low),
-        bottom=bottom,
         draw=np.array(draw),
-        kept=tuple(i for i in range(n) if low[i] > 0.0 and setting.rates.pumps[i]),
+        substeps=substeps if setting.predicted else 1,
         **_upper(setting, found),
+        **_lower(setting, low, bottom),
     ), tuple(_completed(row, low[row.tank], why[row.tank], plant.units[0]) for row in rows)
 
 
@@ -193,6 +195,13 @@ def _wanted(setting, plant, limit):
     return wanted
 
 
+def _predicted(setting):
+    """Number of inputs under way over which levels can be predicted; 0: none."""
+    samples = math.ceil(setting.delay / setting.hold - 1e-9)
+    other = setting.lag > 0.0 or setting.rates.pipes or setting.dead or setting.drawn
+    return 0 if samples < 2 or other or np.any(setting.spare > 0.0) else samples
+
+
 def _upper(setting, found):
     """The fields of SafetyFilter that hold the upper limits."""
     return {
@@ -204,7 +213,14 @@ def _upper(setting, found):
         # of a lagged input every older reading is a part: neighbours count with their `reach`
         "age": setting.delay if setting.lag == 0.0 else UNKNOWN,
         "held": _held(setting, found),
+        "predicted": setting.predicted,
     }
+
+
+def _lower(setting, low, bottom):
+    """The fields of SafetyFilter that hold the low limits."""
+    kept = tuple(i for i, gains in enumerate(setting.rates.pumps) if low[i] > 0.0 and gains)
+    return {"low": np.array(low), "bottom": bottom, "kept": kept}
 
 
 def _of_pumps(actuator, dead):

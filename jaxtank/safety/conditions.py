@@ -12,6 +12,7 @@ from jaxtank.safety.setting import (
     full_pumps,
     highest_level,
     phi,
+    phi_min,
     ran_before,
     resting_level,
     sqrt_of,
@@ -25,6 +26,8 @@ def theorem_of(setting, tank):
         return "no pump, and its inflow cannot pass the limit"
     if setting.lag > 0.0:
         return "Theorem 4"
+    if setting.predicted:
+        return "Theorem 5"
     return "Theorem 3" if setting.delay > 0.0 else "Theorem 1"
 
 
@@ -43,6 +46,8 @@ def failed_condition(setting, tank, heights, slopes, idle, kappa, bound, start):
         return _too_high_above(setting, tank, heights, slopes, start)
     if not rates.pumps[tank] or (setting.delay == 0.0 and setting.lag == 0.0):
         return ""
+    if setting.predicted:
+        return "" if start is None else _filled_under_way(setting, tank, heights, np.asarray(start))
     if any(i == tank for i, *_ in rates.pipes):
         return "a pipe with dead time or lag: not proved"
     steep = rates.out[tank] / math.sqrt(heights[tank])
@@ -67,6 +72,17 @@ def _under_way(setting, tank, heights, kappa, start):
     if brought <= allowed * (1.0 + 1e-9):
         return ""
     return f"(S) start: {brought:.3g} cm/s under way, {max(allowed, 0.0):.3g} allowed"
+
+
+def _filled_under_way(setting, tank, heights, start):
+    """Why the inputs under way at the start may fill a tank past its limit, or ""."""
+    level, steps = float(start[tank]), 200 * setting.predicted
+    step, brought = setting.delay / steps, ran_before(setting, tank)
+    for _ in range(steps):  # from above: the explicit step where it rises, no change where it falls
+        level += step * max(brought + setting.phi(tank, level, heights), 0.0)
+        if level > heights[tank] * (1.0 + 1e-9):
+            return f"start: inputs under way may fill it above {heights[tank]:.4g} cm"
+    return ""
 
 
 def _too_high_above(setting, tank, heights, slopes, start):
@@ -139,9 +155,25 @@ def gap_of(setting, nominal, tank, kappa, limit, reach):
     others = np.minimum(reach + setting.spare, 1e6)
 
     def filtered(h):
-        cap = max(0.0, kappa * (limit - h - eps) - phi(rates, tank, h - eps, others))
+        low, high = h - eps, h + eps
+        if setting.predicted:
+            brought = max(-phi(nominal, tank, h, others), 0.0) / gain  # at rest
+            low, high = _under_way_at_rest(setting, tank, (low, high), brought, others)
+        cap = max(0.0, kappa * (limit - high) - phi(rates, tank, low, others))
         return min(full, gain / most * cap) + phi(nominal, tank, h, others)
 
     free = lambda h: full + phi(nominal, tank, h, others)
     # the levels are found to about 1e-12 of the limit
     return max(round(float(highest_level(free, limit) - highest_level(filtered, limit)), 9), 0.0)
+
+
+def _under_way_at_rest(setting, tank, levels, brought, others):
+    """(least, largest) level [cm] predicted from `levels` with pumps that bring `brought` times
+    their gain.
+    """
+    rates, (low, high), steps = setting.rates, levels, 4 * setting.predicted
+    least, most = (sum(b[end] for b in rates.pumps[tank].values()) for end in (0, 1))
+    for _ in range(steps):
+        low += setting.delay / steps * (least * brought + phi_min(rates, tank, low, 0.0 * others))
+        high += setting.delay / steps * (most * brought + phi(rates, tank, high, others))
+    return low, high

@@ -17,7 +17,8 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.instruments.actuators import allocate
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.floors import floor_rows, floors_of, raised
+from jaxtank.safety.floors import floor_rows, floors_of, lowest, raised
+from jaxtank.safety.prediction import brackets
 from jaxtank.safety.worst_case import rates_of, rise
 
 FLOOR = 0.05
@@ -88,6 +89,8 @@ class SafetyFilter:
     )
     held: tuple = static(doc="tanks whose limits are kept, counted from 0")
     kept: tuple = static(doc="tanks whose low limits are kept, counted from 0", default=())
+    predicted: int = static(doc="inputs under way over which levels are predicted", default=0)
+    substeps: int = static(doc="steps of the prediction in a sample", default=1)
     allocate: bool = static(
         doc="give the other of two pumps what serves the outputs best where one meets its cap",
         choices=(False, True),
@@ -101,6 +104,7 @@ class SafetyFilter:
         metric: tuple[Any, ...] | None,
         y: Sequence[Any],
         hold: Any,
+        line: Sequence[Any] | None = None,
     ) -> tuple[tuple[Any, ...], Any]:
         """Return ((m) inputs within the pumps' limits, the caps and the floors [V] for a command
         (m) [V], 1.0 where a cap or a floor changed the command, else 0.0).
@@ -113,11 +117,13 @@ class SafetyFilter:
             that of the plant, by the effect of two pumps on the outputs
         y : (n) readings [cm]
         hold : longest time for which the inputs are held [s]
+        line : (m) arrays (predicted,) of the inputs under way, the oldest first [V]; needed where
+            `predicted` is above 0
         """
         pumps = range(actuator.pumps)
         low, dead = [actuator.low[j] for j in pumps], [self.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
-        caps, shared = self.limits(y, hold, low, high)
+        caps, shared = self.limits(y, hold, low, high, line)
         floors, together = self.floors(y, hold, low, caps)
         least = tuple(low)
         if self.kept:
@@ -154,16 +160,19 @@ class SafetyFilter:
         small = 1e-6 * (g11 + g22)  # a pump that moves no output keeps its own command
         return g11 + small, g12, g22 + small
 
-    def bounds(self, y: Sequence, hold: Any, high: Sequence) -> list[tuple[dict, Any]]:
+    def bounds(
+        self, y: Sequence, hold: Any, low: Sequence, high: Sequence, line: Sequence | None = None
+    ) -> list[tuple[dict, Any]]:
         """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y.
 
         Parameters
         ----------
         y : (n) readings [cm]
         hold : longest time for which an input is held [s]
-        high : (m) upper limits of the pumps [V]
+        low, high : (m) limits of the pumps [V]
+        line : inputs under way, as of `apply`
         """
-        n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold)
+        n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold, self.draw)
         fastest = [self._fastest(r, i, high) for i in range(n)]
         above = [
             jnp.minimum(
@@ -171,12 +180,15 @@ class SafetyFilter:
             )
             for i in range(n)
         ]
-        rows = []
+        rows, below = [], lowest(self, r, y, hold, low) if self.predicted else []
         for i in self.held:
             if r.pumps[i]:
-                m = self.rate[i] * (self.limit[i] - y[i] - self.band[i]) - rise(
-                    r, i, y[i] - self.band[i], above
-                )
+                least, most = y[i] - self.band[i], y[i] + self.band[i]
+                if line is not None and self.predicted:
+                    levels, others = (least, most, self.limit[i]), (below, above)
+                    step = hold / self.substeps
+                    least, most = brackets(r, i, levels, line, others, step, self.substeps)
+                m = self.rate[i] * (self.limit[i] - most) - rise(r, i, least, above)
                 rows.append(({j: b for j, (_, b) in r.pumps[i].items()}, lower_clip(m, 0.0)))
             else:
                 rows.append(self._row_above(r, i, y, hold, high))
@@ -215,13 +227,15 @@ class SafetyFilter:
         idle = 1.0 + 2.0 * sum(a * lower_clip(high[j], 0.0) for j, a in row.items())
         return row, jnp.where(far, idle, m)
 
-    def limits(self, y: Sequence, hold: Any, low: Sequence, high: Sequence) -> tuple:
+    def limits(
+        self, y: Sequence, hold: Any, low: Sequence, high: Sequence, line: Sequence | None = None
+    ) -> tuple:
         """Return ((m) upper limits of the inputs [V], the rows that bind two pumps or more).
 
         Lower limits win: a pump that cannot stop runs at its lower limit.
         """
         caps, shared = list(high), []
-        for row, m in self.bounds(y, hold, high):
+        for row, m in self.bounds(y, hold, low, high, line):
             if len(row) == 1:
                 ((j, a),) = row.items()
                 cap = jnp.where(a > 0.0, m / jnp.where(a > 0.0, a, 1.0), high[j])

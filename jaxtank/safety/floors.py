@@ -25,12 +25,7 @@ def floor_rows(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) 
     hold : longest time for which an input is held [s]
     low : (m) lower limits of the pumps [V]
     """
-    below = []
-    for i in range(guard.least.tanks):
-        drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in rates.pumps[i].items())
-        fastest = drawn - fall(rates, i, guard.reach[i], guard.bottom)
-        lowest = y[i] - guard.band[i] - (hold + guard.age) * fastest
-        below.append(lower_clip(lowest, guard.bottom[i]))
+    below = lowest(guard, rates, y, hold, low)
     return [
         (
             i,
@@ -39,6 +34,20 @@ def floor_rows(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) 
         )
         for i in guard.kept
     ]
+
+
+def lowest(guard: Any, rates: Rates, y: Sequence, hold: Any, low: Sequence) -> list:
+    """Return the (n) least that each level can be until the inputs of this sample end [cm].
+
+    Parameters as of `floor_rows`.
+    """
+    below = []
+    for i in range(guard.least.tanks):
+        drawn = sum(b * lower_clip(-low[j], 0.0) for j, (_, b) in rates.pumps[i].items())
+        fastest = drawn - fall(rates, i, guard.reach[i], guard.bottom)
+        least = y[i] - guard.band[i] - (hold + guard.age) * fastest
+        below.append(lower_clip(least, guard.bottom[i]))
+    return below
 
 
 def floors_of(rates: Rates, rows: Sequence, low: Sequence, caps: Sequence) -> tuple:

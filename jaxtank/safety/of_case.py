@@ -33,6 +33,7 @@ def design_for(
     band: ArrayLike | None = None,
     rate: float | None = None,
     low: ArrayLike | None = None,
+    predict: bool = True,
 ) -> tuple[SafetyFilter, tuple[TankCertificate, ...]]:
     """Return a safety filter for a case, and the certificate of each tank.
 
@@ -47,6 +48,7 @@ def design_for(
     rate : kappa, how fast a level may approach its limit [1/s]
     low : (n,) levels below which no tank may fall [cm], 0: none; left out: the limit on min_level,
         else none
+    predict : predict levels over the inputs under way where that is proved (see `design`)
 
     Returns
     -------
@@ -87,6 +89,7 @@ def design_for(
         low=case.limits.get("min_level", 0.0) if low is None else low,
         draw=draw,
         drawn=drawn,
+        predict=predict,
     )
 
 

@@ -26,6 +26,7 @@ class Setting(NamedTuple):
     pulse: bool
     dead: bool = False  # whether a pump stands still for inputs above 0
     drawn: bool = False  # whether inflow pulses draw liquid
+    predicted: int = 0  # inputs under way over which levels are predicted
     before: tuple = ()  # (m) inputs at which the pumps ran before t = 0, less dead zones [V]
 
     def phi(self, tank, level, others):

@@ -6,6 +6,7 @@ constant of the filter may be traced, and derivatives by them are exact. Importe
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ def channel(clock, initial, changes, duration, shape, lag=None):
     shape : "linear" or "quintic"
     lag : time constant of a first-order filter behind [s], 0 for none; or None
     """
-    pieces = [(0, functools.partial(_flat, initial))]
+    pieces: list[Any] = [(0, functools.partial(_flat, initial))]
     for start, target in changes:
         first = index(start, clock)
         level = pieces[-1][1](first, start)[0]
@@ -90,7 +91,8 @@ def _quintic(level, delta, s, duration):
 def _filtered(initial, changes, duration, lag, clock):
     """The pieces of a linear channel behind lag f' = r - f, f(0) = initial, solved exactly."""
     lag = jnp.where(lag > 0, lag, 1.0)
-    pieces, at = [(0, functools.partial(_flat, initial))], lambda t: (initial, initial)
+    pieces: list[Any] = [(0, functools.partial(_flat, initial))]
+    at: Any = lambda t: (initial, initial)
     for start, target in changes:
         level, state = at(start)[:2]
         at = functools.partial(_lagged, level, state, target, start, duration, lag)

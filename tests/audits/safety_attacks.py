@@ -71,15 +71,16 @@ def corners(rng, plant, count, spread):
 
 
 def filtered_by(found, actuator, hold):
-    """(readings (P, n), commands (P, m)) -> inputs (P, m) of a SafetyFilter."""
+    """Return (readings (P, n), commands (P, m), inputs under way (d, P, m)) -> inputs (P, m)."""
     clipping = dataclasses.replace(found, allocate=False)
 
     @jax.jit
     @jax.vmap
-    def inputs(y, u):
-        return jax.numpy.stack(clipping.apply(actuator, tuple(u), None, tuple(y), hold)[0])
+    def inputs(y, u, line):
+        applied = clipping.apply(actuator, tuple(u), None, tuple(y), hold, tuple(line))[0]
+        return jax.numpy.stack(applied)
 
-    return lambda y, u: np.asarray(inputs(y, u))
+    return lambda y, u, line: np.asarray(inputs(y, u, np.moveaxis(line, 0, 2)))
 
 
 def begin(rng, found, start, count):
@@ -132,7 +133,7 @@ def attack(
     low, high = np.asarray(actuator.low, float), np.asarray(actuator.high, float)
     x = begin(rng, found, start, count)
     turning, dead = np.zeros((count, m)) + before, np.asarray(found.offset)
-    line = [turning] * delay
+    line, under_way = [turning] * delay, np.zeros((delay, count, m)) + before
     highest, lowest, d, h = x, x, 0.0, hold / substeps
     for k in range(int(seconds / hold)):
         if k % max(1, int(2.0 / hold)) == 0:
@@ -142,7 +143,9 @@ def attack(
             d = np.where(rng.random((count, n)) < 0.5, 0.0, inflow)
             p = corners(rng, plant, count, spread) if varying else p
         d = d if pulses is None else pulses[k]
-        u = filtered(x + eps * rng.choice([-1.0, 1.0], (count, n)), want)
+        y = x + eps * rng.choice([-1.0, 1.0], (count, n))
+        u = filtered(y, want, under_way[delay - found.predicted :])
+        under_way = np.concatenate([under_way, u[None]])[1:]
         line.append(np.maximum(u - dead, 0.0))
         u = line.pop(0)
         for _ in range(substeps):
@@ -191,16 +194,17 @@ def trial(seed, with_low=False):
     plant, actuator = random_rig(rng)
     hold, spread = float(rng.choice([0.1, 0.5, 1.0])), float(rng.choice([0.05, 0.2]))
     eps, start = float(rng.choice([0.0, 0.1])), plant.rim * rng.uniform(0.05, 0.9, plant.tanks)
-    delay, lag = [(0, 0.0), (0, 0.0), (3, 0.0), (2, 0.7)][0 if with_low else seed % 4]
+    delay, lag = [(0, 0.0), (5, 0.0), (3, 0.0), (2, 0.7)][0 if with_low else seed % 4]
     actuator = dataclasses.replace(actuator, delay=delay * hold)
-    if delay:
+    predict = seed % 8 != 2 and lag == 0.0 and delay > 0 and plant.pipes == ()
+    if delay and not predict:
         start = 0.02 * start
     if lag:
         actuator = dataclasses.replace(actuator, lag=np.full(plant.pumps, lag))
-    kappa = 0.999 * min(2.0, rate_bound(hold, delay * hold, lag))
+    kappa = 0.999 * min(2.0, rate_bound(hold, 0.0 if predict else delay * hold, lag))
     inflow = rng.uniform(0.0, 20.0, plant.tanks) * (seed % 3 == 0)
     given = {"widths": of(plant, spread), "band": eps, "rate": kappa, "start": start}
-    given |= {"inflow": inflow}
+    given |= {"inflow": inflow, "predict": predict, "substeps": 4}
     if with_low:
         plant = dataclasses.replace(plant, pump_gain=plant.pump_gain * 3.0)
         given |= {"low": start * rng.uniform(0.0, 0.6, plant.tanks), "widths": of(plant, spread)}

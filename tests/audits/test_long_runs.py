@@ -28,7 +28,7 @@ from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant, Table
-from jaxtank.signals.inflows import pulses
+from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import Sine, ramps
 from tuning.uncertainty import needs
 from tuning.uncertainty.draws import Draws
@@ -197,7 +197,7 @@ def noisy(reference=None):
             (3.0, 6.0), [(t, i, 5.0 + i) for i, t in enumerate(late)], ramp=5.0, shape="quintic"
         ),
         sensor=dataclasses.replace(loop.sensor, noise=np.full(4, 1e-3)),
-        disturbance=pulses(4, [(t + 0.5, 1.1, 0, 50.0) for t in late]),
+        disturbance=inflow_pulses(4, [(t + 0.5, 1.1, 0, 50.0) for t in late]),
         faults=faults(loop.plant, [("pump_gain[0]", late[0], late[1], 0.9, 0.0)]),
         actuator=dataclasses.replace(loop.actuator, low=np.full(2, -100.0), high=np.full(2, 100.0)),
     )

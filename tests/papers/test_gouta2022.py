@@ -223,13 +223,13 @@ def test_pump_fault():
 def held_at(level):
     """A short unsaturated run: a steady setpoint, levels a little off it, a pour."""
     from jaxtank.signals.base import Constant
-    from jaxtank.signals.inflows import pulses
+    from jaxtank.signals.inflows import inflow_pulses
 
     return lambda loop: dataclasses.replace(
         loop,
         reference=Constant(level=np.array(level)),
         x0=np.array(level) + np.array([0.05, -0.04]),
-        disturbance=pulses(2, [(5.0, 4.0, 0, 60.0)]),
+        disturbance=inflow_pulses(2, [(5.0, 4.0, 0, 60.0)]),
     )
 
 
@@ -278,13 +278,13 @@ def test_k_and_l_are_interchangeable_in_the_loop():
 
 def quietly(loop):
     from jaxtank.signals.base import Constant
-    from jaxtank.signals.inflows import pulses
+    from jaxtank.signals.inflows import inflow_pulses
 
     return dataclasses.replace(
         loop,
         reference=Constant(level=np.array([12.0, 10.0])),
         x0=np.array([12.0, 10.0]),
-        disturbance=pulses(2, [(5.0, 4.0, 0, 60.0)]),
+        disturbance=inflow_pulses(2, [(5.0, 4.0, 0, 60.0)]),
     )
 
 

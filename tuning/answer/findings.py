@@ -8,6 +8,7 @@ from jaxtank import measures as ms
 from tuning.answer.answer import Answer
 from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
+from tuning.problem.wording import numbered
 from tuning.search.result import Message, TuningResult
 
 Found = Iterator[Message]
@@ -88,9 +89,9 @@ def _certificates(result, answer) -> Found:
 
 def _idle(result, answer) -> Found:
     if answer.idle:
-        tanks = ", ".join(map(str, answer.idle))
+        tanks = numbered("tank", answer.idle)
         yield Message(
-            "limit-idle", f"no plant comes within 10 % of the limit on the level of tank {tanks}"
+            "limit-idle", f"no plant comes within 10 % of the limit on the level of {tanks}"
         )
 
 

@@ -35,6 +35,9 @@ FACTORS = (1.02, 1.05, 1.1, 1.2, 1.35, 1.6, 2.0, 3.0)
 FAR = 0.4
 """Margin, as a share of a limit, of what a move of setpoints does not look at."""
 
+ROUNDING = 1e-4
+"""Margin, as a share of a limit, that a search of setpoints keeps."""
+
 LARGEST = 1e6
 """Excess, as a share of a limit, that stands for no steady state."""
 
@@ -146,8 +149,8 @@ def _least_move(needs, where, values, quantile, start):
         jac=lambda change: 2.0 * change,
         method="SLSQP",
         bounds=[(-0.9 * v, None) if v > 0 else (0.0, None) for v in values],
-        constraints={"type": "ineq", "fun": lambda c: -needed(c[where]), "jac": slopes},
-        options={"maxiter": 15, "ftol": 1e-4},
+        constraints={"type": "ineq", "fun": lambda c: -needed(c[where]) - ROUNDING, "jac": slopes},
+        options={"maxiter": 40, "ftol": 1e-4},
     ).x
 
 

@@ -192,7 +192,7 @@ def least_offset(
     >>> from jaxtank import presets
     >>> case = presets.find("gouta2015/backstepping")
     >>> least_offset(case, {"plant.orifice[0]": np.array([0.12, 0.1])}).round(2).tolist()
-    [0.0, 0.9]
+    [0.0, 0.68]
     """
     needs = Needs(case, draws, limits)
     return np.sqrt(np.mean(least_offsets(needs) ** 2, axis=1) / needs.setpoints.shape[2])
@@ -249,7 +249,9 @@ def apply_mend(
             mend = Mend(what=kind, set={}, share=None, words=f"the {kind} need no change")
     if mend is None:
         others = "" if kind == "ramps" else _others(found)
-        raise InputError(f"{case.name}: no change of its {kind} alone is enough{needed}{others}")
+        raise InputError(
+            f"{case.name}: no change of its {kind} alone was found to be enough{needed}{others}"
+        )
     return rig.set_values(case, with_models(case.loop, mend.set)), mend
 
 

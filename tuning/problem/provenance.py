@@ -1,5 +1,8 @@
 """What a result was made with: versions, settings and seed; imported by every command."""
 
+# optax and scipy have no type stubs
+# pyright: reportMissingTypeStubs=false
+
 import os
 import platform
 from typing import Any
@@ -14,7 +17,7 @@ from jaxtank.xla.flags import KEY
 from tuning.problem.scenarios import screening_clock
 
 
-def provenance(case: Case, seed: int) -> dict[str, Any]:
+def provenance(case: Case, seed: int | None) -> dict[str, Any]:
     """Return the versions and settings that a result depends on.
 
     Examples

@@ -183,8 +183,8 @@ def best_screened(search, screened):
     for i in np.argsort(costs, kind="stable"):
         if not held[i] or zs[i].tobytes() in search.memory:
             continue
-        held_now = search.best is not None and search.violation(search.best) == 0
-        if held_now and costs[i] >= search.best.cost:
+        best = search.best
+        if best is not None and search.violation(best) == 0 and costs[i] >= best.cost:
             return None
         if search.point(zs[i]) is search.best:
             return zs[i]

@@ -90,11 +90,11 @@ def lost_outputs(
 
 def _suspect(run, before, after) -> set[int]:
     """Return the outputs (from 0) whose measures give a reason to compare their trajectories."""
-    size = np.abs(
-        [float(np.max(np.abs(v))) for v in run.case.loop.reference.sample(run.case.clock)[0]]
-    )
-    grown = np.asarray(after["rms_error"]) > WORSE * np.asarray(before["rms_error"])
-    suspect = grown & (np.asarray(after["rms_error"]) > 0.5 * OFF * size)
+    suspect = np.asarray(after["rms_error"]) > WORSE * np.asarray(before["rms_error"])
+    if suspect.any():
+        setpoints = run.case.loop.reference.sample(run.case.clock)[0]
+        size = np.array([float(np.max(np.abs(v))) for v in setpoints])
+        suspect &= np.asarray(after["rms_error"]) > 0.5 * OFF * size
     for measure in ("settling_time", "recovery_time"):
         if measure in before:
             suspect |= np.isposinf(after[measure]) & ~np.isposinf(before[measure])

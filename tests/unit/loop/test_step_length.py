@@ -19,7 +19,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop import step_size
 from jaxtank.plants.faults import faults
-from jaxtank.signals.inflows import pulses
+from jaxtank.signals.inflows import inflow_pulses
 from tuning.cli import main
 from tuning.report.tuned import report
 
@@ -213,7 +213,7 @@ def test_a_run_that_is_right_is_not_refused(case, rim):
                 loop, faults=faults(loop.plant, [("pump_gain[0]", 3.0, 30.0, 1.5, 0.0)])
             )
         elif case == "pour":
-            loop = dataclasses.replace(loop, disturbance=pulses(1, [(3.0, 1.0, 0, 150.0)]))
+            loop = dataclasses.replace(loop, disturbance=inflow_pulses(1, [(3.0, 1.0, 0, 150.0)]))
         clock = Clock(dt=1.0, duration=40.0)
         run = jaxtank.simulate(loop, clock)
     assert step_size.step_warnings(loop, clock)

@@ -199,7 +199,7 @@ def test_the_example_of_the_module_can_be_used():
 
 def test_faults_inflow_pulses_and_a_sine_over_a_preset_are_those_of_python():
     from jaxtank.plants.faults import faults
-    from jaxtank.signals.inflows import pulses
+    from jaxtank.signals.inflows import inflow_pulses
     from jaxtank.signals.setpoints import Sine
 
     text = (
@@ -217,7 +217,7 @@ def test_faults_inflow_pulses_and_a_sine_over_a_preset_are_those_of_python():
     np.testing.assert_array_equal(jax.tree.leaves(loop.reference.second), jax.tree.leaves(sine))
     assert jax.tree.structure(loop.reference.first) == jax.tree.structure(old.reference)
     for ours, theirs in (
-        (loop.disturbance, pulses(4, [(30.0, 2.0, 1, 40.0)])),
+        (loop.disturbance, inflow_pulses(4, [(30.0, 2.0, 1, 40.0)])),
         (loop.faults, faults(old.plant, [("pump_gain[1]", 10, 20, 0.6, 0.0)])),
     ):
         assert jax.tree.structure(ours) == jax.tree.structure(theirs)
@@ -436,7 +436,7 @@ def test_init_of_the_command(tmp_path, capsys):
 
 def test_what_a_preset_states_in_more_tables_does_not_come_back():
     """A short file without [uncertain], or with one pour of two, would have the preset's."""
-    from jaxtank.signals.inflows import pulses
+    from jaxtank.signals.inflows import inflow_pulses
 
     case = presets.find("gouta2015/ngpc").replace(uncertain={})
     assert rig.loads(rig.short(case)).uncertain == {}
@@ -446,7 +446,9 @@ def test_what_a_preset_states_in_more_tables_does_not_come_back():
     first = [(t, d, i, v) for (t, d, i), v in zip(own.events, np.asarray(own.volume).tolist())][:1]
     assert len(own.events) > 1
     case = case.replace(
-        loop=case.loop.__class__(**{**vars(case.loop), "disturbance": pulses(own.width, first)})
+        loop=case.loop.__class__(
+            **{**vars(case.loop), "disturbance": inflow_pulses(own.width, first)}
+        )
     )
     assert rig.loads(rig.short(case)).loop.disturbance.events == own.events[:1]
 

@@ -105,6 +105,8 @@ variable = "r1"
 knots = [3.0, 6.0]
 [safety_filter]
 limit = [2.5, 2.4]
+low = [0.2, 0.1]
+predict = false
 band = [0.01, 0.02]
 rate = 0.5
 widths = { "plant.drain" = 0.01 }

@@ -145,7 +145,7 @@ def test_swapped_ends_of_the_box_pass_the_limit():
 def test_a_dead_time_needs_a_smaller_rate(delay):
     plant, actuator = one_tank()
     delayed = dataclasses.replace(actuator, delay=0.5 * delay)
-    given = {"widths": {}, "limit": 30.0}
+    given = {"widths": {}, "limit": 30.0, "predict": False}
     _, (row,) = design(plant, delayed, sensor_of(plant), 0.5, **given)
     assert row.rate_bound == pytest.approx(delay**delay / (delay + 1) ** (delay + 1) / 0.5)
     at_bound, _ = design(plant, delayed, sensor_of(plant), 0.5, rate=row.rate_bound, **given)
@@ -179,7 +179,7 @@ def test_filter_and_certificate_reckon_with_the_same_rates(seed):
 def test_inputs_under_way_at_the_start_can_pass_the_limit(delay):
     """(S): pumps at full before t = 0, of which `delay` samples are under way."""
     plant, actuator = one_tank()
-    given = {"widths": {}, "limit": 30.0, "start": [29.0]}
+    given = {"widths": {}, "limit": 30.0, "start": [29.0], "predict": False}
     for before, proved in ((0.0, True), (12.0, False)):
         pumps = dataclasses.replace(actuator, delay=0.5 * delay, initial=np.array([before]))
         found, (row,) = design(plant, pumps, sensor_of(plant), 0.5, **given)

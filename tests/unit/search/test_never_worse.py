@@ -289,3 +289,16 @@ def test_a_start_at_a_constant_setpoint_is_no_change(watertank):
     assert missing == [True] and "x0" in why
     with pytest.raises(jaxtank.InputError, match="rise_time = 5 s: undefined on this run"):
         tuning.tune(case, nominal=True, limits={"rise_time": 5.0}, starts=1)
+
+
+def test_an_infeasible_value_of_a_trade_off_is_the_least_violation_of_a_grid(watertank):
+    """A rise time is a count of samples: no slope leads to the least violation."""
+    limits = {"overshoot_percent": 5.0}
+    found = tuning.tradeoff(watertank, "rise_time", [2.0, 0.05], limits=limits, screening=32)
+    kept, missed = found["points"]
+    assert kept["status"] == "converged" and kept["violation"] == 0.0
+    problem = tuning.Problem(watertank, limits={**limits, "rise_time": 0.05})
+    axis = np.linspace(0.0, 1.0, 31)
+    _, margins = problem.screen(np.stack([v.ravel() for v in np.meshgrid(axis, axis)], axis=1))
+    least = np.maximum(0.0, -margins / problem.limit_scales).max(axis=1).min()
+    assert missed["status"] == "infeasible" and 0.0 < missed["violation"] <= least

@@ -103,7 +103,10 @@ def mends_of(found):
     if not found.mends:
         if found.infeasible_for_any_controller <= 0.05:
             return []
-        return ["no change of setpoints, rims, orifices or pumps alone is enough for 95 % of rigs"]
+        return [
+            "no change of setpoints, rims, orifices or pumps alone was found that is enough for"
+            " 95 % of rigs"
+        ]
     head = ["for 95 % of rigs, one of:"]
     return head + [f"  {m.what}: {' '.join(m.options)}" for m in found.mends]
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.answer.setting import limited_levels
+from tuning.problem.wording import numbered
 from tuning.report.tables import number, table
 from tuning.report.tuned.tables import parts_of as all_parts
 
@@ -85,17 +86,10 @@ def _headline(result):
     held, samples = int(answer.after.held.sum()), answer.after.samples
     limited = f"; limits hold on {held} of {samples} new plants" if answer.after.limits else ""
     tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
-    proved = f", proved for tank {_listed(tanks)}" if tanks and limited else ""
+    proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
     changed = sum(not stays for stays in answer.kept.values())
     gains = f"; {changed} of {len(answer.kept)} gains changed" if answer.kept else ""
     return f"{start}{limited}{proved}{gains} ({result.wall_s:.1f} s)"
-
-
-def _listed(numbers):
-    """1, 2, 3 as text; a range where they follow each other."""
-    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
-        return f"{numbers[0]} to {numbers[-1]}"
-    return ", ".join(map(str, numbers))
 
 
 def _wrapped(text, first=""):

@@ -1,0 +1,94 @@
+"""Levels at the end of a dead time, from above and from below, over the inputs under way.
+
+Two copies of each tank: Theorem 5 of README.md of this folder. Imported by `safety.filter`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxtank.core.numerics import lower_clip, smooth_sqrt
+from jaxtank.safety.worst_case import Rates, fall, rise
+
+
+def line_of(u: Sequence[Any], samples: int) -> tuple[Any, ...]:
+    """Return the inputs under way of pumps that have run at u (m) [V]: (m) arrays (samples,)."""
+    return tuple(jnp.broadcast_to(jnp.asarray(v), (samples,)) for v in u)
+
+
+def moved_on(line: Sequence[Any], u: Sequence[Any]) -> tuple[Any, ...]:
+    """Return the inputs under way (m) a sample later, u (m) the latest [V]; the oldest is first."""
+    return tuple(jnp.concatenate([v[1:], jnp.asarray(w)[None]]) for v, w in zip(line, u))
+
+
+def brackets(
+    rates: Rates,
+    tank: int,
+    levels: tuple[Any, ...],
+    line: Sequence[Any],
+    others: tuple[Any, ...],
+    step: Any,
+    substeps: int,
+) -> tuple:
+    """Return (least, largest) level [cm] of a tank without pipes after the inputs under way.
+
+    A level moves monotonically towards its equilibrium. So the explicit Euler step bounds it from
+    above where it rises and from below where it falls, and the implicit one the other way; both are
+    monotone in the level, whatever the step.
+
+    Parameters
+    ----------
+    levels : (least, largest) level now, and the limit [cm], which the largest never passes
+    line : (m) arrays (samples,) of inputs under way, the oldest first [V]
+    others : ((n) least, (n) largest) levels of the other tanks meanwhile [cm]
+    step : sampling period over substeps [s]
+    """
+    low, high, top = levels
+    above, below = others[1], others[0]
+    enters = rise(rates, tank, 0.0 * top, above)
+    least_enters = fall(rates, tank, 0.0 * top, below)
+    gains = rates.pumps[tank].items()
+    most: Any = sum(jnp.where(line[j] >= 0.0, b, a) * line[j] for j, (a, b) in gains)
+    least: Any = sum(jnp.where(line[j] >= 0.0, a, b) * line[j] for j, (a, b) in gains)
+    # within the laminar threshold, and where outflow may be limited, nothing leaves for certain
+    shallow = lower_clip(rates.empty[tank] + 0.0 * top, rates.knee)
+
+    def one(pair, flows):
+        low, high = pair
+        for _ in range(substeps):
+            high = _from_above(high, flows[1], rates.out[tank], step, rates.knee, shallow)
+            high = jnp.where(high < top, high, top)
+            low = _from_below(low, flows[0], rates.out_most[tank], step, rates.knee)
+        return (low, high), None
+
+    begin = (low + 0.0 * least[0], jnp.where(high < top, high, top) + 0.0 * most[0])
+    flows = (least_enters + least, enters + most)
+    return jax.lax.scan(one, begin, flows)[0]
+
+
+def _explicit(h, flow, out, step, knee):
+    return h + step * (flow - out * smooth_sqrt(lower_clip(h, 0.0), knee))
+
+
+def _implicit(h, flow, out, step):
+    """The level h1 >= 0 with h1 + step out sqrt(h1) = h + step flow."""
+    half = 0.5 * step * out
+    target = lower_clip(h + step * flow, 0.0)
+    # the clip keeps the slope at an empty tank without outlets finite
+    root = jnp.sqrt(lower_clip(half * half + target, 1e-30))
+    return lower_clip(target + 2.0 * half * (half - root), 0.0)
+
+
+def _from_above(h, flow, out, step, knee, shallow):
+    explicit, implicit = _explicit(h, flow, out, step, knee), _implicit(h, flow, out, step)
+    least = jnp.where(h < shallow, h, shallow)
+    falling = lower_clip(implicit, least)
+    return jnp.where(explicit >= h, explicit, falling)
+
+
+def _from_below(h, flow, out, step, knee):
+    h = lower_clip(h, 0.0)
+    explicit, implicit = _explicit(h, flow, out, step, knee), _implicit(h, flow, out, step)
+    return lower_clip(jnp.where(explicit >= h, implicit, explicit), 0.0)
