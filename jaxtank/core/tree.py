@@ -67,7 +67,7 @@ def walk(
     --------
     >>> from jaxtank.signals import ramps
     >>> [name for name, *_ in walk(ramps([3.0], []), "reference.")]
-    ['reference.initial', 'reference.targets']
+    ['reference.initial', 'reference.targets', 'reference.ramp', 'reference.filter']
     """
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
@@ -94,7 +94,7 @@ def parameters(tree: Any) -> dict[str, Any]:
     --------
     >>> from jaxtank.signals import ramps
     >>> parameters(ramps([3.0], []))
-    {'initial': array([3.]), 'targets': array([], dtype=float64)}
+    {'initial': array([3.]), 'targets': array([], dtype=float64), 'ramp': array(60.)}
     """
     return {name: value for name, value, _ in walk(tree) if value is not None}
 

@@ -113,10 +113,10 @@ def _lagged(level, state, target, start, duration, lag, t):
 
 def _decay(level, state, slope, s, lag):
     """(r, f, f', f'') a time s after f = `state`, with r = level + slope s."""
-    gone = jnp.expm1(-s / lag)
-    left = (state - level) * (1.0 + gone)
+    kept, gone = jnp.exp(-s / lag), jnp.expm1(-s / lag)
+    left = (state - level) * kept
     value = level + left + slope * (s + lag * gone)
-    second = left / lag**2 + slope / lag * (1.0 + gone)
+    second = left / lag**2 + slope / lag * kept
     return level + slope * s, value, -left / lag - slope * gone, second
 
 

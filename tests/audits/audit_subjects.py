@@ -250,6 +250,7 @@ CHANGES = [(2.0, 0, 5.0), (6.0, 0, 3.0), (3.0, 1, 9.0)]
 of_signal("Constant", lambda: signals.Constant(level=np.array([2.0, 7.0])))
 of_signal("Ramps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0), windows=True)
 of_signal("Ramps cut short", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=6.0), windows=True)
+of_signal("Ramps filtered", lambda: signals.ramps((3.0, 8.0), CHANGES, 3.2, filter=(2.0, 0.4)))
 of_signal("Ramps quintic", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0, shape="quintic"))
 of_signal("Ramps steps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=0.0))
 SINE = {

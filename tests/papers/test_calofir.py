@@ -249,7 +249,12 @@ OFFSETS = [
 OFFSET_GAINS = [(0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.05, 0.05), (0.1, 0.1)]
 
 
-@pytest.mark.slow_for("c2*0.75-0.3-offsets1", "c2*0.75-0.48-offsets0", "c2*1.25-0.48-offsets2")
+@pytest.mark.slow_for(
+    "c2*0.75-0.3-offsets1",
+    "c2*0.75-0.48-offsets0",
+    "c2*1.25-0.48-offsets2",
+    "c1*0.75-0.48-offsets3",
+)
 @pytest.mark.parametrize("fault, r, offsets", OFFSETS)
 def test_permanent_faults(fault, r, offsets):
     """h1 - h1r after 6000 s (notes S7.2), to half a unit of the last digit; the constant flow
@@ -408,6 +413,7 @@ def test_gradients_from_empty_tanks():
     )
 
 
+@pytest.mark.slow_for("backstepping")
 @pytest.mark.parametrize("name", list(CASES))
 def test_the_loop_compiles_to_one_function(name):
 

@@ -148,6 +148,7 @@ def test_the_share_of_the_overflow_is_caught():
     np.testing.assert_allclose(lost, flow - cascaded.K_LOWER * np.sqrt(10.0), rtol=1e-3)
 
 
+@pytest.mark.slow_for("pi")
 @pytest.mark.parametrize("name", list(CASES))
 def test_the_loop_compiles_to_one_function(name):
 
@@ -261,6 +262,7 @@ def levels_for(loop, inputs, start, dt):
     return np.array(path)
 
 
+@pytest.mark.slow_for("2-4.0", "3-4.0", "10-4.0")
 @pytest.mark.parametrize(
     "substeps, dt", [(1, 4.0), (2, 4.0), (3, 4.0), (4, 4.0), (10, 4.0), (10, 0.4)]
 )

@@ -382,6 +382,7 @@ def test_plant_a_rows_of_the_acceptance_table(row):
     np.testing.assert_allclose(got["max_level"][2:], (h3, h4), atol=0.15)
 
 
+@pytest.mark.slow_for("backstepping-ff-table1-1324", "backstepping-table1-1293")
 @pytest.mark.parametrize(
     "name, excess",
     [("ngpc-table1", 3417), ("backstepping-table1", 1293), ("backstepping-ff-table1", 1324)],

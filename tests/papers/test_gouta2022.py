@@ -442,7 +442,7 @@ def test_permuted_tanks_give_permuted_answers():
 SLOW = {"enmpc-printed", "chadpc-printed", "pi", "pid", "fopi"}
 
 
-@pytest.mark.slow_for("fopi-ff")
+@pytest.mark.slow_for("fopi-ff", "enmpc", "pid-ff", "pi-ff")
 @pytest.mark.parametrize(
     "name",
     [
@@ -498,7 +498,7 @@ def test_published_parameters_are_those_of_the_cases():
     assert float(loop.plant.pump_gain[0]) == pytest.approx(10 * published["plant.pump_gain"].value)
 
 
-@pytest.mark.slow_for("pid-ff")
+@pytest.mark.slow_for("pid-ff", "fopi")
 @pytest.mark.parametrize("name", ["chadpc", "pid-ff", "fopi"])
 def test_the_rig_in_metres_runs_as_in_centimetres(name):
 

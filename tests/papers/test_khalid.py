@@ -224,6 +224,7 @@ def test_cost_equals_brute_force(kind):
     assert eta @ Omega @ eta + 2 * eta @ Psi @ x + constant == pytest.approx(cost, rel=1e-11)
 
 
+@pytest.mark.slow_for("gpc-nc30-30")
 @pytest.mark.parametrize(
     "kind, Nc", [("gpc-nc2", 2), ("gpc", 10), ("gpc-nc30", 30), ("gpc-mimo", 10)]
 )
@@ -360,6 +361,7 @@ def rows(table, quick):
     "S2-laguerre-constrained-0.5",
     "S2-laguerre-unconstrained-0.5",
     "S1-laguerre-constrained-0.1",
+    "S1-laguerre-unconstrained-0.5",
 )
 @pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):
@@ -944,6 +946,7 @@ def test_reverse_slopes_through_programmes_are_the_forward_ones():
 # the compiled loop and the preset
 
 
+@pytest.mark.slow_for("gpc", "laguerre")
 @pytest.mark.parametrize("name", ["gpc", "laguerre", "laguerre-mimo"])
 def test_the_loop_compiles_to_one_function(name):
     """No LAPACK is called in the time loop, so it runs as one function. The constrained cases

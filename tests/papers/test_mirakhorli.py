@@ -1187,6 +1187,7 @@ def test_the_printed_controller_has_no_useful_slopes():
     assert np.ptp(moved) > 1e-2
 
 
+@pytest.mark.slow_for("sfc", "smc", "smc-printed")
 @pytest.mark.parametrize("name", CASES)
 def test_each_case_compiles_to_one_loop(name):
 
@@ -1199,6 +1200,7 @@ def test_each_case_compiles_to_one_loop(name):
     assert loops_in(compiled) >= 1
 
 
+@pytest.mark.slow_for("lqi")
 @pytest.mark.parametrize("name", ["sfc", "hybrid", "lqi"])
 def test_tanks_in_another_order_give_the_same_run(name):
     """Left and right exchanged (tank 1 with 2, 3 with 4, pump 1 with 2) everywhere: the answers are
@@ -1245,7 +1247,7 @@ def test_tanks_in_another_order_give_the_same_run(name):
 POWERS = {"surface": 0, "ks": 1, "phi": 1, "b": 1, "w": 1, "K": -1, "operating_point": 1}
 
 
-@pytest.mark.slow_for("hybrid", "lqi")
+@pytest.mark.slow_for("hybrid", "lqi", "smc-printed")
 @pytest.mark.parametrize(
     "name", [pytest.param("sfc", marks=pytest.mark.slow), "smc", "hybrid", "smc-printed", "lqi"]
 )

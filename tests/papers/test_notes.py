@@ -3,6 +3,7 @@ label or a test names one that exists.
 """
 
 import ast
+import functools
 import re
 from importlib import resources
 from pathlib import Path
@@ -84,8 +85,9 @@ def test_a_wrong_reference_is_found():
     assert dangling(Path("qp.py"), "notes S4.5") == [(None, "S4.5")]
 
 
-@pytest.mark.parametrize("paper", presets.PAPERS)
-def test_tests_that_a_note_names_exist(paper):
+@functools.cache
+def modules_and_functions():
+    """Names of the test modules, and "module::function" of all their functions."""
     modules = {p.name: ast.parse(p.read_text()) for p in TESTS.rglob("test_*.py")}
     functions = {
         f"{m}::{n.name}"
@@ -93,6 +95,12 @@ def test_tests_that_a_note_names_exist(paper):
         for n in ast.walk(tree)
         if isinstance(n, ast.FunctionDef)
     }
+    return modules.keys(), functions
+
+
+@pytest.mark.parametrize("paper", presets.PAPERS)
+def test_tests_that_a_note_names_exist(paper):
+    modules, functions = modules_and_functions()
     named = set(re.findall(r"test_\w+\.py::test_\w+", note(paper)))
     assert named and named <= functions
     assert set(re.findall(r"`(test_\w+\.py)`", note(paper))) <= set(modules)

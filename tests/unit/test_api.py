@@ -25,6 +25,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.observers import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.rig import components
+from tuning.answer import findings
 from tuning.cli.main import main
 from tuning.optimal_input.perfect_information import InputBound
 from tuning.search import messages
@@ -358,8 +359,15 @@ def test_the_message_on_a_bound_names_value_unit_and_sensitivity(tuned):
 
 def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
     folder = Path(messages.__file__).parent
+    report = folder.parent / "report" / "tuned" / "report.py"
+    _check_codes([*folder.glob("*.py"), report], messages.__doc__)
+    _check_codes(Path(findings.__file__).parent.glob("*.py"), findings.__doc__)
+
+
+def _check_codes(paths, table):
+    """The codes of all Messages that the modules make are those of the table, each once."""
     found = set()
-    for path in [*folder.glob("*.py"), folder.parent / "report" / "tuning.py"]:
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
                 found |= {
@@ -367,7 +375,7 @@ def test_every_code_is_kebab_case_and_is_in_the_table_of_codes():
                     for n in ast.walk(node.args[0])
                     if isinstance(n, ast.Constant) and isinstance(n.value, str)
                 }
-    listed = re.findall(r"^([a-z]+(?:-[a-z]+)*)  ", messages.__doc__, flags=re.M)[1:]  # the head
+    listed = re.findall(r"^([a-z]+(?:-[a-z]+)*)  ", table, flags=re.M)[1:]  # the head
     assert found == set(listed) and len(listed) == len(set(listed))
 
 
@@ -599,7 +607,8 @@ def test_a_notebook_shows_a_result_as_tables_with_every_text_escaped(results, ki
 def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     results, kind, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(f"tuning.report.{kind}.figures", lambda *_: {})
+    module = {"tuning": "tuned.report"}.get(kind, kind)
+    monkeypatch.setattr(f"tuning.report.{module}.figures", lambda *_: {})
     with pytest.warns(UserWarning, match=r"rig\.toml is not written .*no name in a rig file"):
         names = {path.name for path in results[kind].save(tmp_path)}
     assert {"result.json", "report.html"} <= names and "rig.toml" not in names

@@ -177,10 +177,10 @@ def test_leaves_of_a_batch_have_its_axis_in_front():
 
 
 def test_noise_that_no_key_draws_is_no_answer():
-    """Outside a trace it is refused at the door; inside one the noise is not known there, and a run
-    without it looked like an answer.
+    """Outside a trace it is refused; inside one the noise is not known, and a run without it looked
+    like an answer.
     """
-    case, clock = presets.find("gouta2015/backstepping"), Clock(dt=0.5, duration=50.0)
+    case, clock = presets.find("gouta2022/pi"), Clock(dt=0.5, duration=50.0)
 
     def travel(noise, key=None):
         return evaluate(
@@ -189,7 +189,7 @@ def test_noise_that_no_key_draws_is_no_answer():
 
     def slope(noise, key=None):
         loop = with_values(case.loop, {"sensor.noise": noise})
-        return sensitivities(loop, clock, ("input_travel",), {"controller.k": 1.0}, key)[1][
+        return sensitivities(loop, clock, ("input_travel",), {"controller.Kc": 1.0}, key)[1][
             "input_travel"
         ]
 

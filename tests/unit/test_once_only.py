@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 from pathlib import Path
 
 import jax
@@ -40,8 +41,14 @@ def calls(tree):
     return found
 
 
+@functools.cache
+def calls_of(text):
+    """As `calls`, of the text of a module."""
+    return calls(ast.parse(text))
+
+
 def callers(name, texts):
-    return {path for path, text in texts.items() if name in calls(ast.parse(text))}
+    return {path for path, text in texts.items() if name in calls_of(text)}
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +78,7 @@ PLANT = dataclasses.replace(
 )  # so low that all tanks overflow
 
 
+@pytest.mark.slow_for("midpoint")
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 def test_a_rolled_sample_is_the_unrolled_one(integrator):
     """Levels and lost volumes agree, also for a number of substeps that is traced."""

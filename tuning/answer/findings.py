@@ -1,10 +1,28 @@
-"""The sentences about a default answer; imported by `recommend`."""
+"""The sentences about a default answer; imported by `recommend`.
+
+===============================  =============================================================
+code                             reported when
+===============================  =============================================================
+step-too-long                    the integration step is too long for the answer
+interrupted                      Ctrl-C ended the search
+limit-violated-out-of-sample     a limit is violated on the plants that judge the answer
+no-longer-follows                the answer leaves a setpoint that the start held
+not-converged                    searches disagree, and more was found without derivatives
+limit-not-certified              the safety filter is on, and a limit is not proved
+parameter-not-exercised          no run depends on the parameter
+parameter-at-bound               the value ended at an end of its range
+input-total-variation            the pumps move much more than before
+constraints-tightened            the search kept inside the limits, to hold on other plants
+noise-assumed                    the case states no sensor noise
+plants-assumed                   the case does not say what is uncertain
+limit-idle                       no plant comes near a limit on a level
+===============================  =============================================================
+"""
 
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from jaxtank import measures as ms
 from tuning.answer.answer import Answer
 from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
@@ -36,27 +54,21 @@ def _violated(result, answer) -> Found:
     if answer.after is None or answer.held:
         return
     held = answer.after.share_held()
-    worst = [r for r in answer.after.worst() if r["margin"] < 0]
-    parts = [_words(result, r) for r in worst[:4]]
+    worst = [row for row in result.constraints if row.margin < 0]
+    parts = [f"{c.name} is {c.amount()}, limit {c.limit:.4g} {c.unit}" for c in worst[:4]]
     if answer.after.failed.any():
         parts.append(f"{int(answer.after.failed.sum())} runs diverged")
     remedy = (
         "a limit without a certificate cannot be guaranteed: other --free ranges, or a limit that"
         " leaves more margin"
     )
-    if answer.setting.filter is None and any(r["limit"].measure == "max_level" for r in worst):
+    if answer.setting.filter is None and any(c.measure == "max_level" for c in worst):
         remedy = "--safety-filter keeps levels below their limits"
     yield Message(
         "limit-violated-out-of-sample",
         f"limits hold on {100 * held['share']:.3g} % of {held['samples']} plants"
         f" ({'; '.join(parts)}): {remedy}",
     )
-
-
-def _words(result, row):
-    limit = row["limit"]
-    unit = ms.unit(limit.measure, result.tuned.loop.units)
-    return f"{limit.label} up to {row['value']:.4g} {unit}, limit {limit.value:.4g} {unit}"
 
 
 def _lost(result, answer) -> Found:

@@ -71,7 +71,8 @@ class Subspace(Search):
 
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
         super().__init__(owner.problem, owner.last_finite, owner.report, owner.tolerance)
-        self.scale, self.owner, self.fixed, self.free = owner.scale, owner, z, np.asarray(free)
+        self.scale, self.owner, self.fixed = owner.scale, owner, z
+        self.free: np.ndarray = np.asarray(free)
 
     def full(self, z: Any) -> np.ndarray:
         """Return (P,) the point of the owner at z, values of the free parameters."""
@@ -88,7 +89,7 @@ class Subspace(Search):
                 found._replace(
                     z=z,
                     gradient=found.gradient[free],
-                    gauss_newton=found.gauss_newton[np.ix_(free, free)],
+                    gauss_newton=found.gauss_newton[free][:, free],
                     margin_slopes=found.margin_slopes[:, free],
                     run_slopes=found.run_slopes[:, free] if found.run_slopes.size else np.zeros(0),
                 )

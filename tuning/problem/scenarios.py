@@ -209,7 +209,11 @@ def with_noise_drawn(group: Group) -> Group:
     count = len(group.runs) * samples * int(np.size(np.asarray(sensor.noise)))
     if group.keys is None or samples > CHUNK or count > LARGEST_NOISE:
         return group
-    drawn = jax.jit(jax.vmap(lambda key: jnp.stack(sensor.draw(key, samples))))(group.keys)
+
+    def draw(key: Any) -> Any:
+        return jnp.stack(sensor.draw(key, samples))
+
+    drawn: Any = jax.jit(jax.vmap(draw))(group.keys)
     return group._replace(keys=drawn)
 
 

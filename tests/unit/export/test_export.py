@@ -117,7 +117,7 @@ class Compiled:
         return out
 
 
-@pytest.mark.slow_for("gouta2015/ngpc")
+@pytest.mark.slow_for("gouta2015/ngpc", "mirakhorli/smc")
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):

@@ -81,11 +81,12 @@ def test_a_mend_is_enough_on_other_plants_and_nine_tenths_of_it_are_not(found, k
     assert shares[0] >= 0.95 and shares[1] < 0.94
 
 
-def test_what_is_printed_is_what_is_applied(found):
+def test_what_is_printed_is_what_is_applied():
+    found = tuning.feasibility(CASE, samples=256)
     for mend in found.mends:
         words = [option.removeprefix("--set ").partition("=") for option in mend.options]
         by_hand = rig.set_values(CASE, {name: json.loads(value) for name, _, value in words})
-        applied, same = tuning.apply_mend(CASE, mend.what)
+        applied, same = tuning.apply_mend(CASE, mend.what, samples=256)
         assert same == mend and all(option in str(found) for option in mend.options)
         for name in mend.set:
             np.testing.assert_array_equal(
@@ -119,15 +120,15 @@ def test_a_weak_pump_is_found_and_mended():
         presets.find("calofir/backstepping"),
         {"actuator.high": 1.005 * pump_of("calofir/backstepping")},
     )
-    found = tuning.feasibility(case, {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=1024)
+    found = tuning.feasibility(case, {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=256)
     assert found.infeasible_for_any_controller > 0.3
     assert found.plateaus[-1].pump == 1 and found.plateaus[-1].tank is None
     mended, mend = tuning.apply_mend(
-        case, "pumps", {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=1024
+        case, "pumps", {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=256
     )
     assert list(mend.set) == ["actuator.high[0]"]
     again = tuning.feasibility(
-        mended, {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=1024, seed=3
+        mended, {"plant.drain": 0.1, "plant.pump_gain": 0.05}, samples=512, seed=3
     )
     assert again.infeasible_for_any_controller < 0.05 and again.mends == ()
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import jaxtank
+from jaxtank import presets, rig
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop.run import evaluate_for_reverse
 
@@ -253,6 +254,7 @@ def test_nan_is_reported_with_time_tank_and_parameters(gouta):
             call()
 
 
+@pytest.mark.slow
 def test_by_the_duration_of_ramps_setpoints_and_the_filter_of_the_reference(gouta):
     """Rates of the reference are fed forward; the ramps end between two samples."""
     values = {"clock.dt": 0.2, "clock.duration": 360.0, "reference.ramp": 61.03}
@@ -260,3 +262,15 @@ def test_by_the_duration_of_ramps_setpoints_and_the_filter_of_the_reference(gout
     names = ["reference.ramp", "reference.targets[2]", "reference.initial[1]"]
     found = agree(case, [*names, "reference.filter[0]"])
     assert np.all(np.abs(found) > 1e-6)
+
+
+def test_by_the_duration_of_a_ramp_and_its_target_through_a_run():
+    """Forward mode alone, of a small rig; the ramps end between two samples."""
+    case = presets.find("calofir/backstepping")
+    values = {"clock.dt": 2.0, "reference.ramp": 21.7, "reference.filter": 9.0}
+    case = rig.set_values(case, {**values, "clock.duration": 400.0})
+    names = ["reference.ramp", "reference.targets[0]", "reference.filter[0]"]
+    f, z = sloped(case, names, "rms_error_total")
+    forward = np.asarray(jax.jit(jax.jacfwd(f))(z))
+    assert np.all(np.abs(forward) > 1e-6)
+    np.testing.assert_allclose(forward, differences(f, z), rtol=1e-5)

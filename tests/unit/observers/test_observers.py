@@ -101,7 +101,7 @@ def test_on_a_linear_model_the_extended_filter_is_the_ordinary_one(measured):
     np.testing.assert_allclose(state.P, P, rtol=1e-10, atol=1e-14)
 
 
-@pytest.mark.slow_for("measured0")
+@pytest.mark.slow_for("measured0", "measured1")
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])
 def test_the_steady_gain_is_scipys(measured):
     Ad, _, drift, L = kalman(measured=measured).design(0.5)

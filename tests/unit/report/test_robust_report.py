@@ -4,10 +4,11 @@ was measured apart from what was expected.
 
 import numpy as np
 import pytest
+from helpers import RIGS
 
 import jaxtank
 import tuning
-from jaxtank import presets, rig
+from jaxtank import rig
 from jaxtank.presets import Scenario
 from tuning.report.tuned import report
 from tuning.search.robust import Certificate, certificate_messages
@@ -18,9 +19,11 @@ RESTS = "; the other rows: the case's own run, on its own plant"
 
 @pytest.fixture(scope="module")
 def case():
-    return rig.set_values(
-        presets.load("cascaded").cases["pi"], {"clock.dt": 4.0, "clock.duration": 400.0}
+    """The rig with one tank, a coarse clock, one uncertain parameter."""
+    one = rig.load(RIGS / "watertank.toml").replace(
+        uncertain={"plant.drain": 0.1}, objective={"rms_error_total": 1.0}
     )
+    return rig.set_values(one, {"clock.dt": 0.5, "clock.duration": 40.0})
 
 
 def row(page, name):
@@ -50,7 +53,7 @@ def test_scenarios_are_reported_as_such(case, weights, words):
     page = repr(
         tuning.tune(
             case,
-            free={"controller.Ti": (20.0, 2000.0, "log")},
+            free={"controller.Ti": (5.0, 100.0, "log")},
             scenarios=scenarios,
             validation=0,
             **SEARCH,
@@ -64,7 +67,7 @@ def test_a_single_run_needs_no_such_line(case):
     result = tuning.tune(case, nominal=True, validation=0, **SEARCH)
     page = repr(result)
     assert "other rows" not in page and "\nobjective: rms_error_total\n" in page
-    assert page.count("\nsettling_time: none, because") == 1 and "no validation" not in page
+    assert "none, because" not in page and "no validation" not in page
     before, after = ({**result.measures[side]} for side in ("before", "after"))
     before["settling_time"], after["settling_time"] = [np.inf], [-3.0]
     plain = result.case.replace(uncertain={}, covariance=None)

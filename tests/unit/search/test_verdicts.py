@@ -221,9 +221,13 @@ WATERTANK = str(RIGS / "watertank.toml")
 
 
 def told(capsys, *words):
-    """(exit code, JSON object or None, stderr) of a command with --json and --quiet."""
+    """(exit code, JSON object or None, stderr) of a command with --json and --quiet.
+
+    Of `tune`: with --nominal, unless --robust is among the words.
+    """
     capsys.readouterr()
-    code = main.main([*words, "--json", "--quiet"])
+    nominal = ["--nominal"] if words[0] == "tune" and "--robust" not in words else []
+    code = main.main([*words, *nominal, "--json", "--quiet"])
     out = capsys.readouterr()
     return code, json.loads(out.out) if out.out else None, out.err
 

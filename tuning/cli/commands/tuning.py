@@ -117,7 +117,7 @@ def _tune(args):
     finder, case, own = _finder(args, case, task)
     folder = args.resume or args.out
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
-    progress = Progress(unit, args.quiet)
+    progress = Progress(unit, args.quiet, None if args.robust or args.nominal else args)
     result = finder(
         case,
         **{k: v for k, v in task.items() if k != "scenarios"},
@@ -208,8 +208,8 @@ def _not_robust(args, case, task, choices, varied):
     return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
 
 
-def _is_nominal(args):
-    """Whether --nominal, or an option that goes with it alone, is given; the latter is noted."""
+def _goes_with_nominal(args):
+    """Return the first option given that goes with --nominal alone; None without."""
     given = {
         "--scenario": args.scenario,
         "--method": args.method != "auto",
@@ -219,16 +219,15 @@ def _is_nominal(args):
         "--tradeoff": args.tradeoff is not None,
         "--bound": args.bound,
     }
-    first = next((name for name, value in given.items() if value), None)
-    if first and not args.nominal and not args.quiet:
-        print(
-            f"jaxtank: note: {first} goes with --nominal: the optimum of the case as it is",
-            file=sys.stderr,
-        )
-    return args.nominal or first is not None
+    return next((name for name, value in given.items() if value), None)
 
 
-def _numbers(args):
+def _is_nominal(args):
+    """Return True if the optimum of the case as it is was asked for."""
+    return args.nominal or _goes_with_nominal(args) is not None
+
+
+def _numbers(args) -> dict[str, Any]:
     """Method and numbers of the search that are given: keywords of the finder."""
     given = {
         "batch": (args.batch, 1, 100_000),
@@ -237,7 +236,7 @@ def _numbers(args):
         "screening": (args.screening, 1, 65536),
         "iterations": (args.iterations, 1, 100_000),
     }
-    read = {
+    read: dict[str, Any] = {
         name: whole(f"--{name}", text, low, high)
         for name, (text, low, high) in given.items()
         if text is not None
@@ -291,12 +290,17 @@ class Progress(Interrupts):
     case has, and what follows it is compiled first.
     """
 
-    def __init__(self, unit, quiet):
+    def __init__(self, unit, quiet, args=None):
         super().__init__()
         self.unit, self.last, self.line = unit, None, Line(quiet)
+        option = None if args is None or quiet else _goes_with_nominal(args)
+        self.note = option and f"{option} goes with --nominal: the optimum of the case as it is"
         self.line.compiling("the simulation and its derivatives", 15)
 
     def __call__(self, event):
+        if self.note:  # not before the search begins: an error is one line
+            print(f"jaxtank: note: {self.note}", file=sys.stderr)
+            self.note = None
         if event["evaluations"] > 1:
             self.check()
         if not self.line.terminal and event["start"] == self.last:
