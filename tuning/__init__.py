@@ -15,6 +15,8 @@ TYPE_CHECKING = False  # for a checker it is True; `typing` would slow down --he
 if TYPE_CHECKING:
     from tuning.answer.answer import Answer as Answer
     from tuning.answer.default import tune as tune
+    from tuning.answer.judged import Judged as Judged
+    from tuning.answer.judged import validate as validate
     from tuning.falsification.result import Attack as Attack
     from tuning.falsification.study import attack as attack
     from tuning.feasible.result import Feasibility as Feasibility
@@ -98,6 +100,8 @@ _NAMES = {
     "sensitivity": "tuning.uncertainty.sensitivity_study",
     "tradeoff": "tuning.search.pareto",
     "Answer": "tuning.answer.answer",
+    "Judged": "tuning.answer.judged",
+    "validate": "tuning.answer.judged",
     "tune": "tuning.answer.default",
 }
 

@@ -169,7 +169,7 @@ def batch(rounds):
     halves = case.replace(clock=dataclasses.replace(case.clock, integrator="midpoint"))
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        function = ensemble.c_lanes(folder)
+        function = ensemble.c_batch(folder)
         if function is None:
             return rows
         for words, which, plants in (
@@ -182,7 +182,7 @@ def batch(rounds):
                 if plants > 256
                 else which
             )
-            a, b, between, apart = ensemble.beside_lanes(function, few, plants, max(rounds // 4, 3))
+            a, b, between, apart = ensemble.beside_batch(function, few, plants, max(rounds // 4, 3))
             assert apart < 1e-10, f"{words}: jaxtank and the C loop are {apart:.1e} cm apart"
             rival = f"vectorised C loop, {b:.1f} ns"
             rows.append(
@@ -218,8 +218,8 @@ sys.path.insert(0, ".")
 import ensemble
 from jaxtank import presets
 with tempfile.TemporaryDirectory() as folder:
-    function, case = ensemble.c_lanes(folder, single=True), presets.find("gouta2015/backstepping")
-    print(*ensemble.beside_lanes(function, case, 256, int(sys.argv[1]), single=True)[:3])
+    function, case = ensemble.c_batch(folder, single=True), presets.find("gouta2015/backstepping")
+    print(*ensemble.beside_batch(function, case, 256, int(sys.argv[1]), single=True)[:3])
 """
 
 

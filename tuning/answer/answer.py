@@ -8,8 +8,6 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from jaxtank.core.jsonable import clean
 from tuning.answer.judged import Judged
 from tuning.answer.setting import Setting
@@ -93,7 +91,7 @@ class Answer(Shown):
                 "objective": dict(self.setting.objective),
                 "safety_filter": self.setting.filter,
                 "nominal_error": dict(self.nominal),
-                "plants": {name: self._side(j) for name, j in sides.items() if j is not None},
+                "plants": {name: j.to_json() for name, j in sides.items() if j is not None},
                 "kept": [name for name, stays in self.kept.items() if stays],
                 "idle_limits_of_tanks": list(self.idle),
                 "limits_tightened": self.tightened,
@@ -101,15 +99,3 @@ class Answer(Shown):
                 "mended": None if self.mended is None else dict(self.mended.set),
             }
         )
-
-    def _side(self, judged):
-        good = ~judged.failed
-        return {
-            "samples": judged.samples,
-            "failed": int(judged.failed.sum()),
-            "objective": float(np.mean(judged.cost[good])) if good.any() else None,
-            "error": float(np.mean(judged.error[good])) if good.any() else None,
-            "highest_level": judged.level[good].max(axis=0).tolist() if good.any() else None,
-            "travel_percent": 100.0 * float(np.mean(judged.travel[good])) if good.any() else None,
-            "limits_held": float(judged.held.mean()),
-        }

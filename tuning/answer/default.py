@@ -17,7 +17,7 @@ from tuning.search.options import Solver, check_options, check_precision
 from tuning.search.result import TuningResult
 from tuning.storage.checkpoint import checkpoint_folder
 
-DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
+DEFAULT = {"starts": 4, "iterations": 40, "validation": FRESH}
 NOMINAL = {"starts": 8, "screening": 64, "iterations": 60, "validation": 64}
 
 
@@ -109,10 +109,15 @@ def tune(
     >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
     >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
     """
-    states = {"scenarios": scenarios, "choices": choices, "batch": batch, "tolerance": tolerance}
+    states = {
+        "scenarios": scenarios,
+        "choices": choices,
+        "batch": batch,
+        "tolerance": tolerance,
+        "screening": screening,
+    }
     asked = [n for n, v in states.items() if v is not None]
     asked += ["risk"] * (risk != "mean") + ["method"] * (method != "auto")
-    asked += ["screening"] * (screening is not None and nominal is False)
     if nominal is False and (asked or isinstance(case, Problem)):
         what = asked[0] if asked else "a Problem"
         raise InputError(f"{what}: belongs to the nominal optimum (nominal=True, --nominal)")

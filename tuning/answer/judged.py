@@ -4,12 +4,16 @@ Imported by `recommend` and by the report.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 
 from jaxtank import measures as ms
-from tuning.answer.setting import Setting, limited_levels, measured
+from jaxtank.case import Case
+from tuning.answer.setting import Setting, limited_levels, measured, setting_of
+from tuning.problem.result import Shown
+from tuning.search.options import check_options, check_precision
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson
 from tuning.uncertainty.study import ensemble
@@ -19,9 +23,9 @@ FRESH = 256
 """Plants on which an answer is judged."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Judged:
-    """One set of gains on N plants with noise, none of them used by the search.
+@dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
+class Judged(Shown):
+    """A case on N plants that are not exactly known, with sensor noise; made by `tuning.validate`.
 
     Parameters
     ----------
@@ -30,7 +34,7 @@ class Judged:
     travel : (N,) rms change of the inputs from sample to sample, as a share of their range [-].
     held : (N,) True where every limit holds; failed : (N,) True where the run diverged.
     infeasible : (N,) True where no controller can hold a setpoint; None where that is not known.
-    limits : the Limits; measures : {name: (N, ...)}.
+    limits : the Limits; measures : {name: (N, ...)}.  unit : of length.
     """
 
     cost: np.ndarray
@@ -42,6 +46,7 @@ class Judged:
     infeasible: np.ndarray | None
     limits: list[Any]
     measures: dict[str, np.ndarray]
+    unit: str
 
     @property
     def samples(self) -> int:
@@ -52,6 +57,40 @@ class Judged:
         """Return {"share", "interval95", "samples"} of the plants on which every limit holds."""
         held, n = int(self.held.sum()), self.samples
         return {"share": held / n, "interval95": clopper_pearson(held, n), "samples": n}
+
+    def to_json(self) -> dict[str, Any]:
+        """Return means over the plants whose run is finite, as plain numbers."""
+        good = ~self.failed
+        mean = lambda values: float(np.mean(values[good])) if good.any() else None
+        held = self.share_held()
+        return {
+            "samples": self.samples,
+            "failed": int(self.failed.sum()),
+            "objective": mean(self.cost),
+            "error": mean(self.error),
+            "highest_level": self.level[good].max(axis=0).tolist() if good.any() else None,
+            "travel_percent": mean(100.0 * self.travel),
+            "limits_held": held["share"],
+            "interval95": held["interval95"],
+        }
+
+    def __str__(self) -> str:
+        found = self.to_json()
+        low, high = (100.0 * end for end in found["interval95"])
+        numbers = {
+            "limits held": f"{100 * found['limits_held']:.3g} % of {self.samples} plants"
+            f" (95 % interval {low:.3g} to {high:.3g} %)"
+        }
+        if found["error"] is not None:
+            levels = ", ".join(f"{v:.4g}" for v in found["highest_level"])
+            numbers |= {
+                "mean total rms error": f"{found['error']:.4g} {self.unit}",
+                "highest levels": f"{levels} {self.unit}",
+                "inputs, sample to sample": f"{found['travel_percent']:.3g} % of their range",
+            }
+        if found["failed"]:
+            numbers["diverged"] = f"{found['failed']} plants"
+        return "\n".join(f"{name}: {text}" for name, text in numbers.items())
 
     def worst(self) -> list[dict[str, Any]]:
         """Return a dict for each limit: the Limit, its worst value, and on how many plants it is
@@ -71,6 +110,52 @@ class Judged:
                 }
             )
         return rows
+
+
+def validate(
+    case: Case,
+    samples: int = FRESH,
+    seed: int = 0,
+    *,
+    distributions: Mapping[str, Any] | None = None,
+    objective: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+) -> Judged:
+    """Return how a case does on plants that are not exactly known, with noise in the readings.
+
+    The noise is that of the case or its scenarios, else 0.1 % of the height of its tanks. The same
+    plants and noise for the same seed, and the plants of `tune` for its seed.
+
+    Parameters
+    ----------
+    case : the Case, with the gains and the safety filter that it has.
+    samples : number of plants.
+    seed : of plants and noise.
+    distributions : {name: distribution or share}; what the case calls uncertain where None, 5 % of
+        every flow where that is nothing.
+    objective : {measure: weight}; as in `tuning.tune`.
+    limits : {measure: value}; those of the case where None.
+
+    Returns
+    -------
+    Judged
+
+    Raises
+    ------
+    InputError : for a name or a value that cannot be used.
+
+    Examples
+    --------
+    >>> import jax, tuning
+    >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> found = tuning.validate(presets.find("cascaded/pi"), samples=8)
+    >>> found.share_held()["share"]
+    0.0
+    """
+    check_precision()
+    check_options(samples=samples)
+    return judge(setting_of(case, objective, limits, distributions), samples, seed)
 
 
 def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
@@ -106,6 +191,7 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         infeasible=found.infeasible,
         limits=found.limits,
         measures=by,
+        unit=unit_of(setting),
     )
 
 

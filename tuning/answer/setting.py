@@ -164,13 +164,13 @@ def setting_of(
         distributions = stated_of(distributions)
         case = _with_box(case, distributions)
     size, (noise, assumed), span = height(case), _noise(case), input_range(case)
-    stated = bool(case.uncertain) or case.covariance is not None
+    stated = is_stated(case)
     found = Setting(
         case=case,
         searched=_noisy(case, noise) if assumed or noise else case,
         objective=_price(case, size, span) if objective is None else rig.check_objective(objective),
         own_objective=objective is not None,
-        distributions=distributions or (spread_of(case) if stated else _default_box(case)),
+        distributions=distributions or plants_of(case),
         stated=stated or distributions is not None,
         noise=noise,
         assumed=assumed,
@@ -254,8 +254,19 @@ def _noisy(case, noise):
     return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(own.shape, noise)}))
 
 
-def _default_box(case):
-    """{name: share} of every flow of the plant; of the noise alone where it has no such names."""
+def is_stated(case: Case) -> bool:
+    """Return True if a case says what is uncertain."""
+    return bool(case.uncertain) or case.covariance is not None
+
+
+def plants_of(case: Case) -> dict[str, Any]:
+    """Return {name: distribution} of what a case calls uncertain.
+
+    Where it says nothing, of every flow of the plant within SPREAD; of the noise alone where the
+    plant has no such names.
+    """
+    if is_stated(case):
+        return spread_of(case)
     names = parameters(case.loop)
     found = {f"plant.{n}": SPREAD for n in FLOWS if np.size(names.get(f"plant.{n}", ()))}
     split = np.asarray(names.get("plant.split", 0.0))

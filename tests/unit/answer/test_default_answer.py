@@ -130,6 +130,15 @@ def test_a_judged_plant_is_the_run_alone(case):
         assert cost == pytest.approx(judged.cost[i], rel=1e-9)
 
 
+def test_validate_gives_what_judged_the_answer(result, case):
+    again = tuning.validate(result.tuned, 24)
+    assert np.array_equal(again.error, result.answer.after.error)
+    assert again.to_json() == result.to_json()["answer"]["plants"]["after"]
+    assert "limits held: 100 % of 24 plants" in str(again) and "<" in again._repr_html_()
+    with pytest.raises(InputError, match="samples = 0"):
+        tuning.validate(case, 0)
+
+
 class Bowl:
     """A problem with a known cost: (z0 - 0.8)^2 + worth (z1 - 0.2)^2 + 1, start at (0.3, 0.7)."""
 
