@@ -1,8 +1,9 @@
 """Execute the notebooks of this folder, top to bottom.
 
 python notebooks/run.py            in full, and keep the outputs in the files
-python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts); the files
-stay as they are python notebooks/run.py 05 08      those alone, by the beginnings of their names
+python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts), without
+                                   changing the files
+python notebooks/run.py 05 08      those alone, by the beginnings of their names
 """
 
 import re
@@ -31,6 +32,7 @@ FAST = {
         "heights": "[30.0, 33.0, 36.0]",
         "bound_heights": "[33.0]",
         "bound_iterations": "20",
+        "rigs, judged": "16, 32",
     },
     "04": {"dt": "0.05", "rates": "np.array([0.3, 3.0, 10.0])", "starts, screening": "1, 8"},
     "05": {"grid_points": "6", "kinds": '("hybrid",)', "screening": "2", "iterations": "2"},
@@ -41,8 +43,8 @@ FAST = {
         "orders": "(1, 4)",
     },
     "07": {"rigs": "64", "sobol_samples": "16"},
-    "08": {"starts, plants, fresh": "1, 8, 64"},
-    "09": {"starts": "2", "samples, fresh, iterations": "4, 16, 4"},
+    "08": {"starts, plants, new": "1, 8, 64", "judged": "32"},
+    "09": {"starts": "2", "samples, new, iterations": "4, 16, 4"},
     "10": {"dt": "0.1", "starts, screening, validation": "1, 8, 8", "rigs": "32"},
 }
 
@@ -86,7 +88,7 @@ def main():
             inject(notebook, FAST[path.name[:2]])
         NotebookClient(
             notebook,
-            timeout=600,
+            timeout=1800,
             kernel_name="python3",
             resources={"metadata": {"path": str(path.parent)}},
         ).execute()

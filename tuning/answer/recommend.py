@@ -40,15 +40,17 @@ TIGHTER = 1.2
 """Factor on the largest violation by which limits are tightened for the next search [-]."""
 
 
+LEVELS = ("max_level", "overflow_volume")
+"""Measures that a safety filter on levels keeps within their limits."""
+
+
 class _Task:
     """What was asked for, and what stays the same from one search to the next."""
 
-    def __init__(self, case, free, setting, plan, samples, progress):
-        self.case, self.free, self.plan, self.samples = case, free, plan, samples
-        self.setting, self.progress = setting, progress
-        self.may_filter = True
+    def __init__(self, free, plan, samples, progress):
+        self.free, self.plan, self.samples = free, plan, samples
+        self.progress, self.may_filter = progress, True
         self.cache: Any = None
-        self.simulations = 0
 
     def problem(self, setting: Setting, case: Case, limits: Mapping[str, Any]) -> Problem:
         """Return the problem of the search on the plants of a case."""
@@ -109,7 +111,7 @@ def recommend(
     if safety_filter is False:
         setting = setting.without_filter()
     plan = {"starts": starts, "iterations": iterations, "seed": seed}
-    task = _Task(case, free, setting, plan, max(validation, 1), progress)
+    task = _Task(free, plan, max(validation, 1), progress)
     Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed).start()
     if checkpoint is not None:
         what = _what(setting, free, plan, validation, safety_filter)
@@ -235,9 +237,6 @@ def _misled(cost, after: Judged):
 
 def _levels_broken(after):
     return any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
-
-
-LEVELS = ("max_level", "overflow_volume")
 
 
 def _violation(after, setting):

@@ -70,7 +70,8 @@ class Subspace(Search):
     """A search over some of the parameters, the others fixed; every point is one of the owner's."""
 
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
-        super().__init__(owner.problem, owner.last_finite, owner.report, owner.tolerance)
+        # its owner reports every evaluation already
+        super().__init__(owner.problem, owner.last_finite, lambda search: None, owner.tolerance)
         self.scale, self.owner, self.fixed = owner.scale, owner, z
         self.free: np.ndarray = np.asarray(free)
 

@@ -262,6 +262,12 @@ def test_options_of_the_nominal_optimum_imply_it_and_say_so(path):
     assert "validation" not in said.out and "what it gives" not in said.out
 
 
+def test_progress_is_a_line_for_each_local_search(path):
+    said = command("tune", path, "--validation", "8")
+    lines = [line for line in said.err.splitlines() if line.startswith("start ")]
+    assert 2 <= len(lines) <= 8
+
+
 def test_an_interrupted_search_gives_its_best_gains(case):
     def stop(event):
         if event["evaluations"] > 3:
