@@ -275,6 +275,6 @@ def test_an_interrupted_search_gives_its_best_gains(case):
 
     result = tuning.tune(case, validation=4, progress=stop)
     assert result.status == "interrupted" and result.answer.after is None
-    assert "not yet judged" in str(result)
+    assert "not yet validated" in str(result)
     assert result.objective["after"] != result.objective["after"]  # NaN: not known
     assert result.to_json()["objective"]["after"] is None
