@@ -16,6 +16,9 @@ from jaxtank.plants.tank_network import TankNetwork
 SIGMAS = 6.0
 """Standard deviations of the sensor noise in the band."""
 
+LEAST_SIGMAS = 5.0
+"""Standard deviations of the noise below which a band of the user's own is not relied on."""
+
 
 def box_of(plant: TankNetwork, widths: Mapping[str, ArrayLike]) -> tuple[TankNetwork, TankNetwork]:
     """Return the plants at the lower and the upper end of a box.
@@ -68,9 +71,24 @@ def widths_of(plant: TankNetwork, spread: Mapping[str, float]) -> dict[str, np.n
     return found
 
 
-def band_of(sensor: LevelSensor) -> np.ndarray:
+def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str) -> list[str]:
+    """Return for each tank why a band cannot be relied on, "" where it can.
+
+    band : (n,) largest difference of reading and level that is assumed [cm].
+    """
+    least = band_of(sensor, LEAST_SIGMAS) + 0.0 * band
+    words = (
+        f"below {LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
+    )
+    return [
+        f"noise band {b:.3g} {unit} {words}, {m:.3g} {unit}" if b < m * (1.0 - 1e-9) else ""
+        for b, m in zip(band, least)
+    ]
+
+
+def band_of(sensor: LevelSensor, sigmas: float = SIGMAS) -> np.ndarray:
     """Return the (n,) band of readings [cm]: 6 standard deviations, half an ADC step, offset."""
-    band = SIGMAS * np.asarray(sensor.noise, dtype=float)
+    band = sigmas * np.asarray(sensor.noise, dtype=float)
     if sensor.offset is not None:
         band = band + np.abs(np.asarray(sensor.offset, dtype=float))
     if sensor.bits:

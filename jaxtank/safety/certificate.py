@@ -17,7 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.box import band_of, box_of, top_of
+from jaxtank.safety.box import band_of, box_of, narrow_band, top_of
 from jaxtank.safety.conditions import failed_condition, gap_of, settle, theorem_of
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.limits import filled_levels, limits_for
@@ -161,6 +161,10 @@ def design(
     why, bottom = failed_low(setting, low, found, kappa, start)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
     rows = [_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n)]
+    rows = [
+        dataclasses.replace(row, certified=False, reason=narrow) if narrow else row
+        for row, narrow in zip(rows, narrow_band(sensor, band, plant.units[0]))
+    ]
     return SafetyFilter(
         least=least,
         most=most,

@@ -70,7 +70,7 @@ def test_a_controller_from_outside_runs_and_is_tuned_by_the_commands(added, tmp_
     added("a controller")
     assert main(["simulate", str(path), "--json"]) == 0
     capsys.readouterr()
-    assert main(["tune", str(path), "--json", "--quiet", "--starts", "1", "--validation", "0"]) == 0
+    assert main(["tune", str(path), "--json", "--quiet", "--starts", "1", "--nominal"]) == 0
     found = json.loads(capsys.readouterr().out)
     gain = found["parameters"]["controller.Kc[0]"]
     assert gain["unit"] == "V/V" and gain["before"] == 1.0 and gain["after"] != 1.0

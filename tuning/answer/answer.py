@@ -70,7 +70,8 @@ class Answer(Shown):
 
     def holds(self) -> dict[str, Any]:
         """Return the object `holds` of the JSON: share of plants, interval, certificates."""
-        found = None if self.after is None else self.after.share_held()
+        known = self.after is not None and bool(self.after.limits)
+        found = self.after.share_held() if self.after is not None and known else None
         return {
             "limits_on_validation": found["share"] if found else None,
             "interval95": found["interval95"] if found else None,

@@ -135,6 +135,11 @@ def tune(
     if own is DEFAULT:
         check_precision()
         check_options(**{n: common[n] for n in counts})
+        if common["validation"] == 0:
+            raise InputError(
+                "validation = 0: the default answer is judged on at least 1 plant (the nominal"
+                " optimum needs none)"
+            )
         assert isinstance(case, Case)
         own = dict(distributions=distributions, safety_filter=safety_filter, mend=mend)
         return recommend(case, **own, **common)

@@ -155,7 +155,7 @@ def _assumed(result, answer) -> Found:
 
 
 def _tightened(result, answer) -> Found:
-    if answer.tightened:
+    if answer.tightened and not all(answer.kept.values()):
         yield Message(
             "constraints-tightened",
             f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that the"

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from tuning.answer.setting import Setting, limited_levels, measured, setting_of
+from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.result import Shown
 from tuning.search.options import check_options, check_precision
 from tuning.uncertainty.result import Ensemble
@@ -188,11 +189,16 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         travel=np.sqrt(np.mean(changes**2, axis=1)),
         held=~(found.failed | np.any(past, axis=0)) if past else ~found.failed,
         failed=found.failed,
-        infeasible=found.infeasible,
+        infeasible=_unreachable(setting.case, found.values),
         limits=found.limits,
         measures=by,
         unit=unit_of(setting),
     )
+
+
+def _unreachable(case, values):
+    """Return (N,) True where no controller can hold a setpoint; None where that is not known."""
+    return ~can_follow(case, values, case.limits) if can_judge(case) else None
 
 
 def matters(setting: Setting, judged: Judged, near: float) -> np.ndarray:

@@ -111,7 +111,7 @@ def recommend(
     if safety_filter is False:
         setting = setting.without_filter()
     plan = {"starts": starts, "iterations": iterations, "seed": seed}
-    task = _Task(free, plan, max(validation, 1), progress)
+    task = _Task(free, plan, validation, progress)
     Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed).start()
     if checkpoint is not None:
         what = _what(setting, free, plan, validation, safety_filter)
@@ -172,7 +172,7 @@ def _attempts(task, setting, near):
     search is judged on plants of its own.
     """
     coarse, tightened, limits = True, 0.0, _searched_limits(setting, near)
-    after = attempt = None
+    last = None
     for attempt in range(ATTEMPTS):
         case = setting.coarse() if coarse else setting.searched
         problem, found = task.problem(setting, case, _tightened(limits, tightened)), Found()
@@ -183,8 +183,12 @@ def _attempts(task, setting, near):
             tuned = _at(setting, _values(problem, found))
             after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
         except KeyboardInterrupt:
-            found.interrupted = True
-            return setting, found, problem, None, tightened, 0
+            if last is None:
+                found.interrupted = True
+                return setting, found, problem, None, tightened, 0
+            last[1].interrupted = True
+            return last
+        last = (setting, found, problem, after, tightened, attempt)
         if coarse and case is not setting.searched and _misled(found.point.cost, after):
             coarse = False
         elif after.held.all():
@@ -197,7 +201,7 @@ def _attempts(task, setting, near):
             tightened = TIGHTER * _violation(after, setting) + tightened
         else:
             break
-    return setting, found, problem, after, tightened, attempt
+    return last
 
 
 def _searched_limits(setting, near):
@@ -220,6 +224,8 @@ def _values(problem, found):
     if found.point is None:
         return own
     values = problem.values(found.point.z)
+    if np.array_equal(found.point.z, problem.start()):
+        values = dict(own)
     if found.kept is not None:
         stays = found.kept if found.idle is None else found.kept | found.idle
         values |= {n: own[n] for n, same in zip(own, stays) if same}

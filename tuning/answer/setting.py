@@ -123,6 +123,7 @@ class Setting:
         # both follow from the noise, which the case as given may not state
         own = {"band": np.asarray(found.band).tolist(), "rate": float(np.max(found.rate))}
         searched = self.searched.without_safety_filter().with_safety_filter(**given)
+        rows = tuple(_for_these_plants(self, row) for row in rows)
         return self.replace(searched=searched, filter=own | given, certificates=rows)
 
     def without_filter(self) -> "Setting":
@@ -138,6 +139,29 @@ class Setting:
         if self.filter is None:
             return found.without_safety_filter()
         return found.without_safety_filter().with_safety_filter(**self.filter)
+
+
+def _for_these_plants(setting, row):
+    """Return a certificate, not certified where it is not of these plants or of a higher limit."""
+    limit = limited_levels(setting.case)[row.tank]
+    why = ""
+    if row.certified and not _in_box(setting):
+        why = "the plants asked for reach beyond the tolerances of the filter"
+    elif row.certified and row.limit > limit * (1.0 + 1e-9):
+        why = f"the limit of the filter, {row.limit:.4g}, is above that on max_level, {limit:.4g}"
+    return dataclasses.replace(row, certified=False, reason=why) if why else row
+
+
+def _in_box(setting):
+    """Return True if every plant lies within the tolerances of a filter of the case."""
+    if setting.case.safety and "widths" in setting.case.safety:
+        return False
+    if not is_stated(setting.case):
+        return True  # 5 % of every flow, here and there
+    found = setting.distributions
+    return setting.case.covariance is None and all(
+        isinstance(d, Uniform) and d.relative is not None for d in found.values()
+    )
 
 
 def _lowered(case, rows, near):

@@ -256,7 +256,10 @@ def apply_mend(
         raise InputError(
             f"{case.name}: no change of its {kind} alone was found to be enough{needed}{others}"
         )
-    return rig.set_values(case, with_models(case.loop, mend.set)), mend
+    found = rig.set_values(case, with_models(case.loop, mend.set))
+    if found.loop.safety_filter is not None:  # designed anew for what has changed
+        found = found.without_safety_filter().with_safety_filter(**dict(case.safety or {}))
+    return found, mend
 
 
 def _others(found):

@@ -99,6 +99,38 @@ def test_shares_that_are_asked_for_are_the_box_of_the_filter(case):
     assert np.allclose(least.pump_gain, own.pump_gain)
 
 
+@pytest.mark.parametrize(
+    "changes, distributions, why",
+    [
+        ({}, {"plant.drain": tuning.Normal(relative=0.1)}, "reach beyond the tolerances"),
+        ({}, {"plant.drain": tuning.Uniform(low=1.8, high=2.5)}, "reach beyond the tolerances"),
+        ({"limit": [2.9]}, None, "is above that on max_level, 2.7"),
+        ({"band": [0.012]}, None, "below 5 standard deviations of the noise"),
+    ],
+)
+def test_nothing_is_called_proved_that_the_filter_does_not_cover(case, changes, distributions, why):
+    case = case.with_safety_filter(**changes) if changes else case
+    found = setting_of(case, distributions=distributions)
+    found = found if changes else found.with_filter()
+    (row,) = found.certificates
+    assert not row.certified and why in row.reason
+    assert dict(found.limits) == {"max_level": 2.7}  # still to be kept by the search
+
+
+def test_a_share_is_that_of_every_flow_where_a_rig_names_nothing(path, tmp_path):
+    (tmp_path / "bare.toml").write_text(TANK.replace("uncertain = {", "# {"))
+    words = ["--validation", "8", "--starts", "1", "--iterations", "1", "--json", "--quiet"]
+    said = command("tune", str(tmp_path / "bare.toml"), "--spread", "0.2", *words)
+    assert set(said.json["validation"]["spread"].values()) == {0.2}
+
+
+def test_plants_that_cannot_follow_are_those_of_the_limits(case):
+    """2.6 cm is the highest setpoint: 2.5 cm as the limit leaves no plant that can follow."""
+    limited = setting_of(case, limits={"max_level": 2.5})
+    assert judge(limited, 4, 0).infeasible.all()
+    assert not judge(setting_of(case), 4, 0).infeasible.any()
+
+
 def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     setting = setting_of(case)
     plants = setting.plants(setting.searched, 3, 0)
@@ -248,6 +280,7 @@ def test_a_limit_that_no_gain_can_hold_is_said_and_ends_with_4(path):
         ({"free": {"controller.Kc": (2.0, 3.0)}}, "starts outside its range"),
         ({"limits": {"max_levl": 3.0}}, "nearest: max_level"),
         ({"starts": 0}, "starts = 0"),
+        ({"validation": 0}, "validation = 0: the default answer is judged"),
     ],
 )
 def test_input_that_cannot_be_used_is_an_error_before_anything_runs(case, options, words):
@@ -266,6 +299,12 @@ def test_progress_is_a_line_for_each_local_search(path):
     said = command("tune", path, "--validation", "8")
     lines = [line for line in said.err.splitlines() if line.startswith("start ")]
     assert 2 <= len(lines) <= 8
+
+
+@pytest.mark.parametrize("other", ["--robust=mean", "--nominal"])
+def test_a_mend_belongs_to_the_default_answer(path, other):
+    said = command("tune", path, "--mend", "rims", other)
+    assert said.code == 2 and "--mend" in said.err and said.err.count("\n") == 1
 
 
 def test_an_interrupted_search_gives_its_best_gains(case):

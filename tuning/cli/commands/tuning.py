@@ -181,13 +181,14 @@ def _check_tradeoff(case, task, sweep):
 
 def _finder(args, case, task):
     """(function that tunes, case, its own keywords): `tune`, or `tune_robust` under --robust."""
-    choices, varied = choices_of(args), distributions_of(args, case)
+    choices, varied = choices_of(args), _varied(args, case)
     if args.robust is None:
         if any(value is not None for value in (args.samples, args.fresh, args.back_off)):
             raise InputError("--samples, --fresh and --back-off of tune belong to --robust")
         return _not_robust(args, case, task, choices, varied)
-    if args.nominal:
-        raise InputError("--nominal and --robust: give one of them")
+    for name, given in (("--nominal", args.nominal), ("--mend", args.mend is not None)):
+        if given:
+            raise InputError(f"{name} and --robust: give one of them")
     if choices or task["scenarios"]:
         raise InputError(
             "--robust makes scenarios of its own: no --choose and no --scenario but none beside it"
@@ -210,6 +211,17 @@ def _finder(args, case, task):
     )
 
 
+def _varied(args, case):
+    """{name: distribution} of --vary or --spread, None without."""
+    from tuning.answer.setting import is_stated, plants_of
+
+    if args.robust is None and (args.spread or args.vary) and _is_nominal(args):
+        raise InputError("--spread and --vary of tune belong to the default answer and to --robust")
+    if args.spread is None or args.robust is not None or is_stated(case):
+        return distributions_of(args, case)
+    return distributions_of(args, case.replace(uncertain=dict.fromkeys(plants_of(case), 0.05)))
+
+
 def _not_robust(args, case, task, choices, varied):
     """`_finder` without --robust: the default answer, or the optimum of the case as it is."""
     if not _is_nominal(args):
@@ -219,8 +231,6 @@ def _not_robust(args, case, task, choices, varied):
         return finder, case, own
     if args.mend is not None:
         raise InputError("--mend belongs to the default answer, not to --nominal")
-    if varied is not None:
-        raise InputError("--spread and --vary of tune belong to the default answer and to --robust")
     from tuning.search.tuner import tune as finder
 
     return finder, case, {"choices": choices, "scenarios": task["scenarios"]}
