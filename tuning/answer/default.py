@@ -115,35 +115,18 @@ def tune(
     >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
     >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
     """
-    states = {
-        "scenarios": scenarios,
-        "choices": choices,
-        "batch": batch,
-        "tolerance": tolerance,
-        "screening": screening,
-    }
-    asked = [n for n, v in states.items() if v is not None]
-    asked += ["risk"] * (risk != "mean") + ["method"] * (method != "auto")
-    if nominal is False and (asked or isinstance(case, Problem)):
-        what = asked[0] if asked else "a Problem"
-        raise InputError(f"{what}: belongs to the nominal optimum (nominal=True, --nominal)")
-    common: dict[str, Any] = dict(free=free, objective=objective, limits=limits, seed=seed)
-    common |= dict(checkpoint=checkpoint_folder(checkpoint, log=log), resume=resume)
+    asked = _asked(method, scenarios, risk, choices, batch, tolerance, screening)
+    _check_nominal(nominal, asked, case)
     own = NOMINAL if nominal or asked or isinstance(case, Problem) else DEFAULT
     counts = {"starts": starts, "iterations": iterations, "validation": validation}
+    common: dict[str, Any] = dict(free=free, objective=objective, limits=limits, seed=seed)
+    common |= dict(checkpoint=checkpoint_folder(checkpoint, log=log), resume=resume)
     common |= {n: own[n] if v is None else v for n, v in counts.items()} | {"progress": progress}
-    if own is DEFAULT:
-        check_precision()
-        check_options(**{n: common[n] for n in counts})
-        if common["validation"] == 0:
-            raise InputError(
-                "validation = 0: the default answer is judged on at least 1 plant (the nominal"
-                " optimum needs none)"
-            )
-        assert isinstance(case, Case)
-        own = dict(distributions=distributions, safety_filter=safety_filter, mend=mend)
-        return recommend(case, **own, **common)
     given = {"distributions": distributions, "safety_filter": safety_filter, "mend": mend}
+    if own is DEFAULT:
+        assert isinstance(case, Case)
+        _check_default(**{n: common[n] for n in counts})
+        return recommend(case, **given, **common)
     for name, value in given.items():
         if value is not None:
             raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
@@ -158,3 +141,34 @@ def tune(
         tolerance=tolerance,
         **common,
     )
+
+
+def _asked(method, scenarios, risk, choices, batch, tolerance, screening):
+    """Return the names of what is given and belongs to the nominal optimum."""
+    states = {
+        "scenarios": scenarios,
+        "choices": choices,
+        "batch": batch,
+        "tolerance": tolerance,
+        "screening": screening,
+    }
+    found = [name for name, value in states.items() if value is not None]
+    return found + ["risk"] * (risk != "mean") + ["method"] * (method != "auto")
+
+
+def _check_nominal(nominal, asked, case):
+    """Raise InputError where nominal=False contradicts what is given."""
+    if nominal is False and (asked or isinstance(case, Problem)):
+        what = asked[0] if asked else "a Problem"
+        raise InputError(f"{what}: belongs to the nominal optimum (nominal=True, --nominal)")
+
+
+def _check_default(**counts):
+    """Raise InputError for numbers that the default answer cannot use."""
+    check_precision()
+    check_options(**counts)
+    if counts["validation"] == 0:
+        raise InputError(
+            "validation = 0: the default answer is judged on at least 1 plant (the nominal optimum"
+            " needs none)"
+        )
