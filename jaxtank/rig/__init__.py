@@ -78,7 +78,7 @@ from jaxtank.case import Case
 from jaxtank.rig.components import register
 from jaxtank.rig.lines import toml
 from jaxtank.rig.read import filtered, from_table, load, loads, open_case
-from jaxtank.rig.validate import (
+from jaxtank.rig.validation import (
     check,
     check_free,
     check_limits,

@@ -14,7 +14,7 @@ from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.files import read_text
 from jaxtank.core.text import shortened
-from jaxtank.rig import components, network, signals, validate
+from jaxtank.rig import components, network, signals, validation
 from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
 from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
@@ -195,7 +195,7 @@ def from_table(table: Mapping[str, Any]) -> Case:
     for name, read in TUNING.items():
         if name in table:
             case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
-    return filtered(validate.check(case))
+    return filtered(validation.check(case))
 
 
 def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | None = None) -> Case:
@@ -230,17 +230,17 @@ def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | No
 
 
 TUNING = {
-    "limits": lambda case, table: validate.check_limits(case.loop, table),
-    "objective": lambda case, table: validate.check_objective(table),
-    "free": lambda case, table: validate.free_of(case.loop, table),
-    "uncertain": lambda case, table: validate.check_uncertain(case.loop, table),
-    "covariance": lambda case, table: validate.check_covariance(case.loop, table),
-    "log": lambda case, table: validate.check_log(case.loop.plant, table),
+    "limits": lambda case, table: validation.check_limits(case.loop, table),
+    "objective": lambda case, table: validation.check_objective(table),
+    "free": lambda case, table: validation.free_of(case.loop, table),
+    "uncertain": lambda case, table: validation.check_uncertain(case.loop, table),
+    "covariance": lambda case, table: validation.check_covariance(case.loop, table),
+    "log": lambda case, table: validation.check_log(case.loop.plant, table),
     "safety_filter": lambda case, table: read_entry(
         SECTIONS["safety_filter"], table, sizes_of(case.loop.plant)
     ),
     "scenario": lambda case, table: tuple(
-        validate.scenario(case, entry, i) for i, entry in enumerate(table)
+        validation.scenario(case, entry, i) for i, entry in enumerate(table)
     ),
 }
 """{section: function (case, its table)} of what is read after the values are set."""

@@ -17,7 +17,7 @@ from jaxtank.rig.lines import Block, Line, block, lines_of, terse, toml
 from jaxtank.rig.preset_match import origin_of, structures
 from jaxtank.rig.read import start_of
 from jaxtank.rig.schema import SECTIONS, targets
-from jaxtank.rig.validate import unreachable
+from jaxtank.rig.validation import unreachable
 from jaxtank.rig.values import MODELS
 from jaxtank.signals.base import Sum
 

@@ -150,8 +150,7 @@ def design(
     )
     setting = setting._replace(predicted=predict * _predicted(setting))
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
-    wanted = _wanted(setting, plant, limit)
-    check_low(low, wanted, plant.units[0])
+    check_low(low, wanted := _wanted(setting, plant, limit), plant.units[0])
     prove = lambda kappa: _proved(setting, plant, wanted, kappa, bound, start)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold, BELOW_BOUND * bound) if rate is None else float(rate)
     found = prove(kappa)
@@ -160,11 +159,8 @@ def design(
         found = prove(kappa)
     why, bottom = failed_low(setting, low, found, kappa, start)
     nominal = jax.tree.map(_plain, rates_of(plant, plant, inflow, 0.0))
-    rows = [_row(setting, nominal, found, i, wanted, kappa, bound) for i in range(n)]
-    rows = [
-        dataclasses.replace(row, certified=False, reason=narrow) if narrow else row
-        for row, narrow in zip(rows, narrow_band(sensor, band, plant.units[0]))
-    ]
+    narrow = narrow_band(sensor, band, plant.units[0])
+    rows = [_row(setting, nominal, found, i, wanted, kappa, bound, narrow[i]) for i in range(n)]
     return SafetyFilter(
         least=least,
         most=most,
@@ -274,16 +270,17 @@ def _held(setting, found):
     )
 
 
-def _row(setting, nominal, found, tank, wanted, kappa, bound):
-    """Return the TankCertificate of one tank."""
+def _row(setting, nominal, found, tank, wanted, kappa, bound, narrow):
+    """Return the TankCertificate of one tank; narrow : why its band is not relied on, or ""."""
+    why = found.reasons[tank] or narrow
     idle, spare = found.idle[tank], setting.spare[tank]
     limit = (wanted if idle else found.heights)[tank]
     theorem = "Theorem 2" if found.slopes[tank] > 0.0 else theorem_of(setting, tank)
     return TankCertificate(
         tank=tank,
         limit=float(limit + spare),
-        certified=not found.reasons[tank],
-        reason=found.reasons[tank] or ("full pumps stay below" if idle else theorem),
+        certified=not why,
+        reason=why or ("full pumps stay below" if idle else theorem),
         rate=kappa,
         rate_bound=bound,
         gap=0.0 if idle else gap_of(setting, nominal, tank, kappa, limit, found.reach),
