@@ -72,12 +72,15 @@ READS = {
     "CDLL",
 }
 MADE = {
+    ("tuning.answer.answer", "_lines", "import_module"): "its own report, by a constant name",
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
+    ("jaxtank.core.installed", "imported", "load"): "an entry point of an installed package that a"
+    " rig file names as the kind of a component; nothing from a path",
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",

@@ -631,7 +631,7 @@ def test_a_case_whose_name_is_none_of_the_language_asks_for_one(name):
     case = dataclasses.replace(presets.find("cascaded/pi"), name=name)
     with pytest.raises(InputError, match=f"'{name}' gives no name for the function; --name NAME"):
         export(case)
-    assert "void law_step(" in export(case, name="controller")
+    assert "void controller_step(" in export(case, name="controller")
 
 
 @pytest.mark.parametrize("name", ["é", "a²", "a b", "1a", "a;b", "a*/", ""])
