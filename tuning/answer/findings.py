@@ -47,9 +47,8 @@ def findings_of(result: TuningResult, steps: Iterable[str] = ()) -> tuple[Messag
 
 def _interrupted(result, answer) -> Found:
     if result.status == Status.INTERRUPTED:
-        yield Message(
-            "interrupted", "interrupted: these are the best gains so far, not yet validated"
-        )
+        words = "not yet validated" if answer.after is None else "of the search before this one"
+        yield Message("interrupted", f"interrupted: these are the best gains so far, {words}")
 
 
 def _violated(result, answer) -> Found:

@@ -192,7 +192,8 @@ def _screened_again(result: TuningResult) -> Found:
         yield Message(
             "screened-at-true-step",
             f"{count(redone, 'screening point')} diverged at the coarse step of the screening and"
-            " were run again at the case's own step: no action is needed",
+            f" {'was' if redone == 1 else 'were'} run again at the case's own step: no action is"
+            " needed",
         )
 
 

@@ -59,35 +59,40 @@ def lines(result):
     return [*parts_of(result), "\n".join(f"- {m.text}" for m in result.messages)]
 
 
-def page_of(result, drawn, command=None):
-    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the
-    line that made it.
-    """
+def _facts(result, broken):
+    """(name, number) of what stands at the top of the page; broken : limits that are violated."""
     unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
-    broken, (rig, _) = [c for c in result.constraints if c["margin"] < 0], rig_of(result)
-    limits = (
-        f"{len(result.constraints) - len(broken)} of {len(result.constraints)} hold"
-        if result.constraints
-        else "none"
-    )
+    held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
     facts = [
         ("objective before", f"{number(before)} {unit}".strip()),
         ("objective after", f"{number(after)} {unit}".strip()),
-        ("limits", limits),
+        ("limits", held if result.constraints else "none"),
         ("gains tuned", str(sum(p["exercised"] for p in result.parameters.values()))),
         ("simulations", str(result.evaluations["simulations"])),
         ("time", f"{result.wall_s:.1f} s"),
     ]
-    if np.isfinite(before) and before and not broken:
+    kept = result.validation["limits_held"] if result.validation else {}
+    if result.answer and result.constraints and None not in kept.values():
+        shares = " -> ".join(f"{100 * share:.3g} %" for share in kept.values())
+        facts[2] = ("plants that keep every limit", shares)
+    elif np.isfinite(before) and before and not broken:
         facts.insert(2, ("change", f"{100 * (after / before - 1):+.3g} %"))
+    return facts
+
+
+def page_of(result, drawn, command=None):
+    """The page report.html of a tuning result, with `drawn`, the figures of `figures`; command: the
+    line that made it.
+    """
+    broken, (rig, _) = [c for c in result.constraints if c["margin"] < 0], rig_of(result)
     return html.document(
         f"{result.tuned.name}: tuned",
         result.case.title,
         result.status.replace("_", " ")
         + ("; every limit holds" if result.constraints and not broken else ""),
         result.success,
-        facts,
+        _facts(result, len(broken)),
         [m.text for m in result.messages],
         html.drawings(drawn, CAPTIONS),
         (answer.parts_of(result) if result.answer else parts_of(result))[1:],
