@@ -4,6 +4,7 @@
     python tests/benchmarks/default_answers.py 'gouta2015*'       # some, by name
     python tests/benchmarks/default_answers.py --plants 512       # fewer plants
     python tests/benchmarks/default_answers.py --again 'cascaded*'  # also: tuned again, other draws
+    python tests/benchmarks/default_answers.py --offsets 'gouta2015*'  # also: where plants rest
 
 Of each case: total rms error of its own run; its mean on --plants (4,096) plants; how many of
 --attacked (10,000) random plants and 256 corners of the box pass a limit, noise on; rms change of
@@ -16,8 +17,10 @@ import fnmatch
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.case import Scenario
@@ -25,6 +28,9 @@ from jaxtank.core.tree import get_value, with_values
 from tuning.answer.judged import judge
 from tuning.answer.setting import limited_levels
 from tuning.problem.scenarios import groups_of, runs_of, values_of
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.plateaus import plateaus_of
+from tuning.uncertainty.sampling import probabilities
 
 ROWS = {
     "gouta2015/backstepping": {},
@@ -38,7 +44,7 @@ ROWS = {
     "mirakhorli/sfc": {},
 }
 
-CORNERS = 256
+CORNERS, OFFSETS = 256, 64
 
 
 def main():
@@ -50,6 +56,7 @@ def main():
     parser.add_argument("--attacked", type=int, default=10_000)
     parser.add_argument("--true-step", action="store_true")
     parser.add_argument("--again", action="store_true")
+    parser.add_argument("--offsets", action="store_true")
     asked = parser.parse_args()
     for name, values in ROWS.items():
         if any(fnmatch.fnmatch(name, pattern) for pattern in asked.names):
@@ -69,6 +76,8 @@ def _row(name, values, asked):
     sides = {"before": result.case, "after": result.tuned}
     for side, one in sides.items():
         print(f"    {side}: {_side(answer.setting, one, asked)}")
+    if asked.offsets:
+        _offsets(answer.setting, result.tuned)
     if asked.again:
         _again(case, result, asked)
 
@@ -86,6 +95,34 @@ def _side(setting, one, asked):
         f"error {np.mean(found.error[~found.failed]):.4g}, cost {np.mean(found.cost):.4g}, change"
         f" {100 * np.mean(found.travel):.3g} %, past a limit {past} of {asked.attacked + CORNERS},"
         f" highest {np.round(spilt.level.max(axis=0), 3)}"
+    )
+
+
+def _offsets(setting, case):
+    """How far plants that cannot follow rest from their setpoints, and the least that algebra
+    allows: rms over outputs and plateaus, mean of the plants.
+    """
+    here = _coarse(setting.replace(searched=case))
+    draws = Draws(here.loop, setting.distributions)
+    values = draws.values(probabilities("random", draws.dimensions, OFFSETS, 81))
+    least = tuning.least_offset(case, values, setting.case.limits)
+    plateaus = plateaus_of(case)
+    ramp = float(case.loop.reference.ramp)
+    ends = [p.time_s - ramp for p in plateaus[1:]] + [case.clock.duration]
+    rows = [round(end / here.clock.dt) - 1 for end in ends]
+    outputs = list(case.loop.plant.outputs)
+
+    def one(values):
+        run = jaxtank.simulate(with_values(here.loop, values), here.clock)
+        return jnp.stack([run.x[row] for row in rows])[:, jnp.array(outputs)]
+
+    levels = np.asarray(jax.jit(jax.vmap(one))(values))
+    found = np.sqrt(np.mean((levels - np.array([p.values for p in plateaus])) ** 2, axis=(1, 2)))
+    cannot = least > 1e-6
+    print(
+        f"    {int(cannot.sum())} of {OFFSETS} plants cannot follow: they rest"
+        f" {found[cannot].mean():.3g} off, at least {least[cannot].mean():.3g}; the others"
+        f" {found[~cannot].mean():.3g}"
     )
 
 
