@@ -1,4 +1,4 @@
-"""The default answer of `tune`: noise, many plants, priced inputs, a safety filter, fresh plants.
+"""The default answer of `tune`: noise, many plants, priced inputs, a safety filter, a validation.
 
 Imported by `default`.
 """
@@ -62,8 +62,8 @@ class _Task:
             found.cache, self.cache = self.cache, None
         return found
 
-    def report(self, problem):
-        """Return what a Search calls after every evaluation."""
+    def report(self, problem, unit):
+        """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""
 
         def report(search):
             if self.progress is None or not search.history:
@@ -71,6 +71,7 @@ class _Task:
             best, last = search.best, search.history[-1]
             self.progress(
                 {
+                    "unit": unit,
                     "start": search.start,
                     "starts": self.plan["starts"],
                     "evaluations": len(search.history),
@@ -165,7 +166,7 @@ def _own(problem):
 
 
 def _attempts(task, setting, near):
-    """Search until the answer holds on fresh plants, or nothing is left to try.
+    """Search until the answer holds on validation plants, or nothing is left to try.
 
     Returns the setting, the Found and the Problem of the last search, its Judged (None where the
     search was interrupted), the share by which limits were tightened, and its number, from 0: every
@@ -177,7 +178,7 @@ def _attempts(task, setting, near):
         case = setting.coarse() if coarse else setting.searched
         problem, found = task.problem(setting, case, _tightened(limits, tightened)), Found()
         try:
-            search_from(problem, task.plan, task.report(problem), found)
+            search_from(problem, task.plan, task.report(problem, setting.cost_unit), found)
             if found.point is None:
                 return setting, found, problem, None, tightened, 0
             tuned = _at(setting, _values(problem, found))
@@ -246,7 +247,7 @@ def _levels_broken(after):
 
 
 def _violation(after, setting):
-    """Return the largest violation on the fresh plants, as a share of its limit [-]."""
+    """Return the largest violation on the validation plants, as a share of its limit [-]."""
     rows = [r for r in after.worst() if r["margin"] < 0 and abs(r["limit"].value) > 0]
     shares = [-r["margin"] / abs(r["limit"].value) for r in rows]
     return min(max(shares, default=0.0), 0.5)

@@ -86,6 +86,11 @@ class Setting:
         proved = bool(self.certificates) and all(row.certified for row in self.certificates)
         return {m: v for m, v in self.case.limits.items() if not (proved and m == "max_level")}
 
+    @property
+    def cost_unit(self) -> str | None:
+        """Unit of the default cost, whose price has one of its own; None for a user's objective."""
+        return None if self.own_objective else f"{self.case.loop.units[0]}^2"
+
     def coarse(self) -> Case:
         """Return the searched case at ten times its step, or itself where that cannot be."""
         clock = screening_clock(self.searched.clock)

@@ -299,7 +299,7 @@ def test_options_of_the_nominal_optimum_imply_it_and_say_so(path):
 def test_progress_is_a_line_for_each_local_search(path):
     said = command("tune", path, "--validation", "8")
     lines = [line for line in said.err.splitlines() if line.startswith("start ")]
-    assert 2 <= len(lines) <= 8
+    assert 2 <= len(lines) <= 8 and all("cm^2" in line for line in lines)
 
 
 @pytest.mark.parametrize("other", ["--robust=mean", "--nominal"])

@@ -335,7 +335,8 @@ class Progress(Interrupts):
             return
         self.last = event["start"]
         breaks = " (breaks a limit)" if event["best_violation"] else ""
-        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {self.unit}{breaks}"
+        unit = event.get("unit") or self.unit
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {unit}{breaks}"
         self.line.show(
             f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
             f" {event['evaluations']}  best {best}"
