@@ -66,32 +66,7 @@ def tune(
     screening at a coarse step, local searches with exact derivatives from distinct starts, a last
     search from the best point, and a validation set.
 
-    Parameters
-    ----------
-    case : Case, or a Problem of one, which has free, objective, limits, scenarios and risk of its
-        own (and its seed, unless another is given).
-    method : solver options (SQP, TRF, LBFGS, Adam), or "auto" (trf where the cost is a sum of
-        squares and no limit is active, else slsqp), "slsqp", "trf", "coarse-trf" (trf at a tenth
-        of the samples, then at all), "lbfgs" or "adam".
-    free : {name: (low, high) or Free}; the case's own where None, as for the next three.
-    objective : {measure: weight}.
-    limits : {measure: value}, {} for none; every limit must hold in every scenario.
-    scenarios : tuple of Scenario, () for the case's own run alone.
-    risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
-    choices : {static name: [values]}, each combination of which is tuned, the best taken.
-    starts : local searches, from the case's own values and the best distinct screened points (and
-        one more from the best screened point, where it is better than what they reached).
-    seed : of the Sobol points and the sensor noise.
-    screening : number of Sobol points.
-    iterations : of each local search.
-    batch : scenarios drawn for each step of adam, None for all.
-    validation : runs on perturbed plants with other noise, 0 for none.
-    tolerance : change of the objective, as a share of its first value, below which a search under
-        limits has converged; None for 1e-8 and a last search to 1e-12.
-    checkpoint : folder for the log of evaluations, with which a killed search is continued by
-        resume=True, to the same bits; `log` is its former name.
-    progress : called with a dict after every evaluation. Ctrl-C ends the search with the best
-        point so far.
+    Parameters, of which every one is of the nominal optimum, and their units as in `tuning.tune`.
 
     Returns
     -------
