@@ -131,10 +131,12 @@ class SafetyFilter:
         if self.kept:
             least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(floors, low, dead))
         most = tuple(cap + zone for cap, zone in zip(caps, dead))
+        least, most = materialised((least, most))
         if self.allocate and actuator.pumps == 2:
             u = allocate(command, materialised(metric or self._metric(y)), least, most)
         else:
             u = tuple(clip(command[j], least[j], most[j]) for j in pumps)
+        u = materialised(u)
         free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
         acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
         if not shared and not together:
@@ -182,6 +184,7 @@ class SafetyFilter:
             )
             for i in range(n)
         ]
+        above = materialised(above)
         rows, below = [], lowest(self, r, y, hold, low) if self.predicted else []
         for i in self.held:
             if r.pumps[i]:
