@@ -9,7 +9,6 @@ Imported by `search`, and as `tuning.Problem`.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
@@ -221,7 +220,7 @@ class Problem:
         return costs, margins
 
     def _screen(self, zs: Floats, coarse: bool) -> tuple[Floats, Floats]:
-        points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
+        points = {b.name: np.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
         tables, broken = [self._per_run() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
             clock = sc.screening_clock(group.clock) if coarse else group.clock
@@ -309,7 +308,7 @@ class Problem:
         table, slopes, matrices, diverged = *(self._per_run() for _ in range(3)), False
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
-            diverged = diverged or bool(np.any(broken))
+            diverged = diverged or bool(np.asarray(broken).any())
             for j, i in enumerate(group.runs):
                 table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
                 slopes[i] = {
