@@ -7,7 +7,7 @@ import pytest
 
 import jaxtank
 import tuning
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.case import Free
 from jaxtank.core.errors import InputError
 from tuning.problem import problem as objective
@@ -52,7 +52,7 @@ def test_backstepping_on_tracking_error_alone(gouta):
 
 @pytest.fixture(scope="module")
 def limited(gouta):
-    return tuning.tune(gouta("backstepping"), nominal=True)
+    return tuning.tune(gouta("backstepping"), nominal=True, starts=2, screening=32)
 
 
 def test_backstepping_under_the_rims(gouta, limited):
@@ -238,6 +238,7 @@ def test_results_stay_in_the_box_and_are_never_worse_than_the_start(gouta):
     assert all(np.all((np.array(h[3]) >= 0) & (np.array(h[3]) <= 1)) for h in result.history)
 
 
+@pytest.mark.slow  # of a smaller rig: test_verdicts.py, what is missed is told in full
 def test_limits_that_cannot_be_met_are_told(gouta):
     result = quick(gouta, limits={"max_level": 5.0}, starts=1)
     assert not result.success and result.status == "infeasible"
@@ -283,8 +284,9 @@ def test_the_weight_of_the_objective_does_not_move_the_answer(gouta):
     )
 
 
-def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged(gouta):
-    result = quick(gouta, "ngpc", method="adam", limits={}, iterations=2, screening=2, starts=1)
+def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged():
+    few = {"iterations": 2, "screening": 2, "starts": 1, "validation": 0}
+    result = tuning.tune(presets.find("cascaded/pi"), "adam", nominal=True, limits={}, **few)
     assert result.status == "not_converged" and not result.success
 
 
