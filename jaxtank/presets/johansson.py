@@ -33,17 +33,18 @@ TIMES = {"minimum": (50.0, 650.0, 1250.0), "non-minimum": (100.0, 5100.0, 10100.
 NAMES = {"minimum": "pi-minimum", "non-minimum": "pi-nonminimum"}
 
 TUNABLE = {
-    "pi-minimum": {
-        "controller.Kc": Free(0.05, 20.0),
-        "controller.Ti": Free(5.0, 1000.0),
-        "controller.Tt": Free(2.0, 1000.0),
-    },
-    # the gain of loop 2 is negative: no logarithmic scale
+    "controller.Kc[0]": Free(0.01, 20.0),
+    "controller.Kc[1]": Free(-0.6, 20.0, "linear"),  # of both signs: notes S4
+    "controller.Ti": Free(5.0, 3000.0),
+    "controller.Tt": Free(2.0, 3000.0),
+}
+# where each case is tuned: a gain keeps its sign
+FREE = {
+    "pi-minimum": {"controller.Kc": Free(0.05, 20.0), "controller.Ti": Free(5.0, 1000.0)},
     "pi-nonminimum": {
         "controller.Kc[0]": Free(0.01, 5.0),
         "controller.Kc[1]": Free(-0.6, -0.002, "linear"),
         "controller.Ti": Free(10.0, 3000.0),
-        "controller.Tt": Free(10.0, 3000.0),
     },
 }
 
@@ -61,9 +62,9 @@ _LEVELS = (
 def _published():
     found = {
         "plant.area": Published((28.0, 32.0, 28.0, 32.0), "cm^2", "Table I"),
-        "plant.drain": Published((0.071, 0.057), "cm^2", "Table I"),
+        "plant.drain": Published((0.071, 0.057, 0.0, 0.0), "cm^2", "Table I"),
         "plant.orifice": Published((0.071, 0.057), "cm^2", "Table I"),
-        "sensor, volts of a centimetre": Published(VOLTS_PER_CM, "V/cm", "Table I"),
+        "sensor.gain": Published(1.0 / VOLTS_PER_CM, "cm/V", "Table I: 0.50 V/cm"),
     }
     for phase, (levels, times, zeros, gain) in POINTS.items():
         pump, split, volts = JOHANSSON[phase]
@@ -171,7 +172,13 @@ def measured(run):
         point = levels if phase == "minimum" else at
         zeros = sorted(float(z.real) for z in transmission_zeros(*linearise(plant, point, volts)))
         slowest[phase] = zeros[-1]
+        controller = run(NAMES[phase])[0].loop.controller
         found |= {
+            f"pump gains, {phase} phase": tuple(map(float, plant.pump_gain)),
+            f"splits, {phase} phase": tuple(map(float, plant.split)),
+            f"voltages, {phase} phase": tuple(map(float, controller.bias)),
+            f"gains K, {phase} phase": tuple(map(float, controller.Kc / VOLTS_PER_CM)),
+            f"integral times, {phase} phase": tuple(map(float, controller.Ti)),
             f"levels, {phase} phase": tuple(map(float, at)),
             f"time constants, {phase} phase": tuple(map(float, -1.0 / np.diag(A))),
             f"zeros, {phase} phase": tuple(zeros),
@@ -197,11 +204,7 @@ def preset():
             loop=loop(phase),
             clock=Clock(dt=1.0, duration=TIMES[phase][2]),
             limits={"max_level": "rim"},
-            free={
-                p: f
-                for p, f in TUNABLE[name].items()
-                if p.startswith(("controller.K", "controller.Ti"))
-            },
+            free=FREE[name],
             objective={"rms_error_total": 1.0},
         )
         for phase, name in NAMES.items()
@@ -216,7 +219,7 @@ def preset():
         cases=cases,
         published=PUBLISHED,
         measured=measured,
-        tunable=TUNABLE["pi-minimum"],
+        tunable=TUNABLE,
         uncertain=UNCERTAIN,
         departures=DEPARTURES,
     )
