@@ -108,9 +108,7 @@ def program_of(loop: ClosedLoop, clock: Clock, name: str) -> str:
     return f"every {spec.save_every}: {lowered.as_text()}"
 
 
-def _read_by(
-    loop: ClosedLoop, clock: Clock, name: str, spec: ms.RunFunction
-) -> tuple[str, ...]:
+def _read_by(loop: ClosedLoop, clock: Clock, name: str, spec: ms.RunFunction) -> tuple[str, ...]:
     """Return the measures that a function reads, found by tracing it without a run."""
     served = _served(loop)
     read: dict[str, None] = {}

@@ -20,16 +20,7 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.loop.closed_loop import (
-    ClosedLoop,
-    Inputs,
-    initial,
-    inputs,
-    is_broken,
-    keyed,
-    run_of,
-    zero_of,
-)
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.saved_rows import simulate_compiled

@@ -19,11 +19,7 @@ from jaxtank.xla.jit import compiled
 
 @compiled("clock", "save_every", "checkpoint")
 def simulate_compiled(
-    loop: ClosedLoop,
-    clock: Clock,
-    key: jax.Array | None,
-    save_every: int,
-    checkpoint: bool = False,
+    loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int, checkpoint: bool = False
 ) -> tuple[Trajectory, jax.Array]:
     """Return (Trajectory, True if the run diverged), unchecked.
 

@@ -20,6 +20,7 @@ from jaxtank.measures.registry import (
     squares,
     times,
     unit,
+    unreadable,
 )
 from jaxtank.measures.running import needs, read, residual_weights, residuals, start, update
 
@@ -50,5 +51,6 @@ __all__ = [
     "start",
     "times",
     "unit",
+    "unreadable",
     "update",
 ]

@@ -22,6 +22,9 @@ GROUP = "jaxtank.measures"
 """Entry points by which an installed package names its measures: name = "package.module:object", a
 Measure, or a function as in `from_function`.
 """
+_COMPILED: dict[str, Measure] = {}
+"""What was last registered by each name, also of measures that were deleted since."""
+
 _NAME = re.compile(r"[A-Za-z]\w*")
 _SIZES: dict[str, Callable[[Any], int]] = {
     "run": lambda plant: 1,
@@ -87,13 +90,13 @@ def register(
         _check_name("accumulator", a, _BUILT_IN_ACCUMULATORS)
         _check_accumulator(a, accumulator)
     _check_measure(name, measure, {**ACCUMULATORS, **own})
-    replaced = MEASURES.get(name, measure) != measure or any(
+    replaced = _COMPILED.get(name, measure) != measure or any(
         ACCUMULATORS.get(a, accumulator) is not accumulator for a, accumulator in own.items()
     )
     if replaced:
         jax.clear_caches()  # compiled runs know a measure by its name
     ACCUMULATORS.update(own)
-    MEASURES[name] = measure
+    MEASURES[name] = _COMPILED[name] = measure
     return measure
 
 
@@ -156,6 +159,14 @@ def check_names(names: Iterable[str]) -> None:
             raise unknown("measure", name, [*MEASURES, *points])
         found = imported(points[name])
         register(name, found if isinstance(found, Measure) else from_function(found))
+
+
+def unreadable(names: Iterable[str]) -> tuple[str, ...]:
+    """Return those of `names` that a rig file cannot name: functions of this process alone, which
+    no installed package has.
+    """
+    own = functions(names)
+    return tuple(own.keys() - installed(GROUP).keys()) if own else ()
 
 
 def squares() -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Objectives and constraints that are functions of a user's own; each becomes a measure by its name.
+"""Objectives and constraints that are functions of a user's own: each becomes a named measure.
 
 Imported by `problem` and by what takes an objective or limits: `search`, `answer`.
 """
