@@ -64,8 +64,7 @@ def sensitivities_compiled(
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
     """Return what `loop.run.sensitivities` returns, unchecked.
 
-    order, values: names and values of the parameters; batched: whether this will be one of several
-    runs side by side.
+    order, values: of the parameters; batched: whether this will be one of several runs.
     """
     if ms.functions(names):
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
