@@ -62,9 +62,8 @@ def sensitivities_compiled(
     squares: tuple[tuple[str, float], ...] = (("mean_square_error", 1.0),),
     batched: bool = False,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """Return what `loop.run.sensitivities` returns, unchecked.
-
-    order, values: of the parameters; batched: whether this will be one of several runs.
+    """Return what `loop.run.sensitivities` returns, unchecked, for parameters `order` at `values`;
+    batched: whether this will be one of several runs side by side.
     """
     if ms.functions(names):
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
@@ -109,8 +108,8 @@ def sensitivities_compiled(
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    carry = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
-    floats, dfloats, rest, matrix = carry
+    last = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
+    floats, dfloats, rest, matrix = last
 
     def finish(floats: Any, theta: Any) -> Any:
         return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None
