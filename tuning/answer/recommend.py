@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.loop import run as lp
