@@ -38,9 +38,9 @@ TOLERANCE = 1e-4
 PROBES = 3
 """Differential evolutions that are tried, at most, until one finds nothing better."""
 
-LINE = 32
-"""Values that are tried between a gain's best and its first value; also the screened points, so
-that one compiled program serves both."""
+LINE, STRIDE = 32, 8
+"""Values that are tried between a gain's best and its first value, also the screened points; and
+how many of these values are run at once."""
 
 MANY = 4
 """Number of parameters from which Gauss-Newton is tried before limits are considered."""
@@ -126,6 +126,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     """
     first = problem.start()
     reference = problem.point(first)
+    problem.check_slopes(reference)
     search = found.search = Search(problem, reference, report, TOLERANCE)
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])
@@ -258,15 +259,19 @@ def _without(search, trial, first, z, iterations):
 def _towards(search, i, first, z, ceiling, allowed, good):
     """Return z with gain i moved towards its first value as far as the cost stays below `ceiling`.
 
-    All LINE values are run at once: the program of the screening, without derivatives.
+    LINE values at most, a few at once, up to the first that does not fit; without derivatives.
     """
     shares = np.arange(1, LINE + 1) / (LINE + 1)
     line = np.repeat(z[None], LINE, axis=0)
     line[:, i] = z[i] + shares * (first[i] - z[i])
-    costs, margins = search.problem.screen(line)
-    shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
-    fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
-    count = LINE if fits.all() else int(np.argmin(fits))  # all before the first that does not fit
+    count = 0
+    for some in np.split(line, LINE // STRIDE):
+        costs, margins = search.problem.screen(some)
+        shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
+        count += STRIDE if fits.all() else int(np.argmin(fits))
+        if not fits.all():
+            break
     for k in range(count - 1, -1, -1):
         if good(search.point(line[k])):
             return line[k]

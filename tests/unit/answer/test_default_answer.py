@@ -202,6 +202,9 @@ class Bowl:
             (2 * w * d)[None],
         )
 
+    def check_slopes(self, point):
+        assert np.isfinite(point.gradient).all()
+
     def screen(self, zs, coarse=False):
         return np.array([self.point(z).cost for z in zs]), np.zeros((len(zs), 0))
 

@@ -66,7 +66,10 @@ def _add_problem(one):
         'a run to tune for, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value'
         " of the case); replaces those of the case; none: the case's own run",
     )
-    text = "a static number or text to try the values of"
+    text = (
+        "a static number or text to try the values of; controller.kind=pid,lqi: the controllers"
+        " that a rig file may name, each with gains and ranges of its own"
+    )
     repeatable(one, "--choose", "NAME=V1,V2", text)
     text = "validation plants (default 256; --nominal: 64, 0 for none)"
     option(one, "--validation", "N", text)
