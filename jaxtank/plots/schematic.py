@@ -262,12 +262,7 @@ def _spout(ax, x, y):
 def _pipe(ax, left, right, y):
     for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
         ax.plot(
-            [left, right],
-            [y, y],
-            color=colour,
-            linewidth=wide,
-            solid_capstyle="butt",
-            zorder=layer,
+            [left, right], [y, y], color=colour, linewidth=wide, solid_capstyle="butt", zorder=layer
         )
 
 

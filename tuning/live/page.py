@@ -18,7 +18,7 @@ import numpy as np
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import parameters
+from jaxtank.core.tree import get_value, parameters
 from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
 from tuning.live.engine import describe, engine
@@ -150,16 +150,10 @@ def _uncertain(case):
             found[name] = float(one.relative)
         elif hasattr(one, "covariance"):
             for own, variance in zip(one.names, np.diagonal(np.asarray(one.covariance))):
-                value = _entries(case, {own: 0.0}) and _value(case, own)
+                value = float(np.ravel(get_value(case.loop, own))[0])
                 if value:
                     found[own] = float(np.sqrt(3.0 * variance) / abs(value))
     return found
-
-
-def _value(case, name):
-    from jaxtank.core.tree import get_value
-
-    return float(np.ravel(get_value(case.loop, name))[0])
 
 
 def assemble(engine_text, info, data):
@@ -189,8 +183,8 @@ def assemble(engine_text, info, data):
     policy = "; ".join(
         [
             "default-src 'none'",
-            f"script-src {' '.join(map(_hash, run))}",
-            f"style-src {_hash(_style())}",
+            f"script-src {' '.join(map(source_of, run))}",
+            f"style-src {source_of(_style())}",
             "worker-src blob:",
             "img-src data:",
             "base-uri 'none'",
@@ -207,7 +201,10 @@ def assemble(engine_text, info, data):
             f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
             _read("page.html"),
             f'<script type="application/json" id="data">{_json(data)}</script>',
-            *(f'<script type="text/plain" id="{n}">{_packed(t)}</script>' for n, t in packed.items()),
+            *(
+                f'<script type="text/plain" id="{n}">{_packed(t)}</script>'
+                for n, t in packed.items()
+            ),
             f"<script>{_page_script()}</script>",
             "</body>\n</html>\n",
         ]
@@ -220,8 +217,14 @@ def _packed(text):
     return base64.b64encode(deflate.compress(text.encode()) + deflate.flush()).decode()
 
 
-def _hash(text):
-    """The source expression of a content-security policy that allows exactly this text."""
+def source_of(text):
+    """Return the source of a content-security policy that allows exactly this script or style.
+
+    Examples
+    --------
+    >>> source_of("")
+    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='"
+    """
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return f"'sha256-{digest}'"
 
