@@ -29,6 +29,7 @@ const state = {
 };
 const view = { from: 0, to: info.duration, at: info.duration };
 const pins = []; // {name, run}
+const framed = window !== window.parent; // in a report or a notebook
 let current = null, bands = null, worker = null, charts = [], rig = null;
 
 // --- what a run takes -------------------------------------------------------------------------
@@ -63,7 +64,7 @@ function run(values = effective(), every = 1) {
 
 // --- one run per frame ------------------------------------------------------------------------
 
-let asked = false, every = 1, resting = 0;
+let asked = false, stride = 1, resting = 0;
 
 function touch() {
   if (asked) return;
@@ -71,27 +72,37 @@ function touch() {
   requestAnimationFrame(() => {
     asked = false;
     const start = performance.now();
-    const found = run(effective(), every);
-    if (found) current = found;
-    const took = performance.now() - start;
-    if (took > 24 && info.samples > 6000 && every === 1) every = Math.ceil(info.samples / 6000);
+    current = run(effective(), stride) ?? current;
+    // a long run keeps fewer samples while sliders move
+    if (stride === 1 && performance.now() - start > 24) stride = Math.ceil(info.samples / 6000);
     show();
     clearTimeout(resting);
     resting = setTimeout(settle, 250);
   });
 }
 
-// once nothing moves: every sample, the band of plants, and words for a screen reader
+// once nothing moves: every sample, the address, words for a screen reader, the band of plants
 function settle() {
-  if (every > 1) {
-    current = run(effective(), 1) ?? current;
-    every = 1;
+  if (stride > 1) {
+    current = run() ?? current;
     show();
-    every = current && current.slow ? every : 1;
   }
-  history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
-  $("verdict").setAttribute("aria-live", "polite");
+  if (!framed) history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
+  describe();
   if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants();
+}
+
+function describe() {
+  if (!current) return;
+  charts.forEach(({ spec, describe: put }) => {
+    const values = current[spec.what][spec.index], [low, high] = extent([values]);
+    const limits = spec.limits.map(({ words }) => words).filter(Boolean).join(", ");
+    put(`${spec.title}: from ${shown(low)} to ${shown(high)}, ${shown(values[values.length - 1])} at the end${
+      limits ? `; ${limits}` : ""}`);
+  });
+  const first = info.measures.find((m) => m.name in info.objective.measures);
+  const words = first ? `${first.name} ${cells(current.measures[first.name])} ${first.unit}` : "";
+  $("spoken").textContent = [$("verdict").textContent, words].filter(Boolean).join(". ");
 }
 
 function changed() {
@@ -639,6 +650,7 @@ function start() {
   $("title").textContent = info.title;
   document.title = `${info.case}: live`;
   $("foot").textContent = `jaxtank ${data.version}: ${info.samples} samples of ${shown(info.dt)} s. Charts by uPlot (MIT).`;
+  $("link").hidden = framed;
   if (!info.filter.present) $("filter-row").hidden = true;
   if (data.rig) rig = makeRig($("rig"), data.rig, info);
   else $("rig").parentNode.hidden = true;

@@ -1,7 +1,7 @@
 """One HTML page of a result, and the HTML that a notebook shows; imported by the reports.
 
 A page is self-contained: pictures are inside as SVG, nothing is fetched from the network, there is
-no script, and every text of the user is escaped.
+no script but that of the live page in its frame, and every text of the user is escaped.
 """
 
 import html
@@ -81,6 +81,7 @@ def document(
     command=None,
     provenance=None,
     files=None,
+    live="",
 ):
     """Return the whole page as text; the same arguments give the same bytes.
 
@@ -106,6 +107,8 @@ def document(
         {name: value}.
     files : dict or None
         {name: text} to be unfolded.
+    live : str
+        Element with the live page (`tuning.report.panel`), "" for none.
     """
     body = [f"<h1>{escape(title)}</h1>", f"<p>{escape(subtitle)}</p>" if subtitle else ""]
     body.append(f'<p class="status{"" if good else " warn"}">{escape(status)}</p>')
@@ -113,6 +116,7 @@ def document(
         cells = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
         body.append(f'<dl class="facts">{"".join(cells)}</dl>')
     body += _chapter("In words", [_list(sentences)] if sentences else [])
+    body += _chapter("Move its parameters", [live] if live else [])
     body += _chapter("Pictures", [_figure(*picture) for picture in pictures])
     body += _chapter("Numbers", [_part(p) for p in _grouped(parts)])
     for name, text in (files or {}).items():

@@ -1,1 +1,0 @@
-function tune() { throw new Error("stub"); }
