@@ -1,0 +1,173 @@
+"""The engine of a live page: a closed loop as JavaScript text, and what is known of it as data.
+
+The text needs no page: node runs it too. Imported by the page.
+"""
+
+import json
+from importlib import resources
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxtank import measures as ms
+from jaxtank.case import Case, Free
+from jaxtank.export.whole_loop import WholeLoop, whole_loop
+from tuning.live.printed import Printed, maths
+from tuning.live.sliders import leaf_of
+from tuning.problem.limits import resolve_limits
+
+ROWS = 1200
+"""Samples that a page keeps of a run unless it asks for more, about."""
+
+
+def engine(case: Case, filtered: Case | None = None) -> str:
+    """Return a text of JavaScript that defines makeEngine(), which runs the loop of a case.
+
+    Parameters
+    ----------
+    case : Case
+    filtered : Case, optional
+        The same with its safety filter, to be switched on and off.
+
+    Raises
+    ------
+    InputError
+        For a loop that has no code of single samples (`jaxtank.export.whole_loop`).
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> "function makeEngine()" in engine(presets.find("cascaded/pi"))
+    True
+    """
+    with jax.enable_x64(True):
+        loops = [whole_loop(one) for one in (case, filtered) if one is not None]
+        facts = _facts(case, loops)
+    programs = ",\n".join(_program(loop) for loop in loops)
+    driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
+    return "\n".join(
+        [
+            "const makeEngine=(()=>{",
+            '"use strict";',
+            f"const info={data(facts)};",
+            f"const programs=[{programs}];",
+            driver,
+            "return makeEngine;",
+            "})();",
+        ]
+    )
+
+
+def describe(case: Case, filtered: Case | None = None) -> dict[str, Any]:
+    """Return what is known of the loop of a case beside its code, as a JSON object.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> describe(presets.find("cascaded/pi"))["pumps"][0]["upper"]
+    10.0
+    """
+    with jax.enable_x64(True):
+        return _facts(case, [whole_loop(one) for one in (case, filtered) if one is not None])
+
+
+def data(value: Any) -> str:
+    """Return a JSON object as JavaScript that may stand in a page: no text of it ends a script.
+
+    Examples
+    --------
+    >>> data({"a": "</script>"})
+    '{"a":"\\\\u003c/script>"}'
+    """
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
+
+
+def _program(loop: WholeLoop) -> str:
+    """One loop as an object of its functions."""
+    printed = Printed(loop)
+    body = "\n".join([*printed.helpers(), printed.text()])
+    measures = [[m, _size(m, found)] for m, found in loop.measures.items()]
+    columns = [[f, n] for f, n in printed.columns().items()]
+    facts = f"streams:{len(printed.streams())},columns:{data(columns)},measures:{data(measures)}"
+    return f"(()=>{{{maths(body)}\n{body}\nreturn{{lead,signals,run,read,{facts}}};}})()"
+
+
+def _size(measure, entries):
+    """Number of entries of a measure, None for one number of the run."""
+    return None if ms.MEASURES[measure].per == "run" else len(entries)
+
+
+def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
+    loop, clock, plant = case.loop, case.clock, case.loop.plant
+    length, drive = loop.units
+    leaves = [leaf_of(case, name, index) for name, index in loops[0].leaves]
+    tanks = list((case.names or {}).get("tank", ())) or [""] * plant.tanks
+    pumps = list((case.names or {}).get("pump", ())) or [""] * plant.pumps
+    rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
+    return {
+        "case": case.name,
+        "title": case.title,
+        "units": {"length": length, "drive": drive},
+        "dt": clock.dt,
+        "duration": clock.duration,
+        "samples": clock.samples,
+        "save_every_default": max(1, clock.samples // ROWS),
+        "tanks": [
+            {"name": tanks[i] or f"tank {i + 1}", "rim": v if np.isfinite(v) else None}
+            for i, v in enumerate(rims)
+        ],
+        "outputs": [int(i) for i in plant.outputs],
+        "pumps": [
+            {
+                "name": pumps[j] or f"pump {j + 1}",
+                "lower": float(loop.actuator.low[j]),
+                "upper": float(loop.actuator.high[j]),
+            }
+            for j in range(plant.pumps)
+        ],
+        "leaves": leaves,
+        "measures": [_measure(case, m, loops[0].measures[m]) for m in loops[0].measures],
+        "limits": _limits(case),
+        "free": list(case.free),
+        "bounds": {name: list(Free(*spec)[:2]) for name, spec in case.free.items()},
+        "objective": {
+            "text": " + ".join(f"{w:g} {m}" for m, w in case.objective.items()),
+            "measures": {m: float(w) for m, w in case.objective.items()},
+        },
+        "filter": {
+            "present": len(loops) > 1 or loop.safety_filter is not None,
+            "default_on": loop.safety_filter is not None,
+        },
+        "noise": [i for i, leaf in enumerate(leaves) if leaf["name"].startswith("sensor.noise")],
+    }
+
+
+def _measure(case, name, entries):
+    spec = ms.MEASURES[name]
+    return {
+        "name": name,
+        "unit": ms.unit(name, case.loop.units),
+        "size": _size(name, entries),
+        "doc": spec.doc,
+        "sense": spec.sense,
+    }
+
+
+def _limits(case):
+    found = []
+    for limit in resolve_limits(case):
+        one = ms.MEASURES[limit.measure].per == "run"
+        side = "upper" if limit.sign > 0 else "lower"
+        found.append(
+            {
+                "measure": limit.measure,
+                "entry": None if one else limit.index,
+                "upper": None,
+                "lower": None,
+                "unit": ms.unit(limit.measure, case.loop.units),
+                side: float(limit.value),
+            }
+        )
+    return found
