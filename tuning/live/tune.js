@@ -1,0 +1,1 @@
+function tune() { throw new Error("no tuner yet"); }
