@@ -19,13 +19,18 @@ for (const id of ["engine", "uplot"]) {
 const data = JSON.parse($("data").textContent);
 const engine = makeEngine();
 const { info } = engine;
-const leaves = info.leaves, byName = new Map(leaves.map((leaf) => [leaf.name, leaf]));
+info.filter.default_on = data.filter;
+const leaves = info.leaves.filter((leaf) => leaf.value !== null);
+const byName = new Map(leaves.map((leaf) => [leaf.name, leaf]));
+// the entries of what is named, as controller.Kc or plant.rim[0]
+const entriesOf = (names) => leaves.map((leaf) => leaf.name)
+  .filter((name) => names.includes(name) || names.includes(name.split("[")[0]));
 const state = {
   values: {}, // {leaf: number} that differ from the case
-  filter: info.filter.present ? Boolean(info.filter.default_on) : null,
+  filter: info.filter.present ? data.filter : null,
   seed: 0,
   broken: new Set(), // names of data.breaks
-  free: new Set(info.free),
+  free: new Set(entriesOf(info.free)),
 };
 const view = { from: 0, to: info.duration, at: info.duration };
 const pins = []; // {name, run}
@@ -501,8 +506,22 @@ function download(name, text) {
   setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
 
-const csv = () => csvOf(run(effective(), info.save_every_default), info.units);
-const command = () => engine.command(effective(), options());
+const csv = () => csvOf(run(effective(), data.every), info.units);
+
+// the command that repeats the run: all that differs from the preset or the file
+function command() {
+  const now = effective(), words = ["jaxtank simulate", data.case];
+  for (const leaf of leaves) {
+    const value = now[leaf.name] ?? leaf.value;
+    if (value !== (data.origin[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name}=${value}`);
+  }
+  if (state.seed) words.push(`--seed ${state.seed}`);
+  if (state.filter !== null && state.filter !== data.filter)
+    words.push(state.filter ? "--safety-filter" : "--no-safety-filter");
+  else if (state.filter && data.guarded) words.push("--safety-filter");
+  return words.join(" ");
+}
+
 const toml = () => tomlOf(data.toml, leaves, effective());
 
 function reset() {
@@ -510,7 +529,7 @@ function reset() {
   state.values = {};
   state.broken.clear();
   state.seed = 0;
-  state.filter = info.filter.present ? Boolean(info.filter.default_on) : null;
+  state.filter = info.filter.present ? data.filter : null;
   pins.length = 0;
   bands = null;
   $("plants").setAttribute("aria-pressed", "false");
@@ -682,7 +701,7 @@ window.jaxtank = {
       if (!byName.has(name)) throw new Error(`no parameter is named ${name}`);
     state.values = { ...values };
     state.broken.clear();
-    const found = run(effective(), info.save_every_default);
+    const found = run(effective(), data.every);
     refresh();
     const plain = (list) => list.map((one) => Array.from(one));
     const measures = Object.fromEntries(Object.entries(found.measures).map(([name, value]) =>

@@ -19,9 +19,11 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, parameters
+from jaxtank.loop.trajectory import stride
 from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
-from tuning.live.engine import describe, engine
+from tuning.live.engine import engine
+from tuning.live.origin import both, entries, origin_of
 
 HERE = Path(__file__).parent
 SCRIPTS = ("inflate", "core", "charts", "rig", "page")
@@ -29,7 +31,7 @@ LEAK = 1.5
 """Factor of an outlet that leaks [-]."""
 
 
-def page(case, presets=()):
+def page(case, presets=(), source=None):
     """Return the live page of a case as the text of an HTML file.
 
     Parameters
@@ -38,6 +40,8 @@ def page(case, presets=()):
     presets : sequence of (name, {dotted name: value}, safety filter: True, False or None)
         States to start from; None leaves the filter as in the case. The page opens with the last
         one and draws the others for comparison. Without any, it opens with the case.
+    source : str or None
+        The rig file that the case was read from, as the command line names it.
 
     Returns
     -------
@@ -55,19 +59,21 @@ def page(case, presets=()):
     >>> text[:15], "http-equiv" in text
     ('<!DOCTYPE html>', True)
     """
-    return assemble(engine(case), describe(case), data_of(case, presets))
+    off, on, _ = both(case)
+    return assemble(engine(off, on), case.name, data_of(case, presets, source))
 
 
-def data_of(case, presets=()):
+def data_of(case, presets=(), source=None):
     """Return what the page knows of a case besides the engine, a JSON object.
 
     Parameters
     ----------
-    case, presets : as of `page`
+    case, presets, source : as of `page`
 
     Returns
     -------
-    {"version", "toml": rig file of the case, "rig": `drawing`, "presets", "breaks": faults that can
+    {"version", "case": its words on the command line, "origin": {dotted name: value without --set},
+    "filter": whether it is on, "every": stride of the rows of a CSV file [samples], "toml": rig file of the case, "rig": `drawing`, "presets", "breaks": faults that can
     be switched on, "uncertain": {dotted name: half-width as a share}}
 
     Examples
@@ -81,30 +87,22 @@ def data_of(case, presets=()):
         toml = rig.dump(case)
     except InputError as error:  # a class of the user's own without a name
         toml = f"# no rig file describes this case ({error})\n"
+    words, values = origin_of(case, source)
     return {
         "version": jaxtank.__version__,
+        "case": words,
+        "origin": values,
+        "filter": case.loop.safety_filter is not None,
+        "every": stride(case.clock.samples),
         "toml": toml,
         "rig": drawing(case.loop.plant),
         "presets": [
-            {"name": name, "values": _entries(case, values), "filter": on, "text": name}
+            {"name": name, "values": entries(case.loop, values), "filter": on, "text": name}
             for name, values, on in presets
         ],
         "breaks": _breaks(case),
         "uncertain": _uncertain(case),
     }
-
-
-def _entries(case, values):
-    """{name of one entry: number} of {dotted name: number or array}."""
-    found, own = {}, parameters(case.loop)
-    for name, value in values.items():
-        if name in own and np.ndim(own[name]):
-            array = np.broadcast_to(np.asarray(value, dtype=float), np.shape(own[name]))
-            for index, entry in np.ndenumerate(array):
-                found[f"{name}[{','.join(map(str, index))}]"] = float(entry)
-        else:
-            found[name] = float(value)
-    return found
 
 
 def _breaks(case):
@@ -156,15 +154,15 @@ def _uncertain(case):
     return found
 
 
-def assemble(engine_text, info, data):
+def assemble(engine_text, name, data):
     """Return the page as text.
 
     Parameters
     ----------
     engine_text : str
         JavaScript that defines `makeEngine`.
-    info : dict
-        What `describe` returns.
+    name : str
+        Of the case.
     data : dict
         What `data_of` returns.
 
@@ -174,7 +172,7 @@ def assemble(engine_text, info, data):
 
     Examples
     --------
-    >>> text = assemble("function makeEngine() {}", {"case": "a <b>"}, {"toml": "</script>"})
+    >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
     >>> "a &lt;b&gt;" in text, text.count("</script>")
     (True, 5)
     """
@@ -197,7 +195,7 @@ def assemble(engine_text, info, data):
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{html.escape(info['case'])}: live</title>",
+            f"<title>{html.escape(name)}: live</title>",
             f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
             _read("page.html"),
             f'<script type="application/json" id="data">{_json(data)}</script>',

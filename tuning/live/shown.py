@@ -82,12 +82,13 @@ def frame(live: LivePage, height: int = HEIGHT) -> str:
     )
 
 
-def of_case(case: Any, presets: Any = ()) -> LivePage:
-    """Return the LivePage of a case; presets as `tuning.live.page.page` takes them.
+def of_case(case: Any, presets: Any = (), source: str | None = None) -> LivePage:
+    """Return the LivePage of a case; presets and source as `tuning.live.page.page`
+    takes them.
 
     Raises InputError for a case that cannot be run in a browser.
     """
-    return LivePage(case.name, page(case, presets))
+    return LivePage(case.name, page(case, presets, source))
 
 
 def of_result(result: Any) -> LivePage:
@@ -96,9 +97,13 @@ def of_result(result: Any) -> LivePage:
 
     Raises InputError for a result without a case, and a case that cannot be run in a browser.
     """
-    case = getattr(result, "tuned", None) or getattr(result, "case", None)
+    case, tuned = getattr(result, "case", None), getattr(result, "tuned", None)
     if case is None:
         raise InputError(f"{type(result).__name__} has no case of its own to explore")
+    guard = None if tuned is None else tuned.loop.safety_filter
+    if guard is not None:  # designed for the plant, which is the same
+        loop = dataclasses.replace(case.loop, safety_filter=guard)
+        case = case.replace(loop=loop, safety=tuned.safety)
     return of_case(case, states_of(result))
 
 

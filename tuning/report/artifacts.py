@@ -10,7 +10,7 @@ from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.loop import run as lp
-from jaxtank.loop.trajectory import csv
+from jaxtank.loop.trajectory import csv, stride
 from tuning.report.figures import failed
 from tuning.report.tables import dumps
 
@@ -35,11 +35,7 @@ def rig_text(case):
 
 def run_for_people(case, key=None, rows=3000):
     """A Trajectory of about `rows` rows, as host arrays."""
-    steps = case.clock.samples - 1
-    least = max(1, steps // rows)
-    # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that
-    # is constant; one that ends at the end, if any
-    every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
+    every = stride(case.clock.samples, rows)
     run = lp.simulate(case.loop, case.clock, key, save_every=every)
     return jax.tree.map(np.asarray, run)
 

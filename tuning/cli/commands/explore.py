@@ -63,7 +63,7 @@ def _page(args):
     case = open_case(args)
     from tuning.live import shown
 
-    live = shown.of_case(case)
+    live = shown.of_case(case, source=args.case if args.case.endswith(".toml") else None)
     live.save(path)
     _report(args, {"case": case.name, "page": str(path), "bytes": len(live.text.encode())})
     return [path]
