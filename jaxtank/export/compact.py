@@ -32,6 +32,11 @@ BINARY = {
 }
 """{operation: (operator, how tightly it binds)}."""
 
+LAZY = {"select": 1, "and": 1, "or": 1}
+"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8 throws
+compiled code away when a branch that it has never seen is taken.
+"""
+
 UNARY = {"neg": "-", "not": "!", "real": "+"}
 MATHS = """
 abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
@@ -216,10 +221,9 @@ def _uses(statements, outputs):
     found = Counter(e.name for e in outputs if isinstance(e, Ref))
     for s in statements:
         if isinstance(s, Define):
-            twice = 1 + (s.op == "square")
-            for e in s.args:
+            for i, e in enumerate(s.args):
                 if isinstance(e, Ref):
-                    found[e.name] += twice
+                    found[e.name] += 2 if s.op == "square" or i >= LAZY.get(s.op, 9) else 1
         elif isinstance(s, Array):
             found.update(e.name for e in s.entries if isinstance(e, Ref))
         elif isinstance(s, Store):

@@ -75,6 +75,8 @@ function deviates(seed, tanks, samples) {
   return out;
 }
 
+const PIECE = 500; // samples
+
 function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
   const places = new Map(info.leaves.map((leaf, i) => [leaf.name, i]));
@@ -112,9 +114,15 @@ function makeEngine() {
     if (own.of !== null && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
     own.signals = own.signals ||
       Array.from({ length: programs[which].streams }, () => new Float64Array(samples));
-    programs[which].signals(q, 0, samples, own.signals);
+    pieces((k, K) => programs[which].signals(q, k, K, own.signals));
     own.of = q;
     return own.signals;
+  }
+
+  /* All samples in short calls: V8 compiles a function that is called often for good, and one that is
+  in a long loop for this call alone. */
+  function pieces(work) {
+    for (let k = 0; k < samples; k += PIECE) work(k, Math.min(k + PIECE, samples));
   }
 
   function measuresOf(program, values) {
@@ -129,11 +137,14 @@ function makeEngine() {
   function run(values, options) {
     const { every = info.save_every_default, seed = 0, filter, measures = true } = options || {};
     const which = chosen(filter), program = programs[which], p = numbers(values);
-    const [forSignals, forRun, forRead, state] = program.lead(p);
+    const [forSignals, forRun, forRead, state, lines] = program.lead(p);
     const S = signals(which, forSignals), N = noise(p, seed);
     const width = program.columns.reduce((sum, [, size]) => sum + size, 0);
     const rows = Math.floor((samples - 1) / every) + 1, R = new Float64Array(rows * width);
-    program.run(forRun, state, S, N, 0, samples, every, R);
+    let written = 0;
+    pieces((k, K) => {
+      written += program.run(forRun, state, lines, S, N, k, K, every, R.subarray(written));
+    });
     const out = { t: Float64Array.from({ length: rows }, (_, i) => i * every * info.dt) };
     let first = 0;
     for (const [name, size] of program.columns) {

@@ -9,7 +9,16 @@ from typing import Any
 from jaxtank.export.compact import MATHS, Text, short_names
 from jaxtank.export.javascript import helpers
 from jaxtank.export.regions import hoisted, kept_in_time, of_rank, ranks, refs
-from jaxtank.export.statements import Array, Define, Matrix, Ref, Statement, names, used
+from jaxtank.export.statements import (
+    TRUTH,
+    Array,
+    Define,
+    Matrix,
+    Ref,
+    Statement,
+    names,
+    used,
+)
 from jaxtank.export.whole_loop import SAVED, WholeLoop
 
 ALONE, TIMED, MOVING = 0, 1, 2
@@ -21,10 +30,10 @@ FIXED = frozenset("p k c n q S N L R K every o Q".split())
 class Printed:
     """The printed functions of a WholeLoop.
 
-    lead(p) -> [numbers for signals, run and read, and the first state]; signals(q, k, K, S) fills
-    S, arrays of what is known of each sample k to K - 1; run(q, c, L, S, N, k, K, every, R) moves
-    the state c over those samples, with the deviates N of the noise, and writes a row to R every
-    so many; read(q, c) returns the measures.
+    lead(p) -> [numbers for signals, run and read, state c, delay lines L]; signals(q, k, K, S)
+    fills S, arrays of what is known of each sample k to K - 1; run(q, c, L, S, N, k, K, every, R)
+    moves c and L over those samples, with the deviates N of the noise, writes a row to R of one
+    sample in `every`, and returns how many numbers it wrote; read(q, c) returns the measures.
     """
 
     def __init__(self, loop: WholeLoop):
@@ -33,6 +42,10 @@ class Printed:
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ranks(self.statements, given)
+        self.truths = {
+            s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH
+        }
+        self.state = self._live()
         self.moving = self._moving()
         self.measured = self._measured()
         self.kept, self.again = self._kept()
@@ -59,8 +72,22 @@ class Printed:
         """Return {saved field: number of its entries}, in the order of a row of R."""
         return {field: len(self.loop.saved[field]) for field in SAVED}
 
+    def _live(self):
+        """The entries of c, without delay lines, that what is saved or measured depends on."""
+        wanted = [e for f in SAVED for e in self.loop.saved[f]] + self._measures()
+        lines = [self.loop.after[i] for i in self.loop.lines]
+        every, live = self._ranked(MOVING), []
+        while True:
+            after = [*wanted, *lines, *(self.loop.after[i] for i in live)]
+            found = refs(used(every, names(after)), after)
+            new = sorted(e.index for e in found if e.name == "c")
+            if new == live:
+                return live
+            live = new
+
     def _outputs(self):
-        return [*self.loop.after, *(e for f in SAVED for e in self.loop.saved[f])]
+        after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
+        return [*after, *(e for f in SAVED for e in self.loop.saved[f])]
 
     def _measures(self):
         return [e for found in self.loop.measures.values() for e in found]
@@ -99,38 +126,30 @@ class Printed:
         return [s for s in self._ranked(ALONE) if isinstance(s, Array) and s.name in read]
 
     def _lead(self):
-        outputs = [*self.loop.first]
+        outputs = [self.loop.first[i] for i in self.state]
+        outputs += [self.loop.first[i] for i in self.loop.lines]
         for found in self.crossing.values():
             outputs += found
         alone = used(self._ranked(ALONE), names(outputs))
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
-        parts = [",".join(map(text.of, found)) for found in self.crossing.values()]
-        first = ",".join(self._first(text))
-        return _function(
-            "lead", "p", [*lines, f"return[[{parts[0]}],[{parts[1]}],[{parts[2]}],[{first}]];"]
-        )
-
-    def _first(self, text):
-        """The first state; a line is an array in place of its first entry, the others are left."""
-        sizes, skip = self._line_sizes(), 0
-        for i, e in enumerate(self.loop.first):
-            if i in sizes:
-                skip = sizes[i]
-                yield f"new Float64Array({skip}).fill({text.of(e)})"
-            if skip:
-                skip -= 1
-                continue
-            yield f"+{text.of(e)}"
+        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
+        parts = [f"Float64Array.of({','.join(map(text.of, group))})" for group in groups]
+        delays = [
+            f"new Float64Array({size}).fill({text.of(self.loop.first[i])})"
+            for i, size in self._line_sizes().items()
+        ]
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return _function("lead", "p", lines)
 
     def _line_sizes(self):
         """{entry of c at which a line begins: its size}."""
-        sizes = {}
-        for start, name in self.loop.lines.items():
-            root = self.loop.after[start].name
-            sizes[start] = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
-            assert name
-        return sizes
+        ends = [*sorted(self.loop.lines), len(self.loop.first)]
+        root = {start: self.loop.after[start].name for start in self.loop.lines}
+        return {
+            start: sum(isinstance(e, Ref) and e.name == root[start] for e in self.loop.after)
+            for start in ends[:-1]
+        }
 
     def _begin(self, name, extra):
         """Return the first lines of a function, and its Text with the numbers it reads."""
@@ -153,47 +172,43 @@ class Printed:
 
     def _run(self):
         text, lines = self._begin("run", {Ref("k"): "k"})
-        streams = [next(text.names) for _ in self.kept]
+        streams = self.streams()
+        kept = [next(text.names) for _ in streams]
         noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
-        text.given |= {e: f"{own}[k]" for e, own in zip(self.streams(), streams)}
-        text.given |= {Ref("n", i): f"{own}[k]" for i, own in enumerate(noise)}
-        if streams:
-            lines.append(f"const[{','.join(streams)}]=S;")
+        if kept:
+            lines.append(f"const[{','.join(kept)}]=S;")
         lines.append(f"const[{','.join(noise)}]=N;")
-        state = self._state(text)
-        lines.append(f"let[{','.join(state)}]=c;")
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        delays = [next(text.names) for _ in self.loop.lines]
+        text.given |= dict(zip(self.loop.lines.values(), delays))
+        lines.append(f"let[{','.join(state)}]=c,o=0;")
+        lines += [f"const[{','.join(delays)}]=L;"] if delays else []
         lines += text.write(self._arrays(self.moving), [])
+        body = [f"const {own}={array}[k];" for own, array in self._given(text, streams, kept)]
+        deviates = [Ref("n", i) for i in range(len(noise))]
+        body += [f"const {own}={array}[k];" for own, array in self._given(text, deviates, noise)]
         outputs = self._outputs()
-        body = text.write([*self.again, *self.moving], outputs, hold=self.loop.after)
-        rows = [f"R[o++]={text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
+        body += text.write([*self.again, *self.moving], outputs, hold=outputs)
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
         body += ["if(k%every===0){", *rows, "}", *self._next(text)]
-        lines += ["let o=0;", "for(;k<K;++k){", *body, "}", f"c.splice(0,c.length,{','.join(state)});"]
-        return _function("run", "q,c,S,N,k,K,every,R", lines)
+        lines += ["for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
+        return _function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
 
-    def _state(self, text):
-        """The variables of the state: one for each entry of c, or for a line as a whole."""
-        sizes, skip, own = self._line_sizes(), 0, []
-        for i in range(len(self.loop.first)):
-            if i in sizes:
-                skip = sizes[i]
-                own.append(next(text.names))
-                text.given[self.loop.lines[i]] = own[-1]
-            if skip:
-                skip -= 1
-                continue
-            own.append(next(text.names))
-            text.given[Ref("c", i)] = own[-1]
-        return own
+    def _given(self, text, found, arrays):
+        """Yield (variable, array) of what is read at each sample."""
+        for e, array in zip(found, arrays):
+            text.given[e] = next(text.names)
+            yield text.given[e], array
 
     def _next(self, text):
         """Lines that put the next state in the place of the last one."""
         moved = []
-        lines = set(self.loop.lines.values())
-        for i, e in enumerate(self.loop.after):
-            if e == Ref("c", i) or Ref("c", i) not in text.given:
-                continue
-            moved.append((text.given[Ref("c", i)], text.of(e), self._real(e)))
-        assert lines or moved
+        for i in self.state:
+            e, name = self.loop.after[i], text.given[Ref("c", i)]
+            if e != Ref("c", i):
+                moved.append((name, text.of(e), self._real(e)))
         old = {name for name, *_ in moved}
         temporary = {value: next(text.names) for _, value, _ in moved if value in old}
         first = [f"const {new}={value};" for value, new in temporary.items()]
@@ -201,14 +216,13 @@ class Printed:
 
     def _real(self, e):
         """What makes a number of a value that may be true or false."""
-        kinds = self.__dict__.setdefault(
-            "kinds", {s.name: s.kind for s in self.statements if isinstance(s, Define)}
-        )
-        return "+" if isinstance(e, Ref) and kinds.get(e.name) == "truth" else ""
+        return "+" if isinstance(e, Ref) and e.name in self.truths else ""
 
     def _read(self):
         text, lines = self._begin("read", {})
-        lines.append(f"const[{','.join(self._state(text))}]=c;")
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        lines.append(f"const[{','.join(state)}]=c;")
         outputs = self._measures()
         lines += text.write(self.measured, outputs, hold=outputs)
         return _function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
@@ -221,6 +235,3 @@ def _function(name, arguments, lines):
 def maths(text: str) -> str:
     """Return the line that gives the functions of Math in `text` their own names."""
     return f"const{{{','.join(m for m in MATHS if f'{m}(' in text)}}}=Math;"
-
-
-__all__ = ["Define", "Printed", "maths"]
