@@ -111,10 +111,22 @@ function real(value) {
   return /^-?\d+$/.test(text) ? `${text}.0` : text;
 }
 
-// the rig file `text` with `values` {name: number} in its table [values]
-function tomlOf(text, leaves, values) {
-  const lines = text.split("\n");
+// the rig file `text` with `values` {name: number} in its table [values], and with or without filter
+function tomlOf(text, leaves, values, filter) {
+  let lines = text.split("\n");
+  const guard = lines.findIndex((line) => line.trim() === "[safety_filter]");
+  if (filter === true && guard < 0) lines.push("[safety_filter]", "");
+  if (filter === false && guard >= 0) {
+    const end = lines.findIndex((line, k) => k > guard && /^\s*\[/.test(line));
+    lines = lines.filter((_, k) => k < guard || (end >= 0 && k >= end));
+  }
   const bases = [...new Set(Object.keys(values).map((name) => name.split("[")[0]))];
+  // in a file the models follow the plant unless they are set
+  for (const base of bases.filter((name) => name.startsWith("plant.")))
+    for (const part of ["controller.model", "controller.law.model", "observer.model"]) {
+      const model = base.replace("plant", part);
+      if (leaves.some((leaf) => leaf.name.split("[")[0] === model)) bases.push(model);
+    }
   let start = lines.findIndex((line) => line.trim() === "[values]");
   if (bases.length && start < 0) {
     start = lines.findIndex((line) => /^\s*\[/.test(line));

@@ -4,6 +4,7 @@ Imported by `page`.
 """
 
 import shlex
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +17,28 @@ NEW = "rig.toml"
 """Name of the rig file that a case without a name of its own is copied to."""
 
 
+class Origin(NamedTuple):
+    """How `jaxtank simulate` makes a case.
+
+    words : the case, with --set of its static fields and clock
+    values : {name of one entry: value before} of the leaves that differ from the preset or the file
+    filtered : whether the preset or the file has a safety filter
+    guard : --set of the settings of the filter that differ, for runs with it
+
+    Examples
+    --------
+    >>> origin_of(presets.find("cascaded/pi"))
+    Origin(words='cascaded/pi', values={}, filtered=False, guard='')
+    """
+
+    words: str
+    values: dict[str, float]
+    filtered: bool
+    guard: str
+
+
 def origin_of(case, source=None):
-    """Return what `jaxtank simulate` needs to make a case.
+    """Return the Origin of a case.
 
     Parameters
     ----------
@@ -25,16 +46,10 @@ def origin_of(case, source=None):
     source : str or None
         The rig file that it was read from, as the command line names it.
 
-    Returns
-    -------
-    (words, values) : the words of the case, with --set of its static fields and clock; {name of one
-        entry: value before} of the leaves that differ from the preset or the file.
-
     Examples
     --------
     >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 2.0, "plant.rim[0]": 8.0})
-    >>> words, values = origin_of(case)
-    >>> words, values["plant.rim[0]"]
+    >>> origin_of(case).words, origin_of(case).values["plant.rim[0]"]
     ('cascaded/pi --set clock.dt=2.0', 10.0)
     """
     source = source or (case.name if case.name in presets.names() else None)
@@ -44,12 +59,24 @@ def origin_of(case, source=None):
         known = None
     words = None if known is None else _static(case, known)
     if words is None:
-        return shlex.quote(source or NEW), {}
+        return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
     differing, own = {}, entries(case.loop, parameters(case.loop))
     for name, value in entries(known.loop, parameters(known.loop)).items():
         if own[name] != value:
             differing[name] = value
-    return " ".join([shlex.quote(source), *words]), differing
+    words = " ".join([shlex.quote(source), *words])
+    return Origin(words, differing, known.safety is not None, _guard(case, known))
+
+
+def _guard(case, known):
+    """--set of the settings of the safety filter of a case that its origin does not have."""
+    before: dict[str, Any] = dict(known.safety or {})
+    found = []
+    for key, value in (case.safety or {}).items():
+        if not np.array_equal(before.get(key), value):
+            text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
+            found += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    return " ".join(found)
 
 
 def _static(case, known):

@@ -19,6 +19,7 @@ for (const id of ["engine", "uplot"]) {
 const data = JSON.parse($("data").textContent);
 const engine = makeEngine();
 const { info } = engine;
+info.measures = info.measures.filter((m) => !m.name.startsWith("time_of_")); // as simulate prints them
 info.filter.default_on = data.filter;
 const leaves = info.leaves.filter((leaf) => leaf.value !== null);
 const byName = new Map(leaves.map((leaf) => [leaf.name, leaf]));
@@ -40,16 +41,12 @@ let current = null, bands = null, worker = null, charts = [], rig = null;
 // --- what a run takes -------------------------------------------------------------------------
 
 const valueOf = (name) => state.values[name] ?? byName.get(name)?.value;
-const modelsOf = (name) =>
-  ["controller", "observer"].map((part) => name.replace(/^plant\./, `${part}.model.`))
-    .filter((model) => model !== name && byName.has(model));
 
-// the values that differ from the case, with what is broken; its models stay as they were
+// the values that differ from the case, with what is broken
 function effective() {
   const values = { ...state.values };
   for (const fault of data.breaks) {
     if (!state.broken.has(fault.name) || !byName.has(fault.leaf)) continue;
-    for (const model of modelsOf(fault.leaf)) values[model] ??= valueOf(fault.leaf);
     const before = values[fault.leaf] ?? byName.get(fault.leaf).value;
     values[fault.leaf] = fault.factor === null ? fault.value : before * fault.factor;
   }
@@ -58,7 +55,7 @@ function effective() {
 
 const options = () => ({ seed: state.seed, filter: state.filter === true });
 
-function run(values = effective(), every = 1) {
+function run(values = effective(), every = data.drawn) {
   try {
     return engine.run(values, { ...options(), every });
   } catch (error) {
@@ -69,27 +66,29 @@ function run(values = effective(), every = 1) {
 
 // --- one run per frame ------------------------------------------------------------------------
 
-let asked = false, stride = 1, resting = 0;
+let asked = false, resting = 0;
 
 function touch() {
   if (asked) return;
   asked = true;
   requestAnimationFrame(() => {
     asked = false;
-    const start = performance.now();
-    current = run(effective(), stride) ?? current;
-    // a long run keeps fewer samples while sliders move
-    if (stride === 1 && performance.now() - start > 24) stride = Math.ceil(info.samples / 6000);
+    current = run() ?? current;
     show();
-    clearTimeout(resting);
-    resting = setTimeout(settle, 250);
+    rest();
   });
 }
 
-// once nothing moves: every sample, the address, words for a screen reader, the band of plants
+function rest() {
+  clearTimeout(resting);
+  resting = setTimeout(settle, 250);
+}
+
+// once nothing moves: every sample of a part, the address, words for a screen reader, the plants
 function settle() {
-  if (stride > 1) {
-    current = run() ?? current;
+  const rows = ((view.to - view.from) / info.dt) / data.drawn;
+  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples) {
+    current = run(effective(), 1) ?? current;
     show();
   }
   if (!framed) history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
@@ -165,6 +164,7 @@ function zoom(from, to) {
   view.from = clamp(from, 0, info.duration - least);
   view.to = clamp(to, view.from + least, info.duration);
   show();
+  rest();
 }
 
 const cells = (value) =>
@@ -457,17 +457,16 @@ function tuneNow() {
 }
 
 function manyPlants() {
-  const spread = {}, held = {}, values = {};
+  const spread = {}, values = {};
   const now = effective();
   for (const leaf of leaves) {
     const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
     if (share === undefined || leaf.group === "model") continue;
     spread[leaf.name] = share;
     values[leaf.name] = now[leaf.name] ?? leaf.value;
-    for (const model of modelsOf(leaf.name)) held[model] = now[model] ?? values[leaf.name];
   }
   ask({
-    kind: "plants", count: 64, values: { ...now, ...values }, held, spread, limits: info.limits, ...options(),
+    kind: "plants", count: 64, values: { ...now, ...values }, spread, limits: info.limits, ...options(),
     measures: [...new Set(info.limits.map((limit) => limit.measure))],
     every: Math.max(1, Math.ceil(info.samples / 400)),
   }, {
@@ -510,19 +509,19 @@ const csv = () => csvOf(run(effective(), data.every), info.units);
 
 // the command that repeats the run: all that differs from the preset or the file
 function command() {
-  const now = effective(), words = ["jaxtank simulate", data.case];
+  const now = effective(), { origin } = data, words = ["jaxtank simulate", origin.words];
   for (const leaf of leaves) {
     const value = now[leaf.name] ?? leaf.value;
-    if (value !== (data.origin[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name}=${value}`);
+    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name}=${value}`);
   }
-  if (state.seed) words.push(`--seed ${state.seed}`);
-  if (state.filter !== null && state.filter !== data.filter)
+  if (state.filter && origin.guard) words.push(origin.guard);
+  if (state.filter !== null && state.filter !== origin.filtered)
     words.push(state.filter ? "--safety-filter" : "--no-safety-filter");
-  else if (state.filter && data.guarded) words.push("--safety-filter");
+  if (state.seed) words.push(`--seed ${state.seed}`);
   return words.join(" ");
 }
 
-const toml = () => tomlOf(data.toml, leaves, effective());
+const toml = () => tomlOf(data.toml, leaves, effective(), state.filter);
 
 function reset() {
   stop();
@@ -704,8 +703,11 @@ window.jaxtank = {
     const found = run(effective(), data.every);
     refresh();
     const plain = (list) => list.map((one) => Array.from(one));
-    const measures = Object.fromEntries(Object.entries(found.measures).map(([name, value]) =>
-      [name, typeof value === "number" || value === null ? value : Array.from(value)]));
+    const finite = (v) => (Number.isFinite(v) ? v : null);
+    const measures = Object.fromEntries(info.measures.map(({ name }) => {
+      const value = found.measures[name];
+      return [name, typeof value === "number" ? finite(value) : Array.from(value, finite)];
+    }));
     return { measures, t: Array.from(found.t), h: plain(found.h), u: plain(found.u) };
   },
   tune: () => tuneNow(),

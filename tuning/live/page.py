@@ -72,9 +72,10 @@ def data_of(case, presets=(), source=None):
 
     Returns
     -------
-    {"version", "case": its words on the command line, "origin": {dotted name: value without --set},
-    "filter": whether it is on, "every": stride of the rows of a CSV file [samples], "toml": rig file of the case, "rig": `drawing`, "presets", "breaks": faults that can
-    be switched on, "uncertain": {dotted name: half-width as a share}}
+    {"version", "origin": an Origin, "filter": whether it is on, "every" and "drawn": strides of the
+    rows of a CSV file and of a picture [samples], "toml": rig file of the case, "rig": `drawing`,
+    "presets", "breaks": faults that can be switched on, "uncertain": {dotted name: half-width as a
+    share}}
 
     Examples
     --------
@@ -87,13 +88,13 @@ def data_of(case, presets=(), source=None):
         toml = rig.dump(case)
     except InputError as error:  # a class of the user's own without a name
         toml = f"# no rig file describes this case ({error})\n"
-    words, values = origin_of(case, source)
+    origin = origin_of(case, source)
     return {
         "version": jaxtank.__version__,
-        "case": words,
-        "origin": values,
+        "origin": origin._asdict(),
         "filter": case.loop.safety_filter is not None,
         "every": stride(case.clock.samples),
+        "drawn": stride(case.clock.samples, 6000),
         "toml": toml,
         "rig": drawing(case.loop.plant),
         "presets": [

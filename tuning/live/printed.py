@@ -9,21 +9,12 @@ from typing import Any
 from jaxtank.export.compact import MATHS, Text, short_names
 from jaxtank.export.javascript import helpers
 from jaxtank.export.regions import hoisted, kept_in_time, of_rank, ranks, refs
-from jaxtank.export.statements import (
-    TRUTH,
-    Array,
-    Define,
-    Matrix,
-    Ref,
-    Statement,
-    names,
-    used,
-)
+from jaxtank.export.statements import TRUTH, Array, Define, Matrix, Ref, Statement, names, used
 from jaxtank.export.whole_loop import SAVED, WholeLoop
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
-FIXED = frozenset("p k c n q S N L R K every o Q".split())
+FIXED = frozenset(["p", "k", "c", "n", "q", "S", "N", "L", "R", "K", "every", "o", "Q"])
 """Names of arguments of the printed functions."""
 
 

@@ -3,11 +3,11 @@
 const engine = makeEngine();
 
 // values of `count` plants about `values`: each leaf of `spread` {name: share} times 1 +- share
-// the controller's and observer's models stay as they are, as `held` {model's leaf: value} says
+// the controller's and observer's models are leaves of their own, and stay
 function plantsOf(message) {
   const next = uniform(message.seed + 1);
   return Array.from({ length: message.count }, () => {
-    const values = { ...message.values, ...message.held };
+    const values = { ...message.values };
     for (const [name, share] of Object.entries(message.spread)) {
       const factor = 1 + share * (2 * next() - 1);
       values[name] = message.values[name] * factor;
