@@ -94,9 +94,10 @@ def write_result(folder, files, draw, page=None, stale=()):
     return written + write_folder(folder, more | pngs(drawn))
 
 
-def save_run(case, run, payload, folder, gif=False):
+def save_run(case, run, payload, folder, gif=False, page=None):
     """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to
-    `folder`, from which the run.gif of an earlier one is removed.
+    `folder`, from which the run.gif of an earlier one is removed; page: function of the pictures
+    that returns report.html.
     """
     from jaxtank.plots import responses
 
@@ -104,12 +105,14 @@ def save_run(case, run, payload, folder, gif=False):
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
-    stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
+    names = ("responses.png", "run.gif", "report.html")
+    stale = [Path(folder) / name for name in names] if old else []
     written = write_result(
         folder,
         files,
         lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)},
-        stale=stale,
+        page,
+        stale,
     )
     if gif:
         from jaxtank.plots.animation import animate
