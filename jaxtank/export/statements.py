@@ -10,10 +10,10 @@ REAL, WHOLE, TRUTH = "real", "whole", "truth"
 
 
 class Ref(NamedTuple):
-    """A variable, or an entry of an array."""
+    """A variable, or an entry of an array, whose index is a number or a variable."""
 
     name: str
-    index: int | None = None
+    index: "int | Ref | None" = None
 
 
 class Define(NamedTuple):
@@ -108,7 +108,8 @@ Statement = Define | Array | Matrix | Store | Until | Loop
 
 def names(entries: Iterable) -> set[str]:
     """Return the names of the variables among numbers and Refs."""
-    return {e.name for e in entries if isinstance(e, Ref)}
+    found = [e for e in entries if isinstance(e, Ref)]
+    return {e.name for e in found} | {e.index.name for e in found if isinstance(e.index, Ref)}
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 
 from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.numerics import clip
+from jaxtank.xla.normal import normal
 
 
 class Sensor(abc.ABC):
@@ -92,9 +93,7 @@ class Sensor(abc.ABC):
         tanks = np.shape(self.noise)[-1]
         if jnp.issubdtype(key.dtype, jnp.floating):
             return tuple(key[i] for i in range(tanks))
-        drawn = lambda key, count: jax.random.normal(
-            key, (tanks, count), dtype=jnp.result_type(float)
-        )
+        drawn = lambda key, count: normal(key, (tanks, count))
         if piece is not None:
             deviates = drawn(jax.random.fold_in(key, piece), samples)
         elif samples <= CHUNK:

@@ -13,7 +13,9 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.loop import run as lp
 from tuning.answer.answer import Answer
 from tuning.answer.findings import findings_of
 from tuning.answer.judged import FRESH, Judged, judge, matters
@@ -21,6 +23,7 @@ from tuning.answer.result import result_of
 from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, plants_of, setting_of
 from tuning.answer.stay_put import Found, search_from
 from tuning.feasible.study import apply_mend, can_judge, feasibility
+from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
 from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import noisy, with_noise_drawn
@@ -113,9 +116,11 @@ def recommend(
         setting = setting.without_filter()
     plan = {"starts": starts, "iterations": iterations, "seed": seed}
     task = _Task(free, plan, validation, progress)
-    Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed).start()
+    first = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
+    first.start()
+    _check_functions(setting, first.needed)
     if checkpoint is not None:
-        what = _what(setting, free, plan, validation, safety_filter)
+        what = _what(setting, free, plan, validation, safety_filter, first.needed)
         task.cache = EvaluationLog(checkpoint, what, resume)
     task.may_filter = safety_filter is not False
     before = judge(setting.replace(searched=_as_given(setting)), task.samples, seed)
@@ -271,7 +276,7 @@ def _answer(setting, before, after, found, problem, values, tightened):
     """Return the Answer: what was judged, on which plants, and the case's own run."""
     own = problem.own_values()
     sides = {"before": setting.case, "after": setting.tuned(values)}
-    nominal = {side: _nominal(case) for side, case in sides.items()}
+    nominal = {side: _nominal(case, problem.needed) for side, case in sides.items()}
     errors = {side: float(m["rms_error_total"]) for side, m in nominal.items()}
     stays = {n: bool(k) for n, k in zip(own, found.kept)} if found.kept is not None else {}
     return Answer(
@@ -296,9 +301,9 @@ def _lost(setting, problem, nominal, values):
     return lost_outputs(own, {side: [table] for side, table in nominal.items()}, values)
 
 
-def _nominal(case):
+def _nominal(case, needed):
     """Return the measures of the case's own run, without noise unless it has some."""
-    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
+    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None, needed)
 
 
 def _idle(setting, before, after):
@@ -310,7 +315,20 @@ def _idle(setting, before, after):
     return np.flatnonzero(limited & ~near)
 
 
-def _what(setting, free, plan, validation, safety_filter):
+def _check_functions(setting, needed):
+    """Raise InputError for a function of the user's that has no value at the starting values."""
+    own, case = tuple(ms.functions(needed)), setting.searched
+    key = jax.random.key(0) if noisy(case) else None
+    values = lp.evaluate(case.loop, case.clock, own, key) if own else {}
+    for name, value in values.items():
+        if not np.isfinite(value):
+            raise InputError(
+                f"function {name}: its value at the starting values is {value}: must be a finite"
+                f" number [{ms.unit(name, case.loop.units)}]"
+            )
+
+
+def _what(setting, free, plan, validation, safety_filter, needed):
     """Return the fingerprint of a search."""
     return fingerprint(
         setting.searched,
@@ -321,5 +339,6 @@ def _what(setting, free, plan, validation, safety_filter):
         distributions={n: repr(d) for n, d in setting.distributions.items()},
         safety_filter=safety_filter,
         validation=validation,
+        **digests(setting.searched.loop, setting.searched.clock, needed),
         **plan,
     )

@@ -119,6 +119,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     """
     first = problem.start()
     reference = problem.point(first)
+    problem.check_slopes(reference)
     search = found.search = Search(problem, reference, report, TOLERANCE)
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])

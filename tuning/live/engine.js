@@ -81,7 +81,7 @@ function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
   const places = new Map(info.leaves.map((leaf, i) => [leaf.name, i]));
   const samples = info.samples, tanks = info.tanks.length;
-  const kept = programs.map(() => ({ signals: null, of: null }));
+  const kept = new Map();
   let drawn = { seed: null, noise: null }, still = null;
 
   function numbers(values) {
@@ -109,12 +109,13 @@ function makeEngine() {
   }
 
   /* What is known of each sample, computed again where the numbers that it depends on changed. */
-  function signals(which, q) {
-    const own = kept[which];
+  function signals(program, q) {
+    if (!kept.has(program)) kept.set(program, { signals: null, of: null });
+    const own = kept.get(program);
     if (own.of !== null && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
     own.signals = own.signals ||
-      Array.from({ length: programs[which].streams }, () => new Float64Array(samples));
-    pieces((k, K) => programs[which].signals(q, k, K, own.signals));
+      Array.from({ length: program.streams }, () => new Float64Array(samples));
+    pieces((k, K) => program.signals(q, k, K, own.signals));
     own.of = q;
     return own.signals;
   }
@@ -138,7 +139,7 @@ function makeEngine() {
     const { every = info.save_every_default, seed = 0, filter, measures = true } = options || {};
     const which = chosen(filter), program = programs[which], p = numbers(values);
     const [forSignals, forRun, forRead, state, lines] = program.lead(p);
-    const S = signals(which, forSignals), N = noise(p, seed);
+    const S = signals(program, forSignals), N = noise(p, seed);
     const width = program.columns.reduce((sum, [, size]) => sum + size, 0);
     const rows = Math.floor((samples - 1) / every) + 1, R = new Float64Array(rows * width);
     let written = 0;
@@ -159,9 +160,54 @@ function makeEngine() {
     delete out.x;
     if (!out.d_hat.some((column) => column.some((v) => v !== 0))) out.d_hat = null;
     if (measures) out.measures = measuresOf(program, program.read(forRead, state));
+    out.broken = diverged(state);
+    return out;
+  }
+
+  /* Measures, their derivatives by `names` and the Gauss-Newton matrix, of one run. */
+  function tangents(values, names, options) {
+    const { seed = 0, filter } = options || {};
+    const which = chosen(filter), program = programs[which].tangents, p = numbers(values);
+    const [forSignals, forPush, forRead, forAim, forSlope, state, lines] = program.lead(p);
+    const P = names.length, aims = names.map((name) => {
+      const d = new Float64Array(program.along.length), i = program.along.indexOf(name);
+      if (i < 0) throw new Error(`${name}: this text has no derivatives by it`);
+      d[i] = 1;
+      return program.aim(forAim, d);
+    });
+    const S = signals(program, forSignals), N = noise(p, seed);
+    const D = joined(aims.map((a) => a[0])), T = joined(aims.map((a) => a[2]));
+    const M = aims.map((a) => a[3]), G = new Float64Array(P * P);
+    pieces((k, K) => program.push(forPush, state, lines, S, N, k, K, P, D, T, M, G));
+    for (let a = 0; a < P; ++a)
+      for (let b = 0; b <= a; ++b) G[b * P + a] = G[a * P + b] *= 2;
+    const width = P ? T.length / P : 0, jacobian = {};
+    const slopes = aims.map((a, j) =>
+      program.slope(forSlope, state, a[1], T.subarray(j * width, (j + 1) * width)));
+    let first = 0;
+    for (const [name, size] of program.measures) {
+      const n = size === null ? 1 : size, rows = new Float64Array(n * P);
+      for (let i = 0; i < n; ++i) for (let j = 0; j < P; ++j) rows[i * P + j] = slopes[j][first + i];
+      jacobian[name] = rows;
+      first += n;
+    }
+    const measures = measuresOf(program, program.read(forRead, state));
+    return { measures, jacobian, gauss_newton: G, broken: diverged(state) };
+  }
+
+  function diverged(state) {
     let level = 0;
     for (let i = 0; i < tanks; ++i) level += state[i];
-    out.broken = !Number.isFinite(level);
+    return !Number.isFinite(level);
+  }
+
+  function joined(parts) {
+    const out = new Float64Array(parts.reduce((sum, part) => sum + part.length, 0));
+    let at = 0;
+    for (const part of parts) {
+      out.set(part, at);
+      at += part.length;
+    }
     return out;
   }
 
@@ -178,7 +224,7 @@ function makeEngine() {
     return words.join(" ");
   }
 
-  return { info, run, command };
+  return { info, run, tangents, command };
 }
 
 function quoted(text) {

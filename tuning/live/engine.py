@@ -4,6 +4,7 @@ The text needs no page: node runs it too. Imported by the page.
 """
 
 import json
+from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -11,14 +12,20 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.case import Case, Free
-from jaxtank.export.whole_loop import WholeLoop, whole_loop
+from jaxtank.case import Case
+from jaxtank.export.whole.loop import WholeLoop, traced_leaves, whole_loop
+from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
 from tuning.live.printed import Printed, maths
+from tuning.live.printed_tangents import PrintedTangents
 from tuning.live.sliders import leaf_of
 from tuning.problem.limits import resolve_limits
+from tuning.problem.bounds import bounds
+from tuning.problem.problem import ROOT
 
 ROWS = 1200
 """Samples that a page keeps of a run unless it asks for more, about."""
+ALWAYS = ("rms_error_total", "max_level")
+"""Measures that have derivatives whatever a case minimises and limits."""
 
 
 def engine(case: Case, filtered: Case | None = None) -> str:
@@ -33,7 +40,7 @@ def engine(case: Case, filtered: Case | None = None) -> str:
     Raises
     ------
     InputError
-        For a loop that has no code of single samples (`jaxtank.export.whole_loop`).
+        For a loop that has no code of single samples (`jaxtank.export.whole.loop`).
 
     Examples
     --------
@@ -42,9 +49,10 @@ def engine(case: Case, filtered: Case | None = None) -> str:
     True
     """
     with jax.enable_x64(True):
-        loops = [whole_loop(one) for one in (case, filtered) if one is not None]
+        cases = [one for one in (case, filtered) if one is not None]
+        loops = [whole_loop(one) for one in cases]
         facts = _facts(case, loops)
-    programs = ",\n".join(_program(loop) for loop in loops)
+        programs = ",\n".join(_program(loop, _tangents(loop.case)) for loop in loops)
     driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
@@ -84,14 +92,42 @@ def data(value: Any) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _program(loop: WholeLoop) -> str:
+def _tangents(case: Case) -> TangentLoop:
+    """The derivatives that a search of the case asks for."""
+    wanted = [*case.objective, *(x.measure for x in resolve_limits(case)), *ALWAYS]
+    measures = [m for m in dict.fromkeys(wanted) if ms.serves(m, case.loop)]
+    names = [n for n in traced_leaves(case) if n.startswith("controller.") and ".model." not in n]
+    names += [name.split("[")[0] for name in case.free]
+    return tangent_loop(case, measures, list(dict.fromkeys(names)), squares_of(case.objective))
+
+
+def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
+    """Return ((measure, weight), ...) of the Gauss-Newton matrix of an objective, as `tune` has it.
+
+    Examples
+    --------
+    >>> squares_of({"ise": 2.0, "iae": 1.0})
+    (('ise', 2.0),)
+    """
+    own = tuple((m, w) for m, w in objective.items() if m in ms.squares())
+    return (("mean_square_error", 1.0),) if ROOT in objective or not own else own
+
+
+def _program(loop: WholeLoop, tangents: TangentLoop) -> str:
     """One loop as an object of its functions."""
-    printed = Printed(loop)
+    columns = [[f, len(found)] for f, found in loop.saved.items()]
+    main, slopes = Printed(loop), PrintedTangents(tangents)
+    along = [f"{n}[{','.join(map(str, i))}]" if i else n for n, i in tangents.leaves]
+    own = f"{_block(slopes, 'lead,signals,read,aim,push,slope', f'along:{data(along)}')}"
+    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}")
+
+
+def _block(printed: Printed, functions: str, facts: str) -> str:
+    """Functions in a scope of their own."""
     body = "\n".join([*printed.helpers(), printed.text()])
-    measures = [[m, _size(m, found)] for m, found in loop.measures.items()]
-    columns = [[f, n] for f, n in printed.columns().items()]
-    facts = f"streams:{len(printed.streams())},columns:{data(columns)},measures:{data(measures)}"
-    return f"(()=>{{{maths(body)}\n{body}\nreturn{{lead,signals,run,read,{facts}}};}})()"
+    measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
+    facts = f"streams:{len(printed.streams())},measures:{measures},{facts}"
+    return f"(()=>{{{maths(body)}\n{body}\nreturn{{{functions},{facts}}};}})()"
 
 
 def _size(measure, entries):
@@ -101,6 +137,7 @@ def _size(measure, entries):
 
 def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
+    free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
     leaves = [leaf_of(case, name, index) for name, index in loops[0].leaves]
     tanks = list((case.names or {}).get("tank", ())) or [""] * plant.tanks
@@ -130,8 +167,9 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "leaves": leaves,
         "measures": [_measure(case, m, loops[0].measures[m]) for m in loops[0].measures],
         "limits": _limits(case),
-        "free": list(case.free),
-        "bounds": {name: list(Free(*spec)[:2]) for name, spec in case.free.items()},
+        "free": [b.name for b in free],
+        "logarithmic": [b.name for b in free if b.scale == "log"],
+        "bounds": {b.name: [b.low, b.high] for b in free},
         "objective": {
             "text": " + ".join(f"{w:g} {m}" for m, w in case.objective.items()),
             "measures": {m: float(w) for m, w in case.objective.items()},

@@ -6,15 +6,24 @@ Imported by `tuning.live.engine`.
 from collections.abc import Iterable
 from typing import Any
 
-from jaxtank.export.compact import MATHS, Text, short_names
+from jaxtank.export.whole.compact import MATHS, Text, short_names
 from jaxtank.export.javascript import helpers
-from jaxtank.export.regions import hoisted, kept_in_time, of_rank, ranks, refs
-from jaxtank.export.statements import TRUTH, Array, Define, Matrix, Ref, Statement, names, used
-from jaxtank.export.whole_loop import SAVED, WholeLoop
+from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
+from jaxtank.export.statements import (
+    TRUTH,
+    Array,
+    Define,
+    Matrix,
+    Ref,
+    Statement,
+    names,
+    used,
+)
+from jaxtank.export.whole.loop import SAVED, WholeLoop
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
-FIXED = frozenset(["p", "k", "c", "n", "q", "S", "N", "L", "R", "K", "every", "o", "Q"])
+FIXED = frozenset("p d k c e q j o S N L R K P D T M G E every".split())
 """Names of arguments of the printed functions."""
 
 
@@ -27,9 +36,16 @@ class Printed:
     sample in `every`, and returns how many numbers it wrote; read(q, c) returns the measures.
     """
 
-    def __init__(self, loop: WholeLoop):
-        self.loop = loop
-        self.statements = hoisted(loop.statements)
+    def __init__(
+        self,
+        loop: WholeLoop,
+        statements: list[Statement] | None = None,
+        others: Iterable[Any] = (),
+        at_end: Iterable[Any] = (),
+    ):
+        """others: what else is read at each sample; at_end: what else is read after the last."""
+        self.loop, self.others, self.at_end = loop, list(others), list(at_end)
+        self.statements = hoisted(loop.statements) if statements is None else statements
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ranks(self.statements, given)
@@ -66,6 +82,7 @@ class Printed:
     def _live(self):
         """The entries of c, without delay lines, that what is saved or measured depends on."""
         wanted = [e for f in SAVED for e in self.loop.saved[f]] + self._measures()
+        wanted += [*self.others, *(self.loop.after[i] for i in self._levels())]
         lines = [self.loop.after[i] for i in self.loop.lines]
         every, live = self._ranked(MOVING), []
         while True:
@@ -78,10 +95,14 @@ class Printed:
 
     def _outputs(self):
         after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
-        return [*after, *(e for f in SAVED for e in self.loop.saved[f])]
+        return [*after, *self.others, *(e for f in SAVED for e in self.loop.saved[f])]
 
     def _measures(self):
-        return [e for found in self.loop.measures.values() for e in found]
+        return [*self.at_end, *(e for found in self.loop.measures.values() for e in found)]
+
+    def _levels(self):
+        """The entries of c that are levels: those whose sum tells a run that diverged."""
+        return range(self.loop.case.loop.plant.tanks)
 
     def _ranked(self, rank):
         return of_rank(self.statements, self.rank, rank)
@@ -131,7 +152,7 @@ class Printed:
             for i, size in self._line_sizes().items()
         ]
         lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
-        return _function("lead", "p", lines)
+        return function("lead", "p", lines)
 
     def _line_sizes(self):
         """{entry of c at which a line begins: its size}."""
@@ -159,9 +180,18 @@ class Printed:
         body = text.write(self._timed(), streams)
         body += [f"{array}[k]=+{text.of(e)};" for array, e in zip(own, streams)]
         lines += ["for(;k<K;++k){", *body, "}"] if own else []
-        return _function("signals", "q,k,K,S", lines)
+        return function("signals", "q,k,K,S", lines)
 
     def _run(self):
+        text, lines, body, state = self._sample()
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
+
+    def _sample(self):
+        """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
         text, lines = self._begin("run", {Ref("k"): "k"})
         streams = self.streams()
         kept = [next(text.names) for _ in streams]
@@ -173,7 +203,7 @@ class Printed:
         text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
         delays = [next(text.names) for _ in self.loop.lines]
         text.given |= dict(zip(self.loop.lines.values(), delays))
-        lines.append(f"let[{','.join(state)}]=c,o=0;")
+        lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
         lines += text.write(self._arrays(self.moving), [])
         body = [f"const {own}={array}[k];" for own, array in self._given(text, streams, kept)]
@@ -181,11 +211,7 @@ class Printed:
         body += [f"const {own}={array}[k];" for own, array in self._given(text, deviates, noise)]
         outputs = self._outputs()
         body += text.write([*self.again, *self.moving], outputs, hold=outputs)
-        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
-        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
-        lines += ["for(;k<K;++k){", *body, "}"]
-        lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
-        return _function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
+        return text, lines, body, state
 
     def _given(self, text, found, arrays):
         """Yield (variable, array) of what is read at each sample."""
@@ -214,12 +240,12 @@ class Printed:
         state = [next(text.names) for _ in self.state]
         text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
         lines.append(f"const[{','.join(state)}]=c;")
-        outputs = self._measures()
-        lines += text.write(self.measured, outputs, hold=outputs)
-        return _function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
+        outputs = [e for found in self.loop.measures.values() for e in found]
+        lines += text.write(used(self.measured, names(outputs)), outputs, hold=outputs)
+        return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 
-def _function(name, arguments, lines):
+def function(name, arguments, lines):
     return f"function {name}({arguments}){{" + "\n".join(lines) + "}"
 
 

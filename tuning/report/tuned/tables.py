@@ -69,7 +69,7 @@ def _measure_table(result):
     rows = [["objective", unit, number(objective["before"]), number(objective["after"])]]
     shown = []
     alone = set(objective["terms"])
-    for m in ms.placed("shown"):
+    for m in (*ms.placed("shown"), *ms.functions(measures["after"])):
         if m not in measures["after"] or (m == "rms_error_total" and alone == {m}):
             continue
         before = numbers(measures["before"][m], 4)

@@ -78,12 +78,13 @@ def served(case: Case) -> tuple[str, ...]:
     return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
 
 
-def sample_of(case: Case, names: Sequence[str]) -> Any:
+def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]] = ()) -> Any:
     """Return the function (p, k, c, n) -> (c before the first sample, c after this one, saved,
-    measures) of a case.
+    measures, residuals) of a case.
 
     p: {dotted name: array}; k: index of the sample; c: (state, accumulators, volume lost over each
-    rim); n: (tanks,) deviates. Measures are those of a run that ended with c.
+    rim); n: (tanks,) deviates. Measures are those of a run that ended with c, residuals the numbers
+    whose squares the measures of `squares` add at this sample.
     """
     clock, names = case.clock, tuple(names)
 
@@ -97,13 +98,14 @@ def sample_of(case: Case, names: Sequence[str]) -> Any:
         now = jax.tree.map(lambda a: a[0], now)
         run = run_of(loop, clock)
         after, sample = step(loop, clock, state, now)
+        errors = ms.residuals(run, acc, sample, now.context, squares)
         update = ms.update(run, acc, sample, now.context)
         saved = {f: tuple(getattr(sample, f)) for f in SAVED} | {"spilled": spilled}
         total = tuple(a + b for a, b in zip(spilled, sample.spilled))
         start = initial(loop, clock)._replace(k=())
         before = (start, ms.start(run, names), (zero_of(loop),) * loop.plant.tanks)
         found = ms.read(run, acc, names)
-        return before, (after._replace(k=()), update, total), saved, found
+        return before, (after._replace(k=()), update, total), saved, found, errors
 
     return whole
 
@@ -126,31 +128,46 @@ def whole_loop(case: Case, names: Sequence[str] | None = None) -> WholeLoop:
     >>> len(found.first) == len(found.after), list(found.measures)
     (True, ['rms_error_total'])
     """
+    check_pointwise(case)
+    names = served(case) if names is None else tuple(names)
+    whole, shapes = sample_of(case, names), arguments(case, names)
+    made = lower_all(whole, shapes)
+    before, after, saved, found, _ = made.outputs
+    return WholeLoop(
+        case=case,
+        leaves=entries_of(shapes["p"]),
+        statements=made.statements,
+        first=flat(before),
+        after=flat(after),
+        saved={f: flat(saved[f]) for f in SAVED},
+        measures={m: flat(found[m]) for m in names},
+        lines={start.index: name for start, name in made.lines.items()},
+    )
+
+
+def check_pointwise(case: Case) -> None:
+    """Raise InputError for a loop whose signals do not follow from their times alone."""
     if not is_pointwise(case.loop):
         raise InputError(
             f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"
             " loop has no code of single samples"
         )
-    names = served(case) if names is None else tuple(names)
-    whole, leaves = sample_of(case, names), traced_leaves(case)
+
+
+def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
+    """Return {name: shapes and types} of the arguments of `sample_of`, with measures `names`."""
     real = jnp.result_type(float)
-    p = {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in leaves.items()}
-    n = (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks
-    c = carried(case, names)
-    k = jax.ShapeDtypeStruct((), jnp.int32)
-    made = lower_all(whole, {"p": p, "k": k, "c": c, "n": n})
-    before, after, saved, found = made.outputs
-    entries = [(name, i) for name in sorted(p) for i in np.ndindex(p[name].shape)]
-    return WholeLoop(
-        case=case,
-        leaves=tuple(entries),
-        statements=made.statements,
-        first=_entries(before),
-        after=_entries(after),
-        saved={f: _entries(saved[f]) for f in SAVED},
-        measures={m: _entries(found[m]) for m in names},
-        lines={start.index: name for start, name in made.lines.items()},
-    )
+    return {
+        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in traced_leaves(case).items()},
+        "k": jax.ShapeDtypeStruct((), jnp.int32),
+        "c": carried(case, names),
+        "n": (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks,
+    }
+
+
+def entries_of(shapes: dict[str, Any]) -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Return (dotted name, index in it) of each entry of arrays, in the order of an argument."""
+    return tuple((name, i) for name in sorted(shapes) for i in np.ndindex(shapes[name].shape))
 
 
 def carried(case: Case, names: Sequence[str]) -> Any:
@@ -165,5 +182,6 @@ def carried(case: Case, names: Sequence[str]) -> Any:
     return jax.eval_shape(start)
 
 
-def _entries(tree: Any) -> list[Any]:
+def flat(tree: Any) -> list[Any]:
+    """Return the entries of all arrays of a tree."""
     return [e for array in jax.tree.leaves(tree) for e in np.ravel(array)]
