@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
+from jaxtank.core.tree import parameters
 from tuning.live.page import page
 
 HEIGHT = 900
@@ -115,11 +116,12 @@ def states_of(result: Any) -> list[tuple[str, dict[str, Any], bool]]:
     tuned = getattr(result, "tuned", None)
     if tuned is None:
         return []
-    changes = result.parameters.items()
+    numbers = {n.split("[")[0] for n in parameters(result.case.loop)}
+    changes = [(n, p) for n, p in result.parameters.items() if n.split("[")[0] in numbers]
     return [
         (
             when,
-            {name: np.asarray(getattr(change, when), dtype=float) for name, change in changes},
+            {name: np.asarray(change[when], dtype=float) for name, change in changes},
             case.loop.safety_filter is not None,
         )
         for when, case in (("before", result.case), ("after", tuned))

@@ -115,8 +115,9 @@ def document(
     if facts:
         cells = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
         body.append(f'<dl class="facts">{"".join(cells)}</dl>')
+    if live:  # wider than the text
+        body += ["</header>", *_chapter("Move its parameters", [live]), "<main>"]
     body += _chapter("In words", [_list(sentences)] if sentences else [])
-    body += _chapter("Move its parameters", [live] if live else [])
     body += _chapter("Pictures", [_figure(*picture) for picture in pictures])
     body += _chapter("Numbers", [_part(p) for p in _grouped(parts)])
     for name, text in (files or {}).items():
@@ -130,7 +131,8 @@ def document(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>\n<main>",
+            f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>",
+            "<header>" if live else "<main>",
             *filter(None, body),
             "</main>\n</body>\n</html>\n",
         ]

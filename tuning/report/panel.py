@@ -1,7 +1,6 @@
 """The live page of a result inside its report; imported by the reports."""
 
 from jaxtank.core.errors import InputError
-from tuning.live import shown
 from tuning.report.figures import failed
 
 
@@ -16,6 +15,8 @@ def panel(result):
     >>> panel(presets.find("cascaded/pi"))[:20]
     '<iframe class="live"'
     """
+    from tuning.live import shown  # only where a page is written
+
     try:
         make = shown.of_result if hasattr(result, "case") else shown.of_case
         return shown.frame(make(result))

@@ -48,7 +48,7 @@ def explore(args):
         raise InputError("--out '': must name a file")
     written = _gallery(args) if args.all else _page(args)
     if args.open:
-        webbrowser.open(written[0].resolve().as_uri())
+        webbrowser.open_new_tab(written[0].resolve().as_uri())
     return 0
 
 
