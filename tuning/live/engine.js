@@ -75,6 +75,9 @@ function deviates(seed, tanks, samples) {
   return out;
 }
 
+info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
+  entries.map(([name, value, lower, upper]) => ({ name, unit, doc, value, lower, upper, group })));
+
 const PIECE = 500; // samples
 
 function makeEngine() {
@@ -129,6 +132,8 @@ function makeEngine() {
   function measuresOf(program, values) {
     const found = {};
     let at = 0;
+    for (const { name, size } of program.along ? [] : info.measures)
+      found[name] = size === null ? NaN : Array(size).fill(NaN);
     for (const [name, size] of program.measures) {
       found[name] = size === null ? values[at++] : values.slice(at, at += size);
     }

@@ -24,6 +24,8 @@ from tuning.problem.problem import ROOT
 
 ROWS = 3000
 """Rows of a run for people, about: those of `jaxtank simulate --out`."""
+SHARED = ("unit", "doc", "group")
+"""What the entries of one array have in common."""
 ALWAYS = ("rms_error_total", "max_level")
 """Measures that have derivatives whatever a case minimises and limits."""
 
@@ -58,7 +60,7 @@ def engine(case: Case, filtered: Case | None = None) -> str:
         [
             "const makeEngine=(()=>{",
             '"use strict";',
-            f"const info={data(facts)};",
+            f"const info={data(_packed(facts))};",
             f"const programs=[{programs}];",
             driver,
             "return makeEngine;",
@@ -78,6 +80,17 @@ def describe(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     """
     with jax.enable_x64(True):
         return _facts(case, [whole_loop(one) for one in (case, filtered) if one is not None])
+
+
+def _packed(facts: dict[str, Any]) -> dict[str, Any]:
+    """The same with the leaves of an array together: what they share, and [name, what differs]."""
+    groups: dict[tuple[Any, ...], list[Any]] = {}
+    for leaf in facts["leaves"]:
+        shared = tuple(leaf[key] for key in SHARED)
+        own = [leaf["name"], *(leaf[key] for key in ("value", "lower", "upper"))]
+        groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(own)
+    packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
+    return {**facts, "leaves": packed}
 
 
 def data(value: Any) -> str:
@@ -172,7 +185,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             for j in range(plant.pumps)
         ],
         "leaves": leaves,
-        "measures": [_measure(case, m, loops[0].measures[m]) for m in loops[0].measures],
+        "measures": [_measure(case, m, found) for m, found in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
         "logarithmic": [b.name for b in free if b.scale == "log"],
