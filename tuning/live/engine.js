@@ -75,23 +75,26 @@ function deviates(seed, tanks, samples) {
   return out;
 }
 
+info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
+  entries.map(([name, value, lower, upper]) => ({ name, unit, doc, value, lower, upper, group })));
+
 const PIECE = 500; // samples
 
 function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
-  const places = new Map(info.leaves.map((leaf, i) => [leaf.name, i]));
+  const noisy = info.leaves.filter((leaf) => leaf.name.startsWith("sensor.noise"));
   const samples = info.samples, tanks = info.tanks.length;
   const kept = new Map();
   let drawn = { seed: null, noise: null }, still = null;
 
-  function numbers(values) {
-    const p = new Float64Array(info.leaves.length);
-    info.leaves.forEach((leaf, i) => (p[i] = leaf.value));
-    for (const [name, value] of Object.entries(values || {})) {
-      if (!places.has(name)) throw new Error(`${name}: no parameter of this loop has this name`);
-      p[places.get(name)] = Number(value);
-    }
-    return p;
+  function numberOf(values, name) {
+    return values && name in values ? Number(values[name]) : defaults.get(name);
+  }
+
+  function numbers(program, values) {
+    for (const name of Object.keys(values || {}))
+      if (!defaults.has(name)) throw new Error(`${name}: no parameter of this loop has this name`);
+    return Float64Array.from(program.leaves, (name) => numberOf(values, name));
   }
 
   function chosen(filter) {
@@ -99,8 +102,8 @@ function makeEngine() {
     return on && info.filter.present ? 1 % programs.length : 0;
   }
 
-  function noise(p, seed) {
-    if (!info.noise.some((i) => p[i] > 0)) {
+  function noise(values, seed) {
+    if (!noisy.some((leaf) => numberOf(values, leaf.name) > 0)) {
       still = still || new Float64Array(samples);
       return Array(tanks).fill(still);
     }
@@ -129,6 +132,8 @@ function makeEngine() {
   function measuresOf(program, values) {
     const found = {};
     let at = 0;
+    for (const { name, size } of program.along ? [] : info.measures)
+      found[name] = size === null ? NaN : Array(size).fill(NaN);
     for (const [name, size] of program.measures) {
       found[name] = size === null ? values[at++] : values.slice(at, at += size);
     }
@@ -137,9 +142,9 @@ function makeEngine() {
 
   function run(values, options) {
     const { every = info.save_every_default, seed = 0, filter, measures = true } = options || {};
-    const which = chosen(filter), program = programs[which], p = numbers(values);
+    const program = programs[chosen(filter)], p = numbers(program, values);
     const [forSignals, forRun, forRead, state, lines] = program.lead(p);
-    const S = signals(program, forSignals), N = noise(p, seed);
+    const S = signals(program, forSignals), N = noise(values, seed);
     const width = program.columns.reduce((sum, [, size]) => sum + size, 0);
     const rows = Math.floor((samples - 1) / every) + 1, R = new Float64Array(rows * width);
     let written = 0;
@@ -167,7 +172,7 @@ function makeEngine() {
   /* Measures, their derivatives by `names` and the Gauss-Newton matrix, of one run. */
   function tangents(values, names, options) {
     const { seed = 0, filter } = options || {};
-    const which = chosen(filter), program = programs[which].tangents, p = numbers(values);
+    const program = programs[chosen(filter)].tangents, p = numbers(program, values);
     const [forSignals, forPush, forRead, forAim, forSlope, state, lines] = program.lead(p);
     const P = names.length, aims = names.map((name) => {
       const d = new Float64Array(program.along.length), i = program.along.indexOf(name);
@@ -175,7 +180,7 @@ function makeEngine() {
       d[i] = 1;
       return program.aim(forAim, d);
     });
-    const S = signals(program, forSignals), N = noise(p, seed);
+    const S = signals(program, forSignals), N = noise(values, seed);
     const D = joined(aims.map((a) => a[0])), T = joined(aims.map((a) => a[2]));
     const M = aims.map((a) => a[3]), G = new Float64Array(P * P);
     pieces((k, K) => program.push(forPush, state, lines, S, N, k, K, P, D, T, M, G));

@@ -18,12 +18,14 @@ from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
 from tuning.live.printed import Printed, maths
 from tuning.live.printed_tangents import PrintedTangents
 from tuning.live.sliders import leaf_of
-from tuning.problem.limits import resolve_limits
+from tuning.problem.limits import limit_scale, resolve_limits
 from tuning.problem.bounds import bounds
 from tuning.problem.problem import ROOT
 
-ROWS = 1200
-"""Samples that a page keeps of a run unless it asks for more, about."""
+ROWS = 3000
+"""Rows of a run for people, about: those of `jaxtank simulate --out`."""
+SHARED = ("unit", "doc", "group")
+"""What the entries of one array have in common."""
 ALWAYS = ("rms_error_total", "max_level")
 """Measures that have derivatives whatever a case minimises and limits."""
 
@@ -58,7 +60,7 @@ def engine(case: Case, filtered: Case | None = None) -> str:
         [
             "const makeEngine=(()=>{",
             '"use strict";',
-            f"const info={data(facts)};",
+            f"const info={data(_packed(facts))};",
             f"const programs=[{programs}];",
             driver,
             "return makeEngine;",
@@ -78,6 +80,17 @@ def describe(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     """
     with jax.enable_x64(True):
         return _facts(case, [whole_loop(one) for one in (case, filtered) if one is not None])
+
+
+def _packed(facts: dict[str, Any]) -> dict[str, Any]:
+    """The same with the leaves of an array together: what they share, and [name, what differs]."""
+    groups: dict[tuple[Any, ...], list[Any]] = {}
+    for leaf in facts["leaves"]:
+        shared = tuple(leaf[key] for key in SHARED)
+        own = [leaf["name"], *(leaf[key] for key in ("value", "lower", "upper"))]
+        groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(own)
+    packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
+    return {**facts, "leaves": packed}
 
 
 def data(value: Any) -> str:
@@ -117,7 +130,7 @@ def _program(loop: WholeLoop, tangents: TangentLoop) -> str:
     """One loop as an object of its functions."""
     columns = [[f, len(found)] for f, found in loop.saved.items()]
     main, slopes = Printed(loop), PrintedTangents(tangents)
-    along = [f"{n}[{','.join(map(str, i))}]" if i else n for n, i in tangents.leaves]
+    along = [_name(*leaf) for leaf in tangents.leaves]
     own = f"{_block(slopes, 'lead,signals,read,aim,push,slope', f'along:{data(along)}')}"
     return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}")
 
@@ -126,8 +139,14 @@ def _block(printed: Printed, functions: str, facts: str) -> str:
     """Functions in a scope of their own."""
     body = "\n".join([*printed.helpers(), printed.text()])
     measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
-    facts = f"streams:{len(printed.streams())},measures:{measures},{facts}"
+    leaves = data([_name(*leaf) for leaf in printed.loop.leaves])
+    facts = f"streams:{len(printed.streams())},measures:{measures},leaves:{leaves},{facts}"
     return f"(()=>{{{maths(body)}\n{body}\nreturn{{{functions},{facts}}};}})()"
+
+
+def _name(name, index):
+    """The name of an entry of a leaf."""
+    return f"{name}[{','.join(map(str, index))}]" if index else name
 
 
 def _size(measure, entries):
@@ -139,7 +158,8 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
-    leaves = [leaf_of(case, name, index) for name, index in loops[0].leaves]
+    own = {leaf: one.case for one in reversed(loops) for leaf in one.leaves}
+    leaves = [leaf_of(own[leaf], *leaf) for leaf in sorted(own, key=lambda leaf: leaf[0])]
     tanks = list((case.names or {}).get("tank", ())) or [""] * plant.tanks
     pumps = list((case.names or {}).get("pump", ())) or [""] * plant.pumps
     rims = [float(v) for v in np.broadcast_to(np.asarray(plant.rim), (plant.tanks,))]
@@ -165,7 +185,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             for j in range(plant.pumps)
         ],
         "leaves": leaves,
-        "measures": [_measure(case, m, loops[0].measures[m]) for m in loops[0].measures],
+        "measures": [_measure(case, m, found) for m, found in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
         "logarithmic": [b.name for b in free if b.scale == "log"],
@@ -178,7 +198,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             "present": len(loops) > 1 or loop.safety_filter is not None,
             "default_on": loop.safety_filter is not None,
         },
-        "noise": [i for i, leaf in enumerate(leaves) if leaf["name"].startswith("sensor.noise")],
+        "noise": bool(np.any(np.asarray(loop.sensor.noise) > 0)),
     }
 
 
@@ -205,6 +225,8 @@ def _limits(case):
                 "upper": None,
                 "lower": None,
                 "unit": ms.unit(limit.measure, case.loop.units),
+                "scale": float(limit_scale(limit, case.loop)),
+                "nan_holds": bool(ms.MEASURES[limit.measure].nan_holds),
                 side: float(limit.value),
             }
         )

@@ -245,8 +245,26 @@ class Printed:
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 
-def function(name, arguments, lines):
-    return f"function {name}({arguments}){{" + "\n".join(lines) + "}"
+def function(name: str, arguments: str, lines: Iterable[str]) -> str:
+    """Return a function as text, with constants that follow each other in one statement.
+
+    Examples
+    --------
+    >>> print(function("f", "q", ["const[a]=q;", "const b=a+1;", "return b;"]))
+    function f(q){const[a]=q,
+    b=a+1;
+    return b;}
+    """
+    short: list[str] = []
+    constant = False
+    for line in lines:
+        now = line.startswith(("const ", "const[")) and line.endswith(";")
+        if now and constant:
+            short[-1] = short[-1][:-1] + ","
+            line = line.removeprefix("const").lstrip()
+        short.append(line)
+        constant = now
+    return f"function {name}({arguments}){{" + "\n".join(short) + "}"
 
 
 def maths(text: str) -> str:
