@@ -10,13 +10,8 @@ function make(tag, attributes = {}, ...children) {
   return node;
 }
 
-const unpacked = Object.fromEntries(["engine", "uplot", "worker"].map((id) => [id, inflate($(id).textContent)]));
-for (const id of ["engine", "uplot"]) {
-  const script = make("script"); // allowed by its hash in the page's policy
-  script.textContent = unpacked[id];
-  document.head.append(script);
-}
-const data = JSON.parse($("data").textContent);
+const { unpacked } = window.jaxtank; // by loader.js
+const data = JSON.parse(unpacked.data);
 const engine = makeEngine();
 const { info } = engine;
 info.measures = info.measures.filter((m) => !m.name.startsWith("time_of_")); // as simulate prints them
@@ -430,11 +425,11 @@ function tuneNow() {
   }
   pin("before tuning");
   const words = (found) => `objective ${shown(found.objective)}${
-    found.violation > 0 ? `, limits passed by ${shown(found.violation, 3)}` : ""}`;
+    found.violation > 0 ? `, limits passed by ${shown(100 * found.violation, 3)} %` : ""}`;
   ask({ kind: "tune", values: start, free: names, limits: info.limits, ...options() }, {
     progress(now) {
       if (!best || now.values) best = now;
-      say(`Tuning ${names.length} of ${leaves.length} parameters: iteration ${now.iterations}, ${words(now)}`);
+      say(`Tuning ${names.length === 1 ? "one parameter" : `${names.length} parameters`}: iteration ${now.iterations}, ${words(now)}`);
       if (now.values) apply(now);
     },
     tuned(found) {

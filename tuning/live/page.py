@@ -26,7 +26,7 @@ from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
 
 HERE = Path(__file__).parent
-SCRIPTS = ("inflate", "core", "charts", "rig", "page")
+SCRIPTS = ("core", "charts", "rig", "page")
 KEPT = 8
 """Engines that are kept in memory."""
 
@@ -194,10 +194,10 @@ def assemble(engine_text, name, data):
     --------
     >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
     >>> "a &lt;b&gt;" in text, text.count("</script>")
-    (True, 5)
+    (True, 6)
     """
-    packed = {"engine": engine_text, "uplot": _read("vendor/uPlot.iife.min.js")}
-    run = [*packed.values(), _page_script()]
+    packed = {"engine": engine_text, "uplot": _read("vendor/uPlot.iife.min.js"), "page": _whole()}
+    run = [*packed.values(), _loader()]
     policy = "; ".join(
         [
             "default-src 'none'",
@@ -209,7 +209,9 @@ def assemble(engine_text, name, data):
             "form-action 'none'",
         ]
     )
-    packed["worker"] = "\n".join(map(_script, ("tune", "core", "worker")))
+    search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
+    packed["worker"] = "\n".join([search, _script("core"), _script("worker")])
+    packed["data"] = json.dumps(data, allow_nan=False, separators=(",", ":"))
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -218,12 +220,11 @@ def assemble(engine_text, name, data):
             f"<title>{html.escape(name)}: live</title>",
             f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
             _read("page.html"),
-            f'<script type="application/json" id="data">{_json(data)}</script>',
             *(
                 f'<script type="text/plain" id="{n}">{_packed(t)}</script>'
                 for n, t in packed.items()
             ),
-            f"<script>{_page_script()}</script>",
+            f"<script>{_loader()}</script>",
             "</body>\n</html>\n",
         ]
     )
@@ -247,12 +248,6 @@ def source_of(text):
     return f"'sha256-{digest}'"
 
 
-def _json(value):
-    """JSON that may stand in a script element."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
-
-
 @cache
 def _read(name):
     return (HERE / name).read_text(encoding="utf-8").strip()
@@ -273,9 +268,15 @@ def _script(name):
 
 
 @cache
-def _page_script():
+def _whole():
     """The scripts of the page as one function, so that they define nothing global."""
-    licence = "/* Packed beside this: uPlot 1.6.32, copyright (c) 2022 Leon Sorokin, MIT licence:"
+    return "\n".join(['(() => {"use strict";', *map(_script, SCRIPTS), "})();"])
+
+
+@cache
+def _loader():
+    """The script that unpacks the others, with the licence of what is not ours."""
+    licence = "/* Packed in this page: uPlot 1.6.32, copyright (c) 2022 Leon Sorokin, MIT licence:"
     terms = _read("vendor/uPlot-LICENSE.txt").partition("\n\n")[2]
-    parts = [licence, terms, '*/\n(() => {"use strict";', *map(_script, SCRIPTS), "})();"]
-    return "\n".join(parts)
+    parts = [licence, terms, '*/\n(() => {"use strict";', _script("inflate"), _script("loader")]
+    return "\n".join([*parts, "})();"])
