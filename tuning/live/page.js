@@ -104,7 +104,15 @@ function describe() {
   $("spoken").textContent = [$("verdict").textContent, words].filter(Boolean).join(". ");
 }
 
+// a command designs the filter for the plant, the pumps and the noise that it is given
+function noteFilter() {
+  const groups = ["plant", "pumps", "sensor"];
+  const moved = Object.keys(effective()).some((name) => groups.includes(byName.get(name)?.group));
+  $("filter-note").hidden = !(state.filter && moved);
+}
+
 function changed() {
+  noteFilter();
   bands = null;
   touch();
 }
@@ -205,13 +213,16 @@ function limitWords(limit) {
   return `${limit.measure}, ${tank}`;
 }
 
+// a name that may be broken after each "_"
+const broken = (text) => text.split(/(?<=_)/).flatMap((part, i) => (i ? [make("wbr"), part] : [part]));
+
 // a table, its cells replaced and not made anew where its shape stays
 function fill(host, caption, heads, rows) {
   const shape = JSON.stringify([heads, rows.map((row) => row.head)]);
   if (host.dataset.shape !== shape) {
     host.dataset.shape = shape;
     const head = make("tr", {}, ...heads.map((text) => make(text ? "th" : "td", text ? { scope: "col" } : {}, text)));
-    const body = rows.map((row) => make("tr", {}, make("th", { scope: "row", title: row.title }, row.head),
+    const body = rows.map((row) => make("tr", {}, make("th", { scope: "row", title: row.title }, ...broken(row.head)),
       ...row.cells.map(() => make("td"))));
     host.replaceChildren(...(rows.length
       ? [make("table", {}, make("caption", {}, caption), make("thead", {}, head), make("tbody", {}, ...body))]
@@ -294,10 +305,13 @@ function slider(leaf) {
   return row;
 }
 
+// numbers without a slider: of models, and of the safety filter, which a command designs anew
+const HIDDEN = ["model", "safety filter"];
+
 function makeSliders() {
   const groups = new Map();
   for (const leaf of leaves) {
-    if (leaf.group === "model") continue;
+    if (HIDDEN.includes(leaf.group)) continue;
     const own = state.free.has(leaf.name) ? "tuned gains" : leaf.group;
     if (!groups.has(own)) groups.set(own, []);
     groups.get(own).push(leaf);
@@ -346,6 +360,7 @@ function refresh() {
   rows.forEach(({ update }) => update());
   if ($("seed")) $("seed").value = state.seed;
   $("filter").checked = state.filter === true;
+  noteFilter();
   document.querySelectorAll("#breaks button").forEach((button) =>
     button.setAttribute("aria-pressed", String(state.broken.has(button.textContent))));
   changed();
@@ -456,7 +471,7 @@ function manyPlants() {
   const now = effective();
   for (const leaf of leaves) {
     const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
-    if (share === undefined || leaf.group === "model") continue;
+    if (share === undefined || HIDDEN.includes(leaf.group)) continue;
     spread[leaf.name] = share;
     values[leaf.name] = now[leaf.name] ?? leaf.value;
   }
@@ -688,7 +703,7 @@ function start() {
 }
 
 window.jaxtank = {
-  names: leaves.map((leaf) => leaf.name),
+  names: leaves.filter((leaf) => !HIDDEN.includes(leaf.group)).map((leaf) => leaf.name),
   // sets the sliders to `values` (others as in the case), shows the run and returns it
   run(values = {}) {
     for (const name of Object.keys(values))
