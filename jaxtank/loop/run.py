@@ -20,19 +20,12 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.loop.closed_loop import (
-    ClosedLoop,
-    Inputs,
-    initial,
-    inputs,
-    is_broken,
-    keyed,
-    run_of,
-    zero_of,
-)
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.functions import needed_by, values_of
+from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
-from jaxtank.loop.trajectory import COLUMNS, Trajectory
+from jaxtank.loop.trajectory import Trajectory
 from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import checkpointed_scan, scan
 from jaxtank.xla.jit import compiled
@@ -229,6 +222,11 @@ def evaluate_compiled(
     loop: ClosedLoop, clock: Clock, names: tuple[str, ...], key: jax.Array | None, checkpoint: bool
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """Return (measures, True if the run diverged), unchecked; checkpoint: for reverse mode."""
+    if ms.functions(names):
+        values, broken = evaluate_compiled(
+            loop, clock, needed_by(loop, clock, names), key, checkpoint
+        )
+        return values_of(loop, clock, names, key, values, checkpoint), broken
     loop = keyed(loop, key)
     run = run_of(loop, clock)
     pointwise = clock.samples > CHUNK and is_pointwise(loop)
@@ -262,54 +260,6 @@ def evaluate_compiled(
         carry = scanned(carry, None, clock.samples)
     state, acc = carry
     return ms.read(run, acc, names), is_broken(state)
-
-
-@compiled("clock", "save_every")
-def simulate_compiled(
-    loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int
-) -> tuple[Trajectory, jax.Array]:
-    """Return (Trajectory, True if the run diverged), unchecked."""
-    loop = keyed(loop, key)
-    rows = (clock.samples - 1) // save_every + 1
-    spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
-
-    def in_rows(a: Any) -> Any:
-        padded = jnp.pad(a, (0, max(spare, 0)), mode="edge")
-        return padded[: rows * save_every].reshape(rows, save_every)
-
-    def one(carry: Any, now: Any) -> Any:
-        state, spilled = carry
-        state, sample = step(loop, clock, state, now)
-        return (state, tuple(a + b for a, b in zip(spilled, sample.spilled))), sample
-
-    def unsaved(carry: Any, now: Any) -> Any:
-        return one(carry, now)[0], None
-
-    def row(carry: Any, now: Any) -> Any:
-        spilled = carry[1]
-        carry, sample = one(carry, jax.tree.map(_first, now))
-        if save_every > 1:
-            others = jax.tree.map(_but_first, now)
-            carry = scan(unsaved, carry, others, length=save_every - 1)[0]
-        return carry, sample._replace(spilled=spilled)
-
-    zero = zero_of(loop)
-    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key))
-    start = (initial(loop, clock), (zero,) * loop.plant.tanks)
-    (state, _), saved = scan(row, start, xs, length=rows)
-    columns: dict[str, Any] = {}
-    for name in COLUMNS:
-        value: Any = getattr(saved, name)
-        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
-    return Trajectory(**columns, units=loop.units), is_broken(state)
-
-
-def _first(a: Any) -> Any:
-    return a[0]
-
-
-def _but_first(a: Any) -> Any:
-    return a[1:]
 
 
 def _report_broken(

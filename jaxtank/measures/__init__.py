@@ -1,11 +1,13 @@
 """Numbers that describe a run, accumulated in the time loop: memory does not grow with its length.
 
 `catalogue` holds the measures, `accumulators` what the loop carries for them, `registry` what is
-known of them by name, `running` what the loop calls. May import `jaxtank.core` only.
+known of them by name, `running` what the loop calls, `functions` those that are a function of a
+whole run. May import `jaxtank.core` only.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run
 from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
 from jaxtank.measures.registry import (
     check_names,
     entries,
@@ -18,6 +20,7 @@ from jaxtank.measures.registry import (
     squares,
     times,
     unit,
+    unreadable,
 )
 from jaxtank.measures.running import needs, read, residual_weights, residuals, start, update
 
@@ -28,8 +31,12 @@ __all__ = [
     "Context",
     "Measure",
     "Run",
+    "RunFunction",
     "check_names",
     "entries",
+    "from_function",
+    "functions",
+    "name_of",
     "needs",
     "of_loop",
     "placed",
@@ -44,5 +51,6 @@ __all__ = [
     "start",
     "times",
     "unit",
+    "unreadable",
     "update",
 ]

@@ -28,6 +28,10 @@ AGREE = 0.01
 """Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
 to a few percent."""
 
+AGAIN = 1.25
+"""All gains stay at their first values where that costs less than this many times WORTH: those of
+an earlier answer, which may cost WORTH already, on plants and limits that differ a little [-]."""
+
 TOLERANCE = 1e-4
 """Change of the cost, as a share of its first value, at which a search has converged [-]."""
 
@@ -48,6 +52,8 @@ class Found:
 
     z : (P,) the answer.  kept : (P,) True for gains at their first value.  agreed : True if two
     searches ended within AGREE, or evolution found nothing better.  starts : as in `TuningResult`.
+    slack : (limits,) by how much the first values may violate the limits of the search, in the unit
+    of each; None for nothing.
     """
 
     search: Search | None = None
@@ -55,6 +61,7 @@ class Found:
     z: Any = None
     kept: Any = None
     idle: Any = None
+    slack: Any = None
     agreed: bool = False
     interrupted: bool = False
 
@@ -119,6 +126,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     """
     first = problem.start()
     reference = problem.point(first)
+    problem.check_slopes(reference)
     search = found.search = Search(problem, reference, report, TOLERANCE)
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])
@@ -139,7 +147,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     if not found.agreed:
         found.agreed = _confirmed(search, found, Population(zs, costs, margins), plan)
     found.idle = diagnostics.unexercised(problem, search, first)
-    found.z, found.kept = stay_put(search, first, plan["iterations"])
+    found.z, found.kept = stay_put(search, first, plan["iterations"], found.slack)
 
 
 def _local_search(search, found, z, iterations):
@@ -198,7 +206,9 @@ def _agree(starts):
     return len(costs) > 1 and converged and costs[1] <= costs[0] * (1.0 + AGREE)
 
 
-def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+def stay_put(
+    search: Search, first: np.ndarray, iterations: int, slack: Any = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more.
 
     One gain after the other is set back to its value in `first` and the rest searched again. It
@@ -213,7 +223,7 @@ def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.nda
     def good(point):
         return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
 
-    if good(search.point(first)):
+    if _all_stay(search, search.point(first), allowed, slack):
         return first.copy(), ~kept
     # first those whose value costs least by the curvature at the best point
     order = np.argsort(np.diag(best.gauss_newton) * (best.z - first) ** 2, kind="stable")
@@ -226,6 +236,13 @@ def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.nda
         else:
             z = _towards(search, i, first, z, ceiling, allowed, good)
     return z, kept
+
+
+def _all_stay(search, start, allowed, slack):
+    """Return True if the first values may stay, all of them: see AGAIN and `Found.slack`."""
+    given = start if slack is None else start._replace(margins=start.margins + slack)
+    dearest = search.best.cost + AGAIN * WORTH * abs(search.best.cost)
+    return start.finite and start.cost <= dearest and search.violation(given) <= allowed
 
 
 def _without(search, trial, first, z, iterations):

@@ -16,9 +16,11 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
 from tuning.problem.bounds import bounds
+from tuning.problem.functions import as_measures
 from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
 from tuning.problem.point import Floats, Point
 from tuning.storage.evaluation_log import EvaluationCache
@@ -58,8 +60,10 @@ class Problem:
     ----------
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
-    objective : {measure: weight}; a measure with several entries counts with their sum.
-    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario.
+    objective : {measure: weight}; a measure with several entries counts with their sum. A function
+        of one's own may stand in the place of a measure, or alone (`tuning.Objective`).
+    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario. With
+        functions of one's own a list: [{measure: value}, tuning.Constraint(...)].
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     cache : an EvaluationCache of what was evaluated before.
@@ -81,8 +85,8 @@ class Problem:
         self,
         case: Case,
         free: Mapping[str, Any] | None = None,
-        objective: Mapping[str, float] | None = None,
-        limits: Mapping[str, Any] | None = None,
+        objective: Any = None,
+        limits: Any = None,
         scenarios: Sequence[Scenario] | None = None,
         seed: int = 0,
         cache: EvaluationCache | None = None,
@@ -95,6 +99,7 @@ class Problem:
         if risk not in RISKS:
             raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
         self.risk = risk
+        objective, limits = as_measures(objective, limits)
         self.bounds = bounds(case.loop, case.free if free is None else free)
         self.objective = check_objective(case.objective if objective is None else objective)
         self.scenarios = sc.check_scenarios(
@@ -107,17 +112,32 @@ class Problem:
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
         self.points: dict[bool, int] = {}
 
-    def limit(self, limits: Mapping[str, Any] | None) -> None:
+    def limit(self, limits: Any) -> None:
         """Replace the limits by `limits`, as in `resolve_limits`.
 
         The evaluation cache holds margins of the former limits, and is emptied."""
         self.given["limits"] = limits
+        limits = as_measures(None, limits, self.objective)[1]
         self.limits: list[Limit] = resolve_in(self.runs, limits)
         self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
+        check_functions(self.loop, self.clock, self.needed)
         self.cache = EvaluationCache()
+
+    def check_slopes(self, point: Point) -> None:
+        """Raise InputError for a function of the user's whose derivative at a Point is NaN."""
+        if not np.isfinite(point.cost):
+            return
+        bad = [*ms.functions(self.objective)] if np.isnan(point.gradient).any() else []
+        measured = zip(self.limits, point.margin_slopes)
+        bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
+        for name in ms.functions(bad):
+            raise InputError(
+                f"function {name}: its derivative by {', '.join(self.names)} is not a number at the"
+                " starting values, as of a root or a quotient at 0"
+            )
 
     @property
     def names(self) -> list[str]:
