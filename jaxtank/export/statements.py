@@ -46,7 +46,7 @@ class Matrix(NamedTuple):
     """A matrix operation, name = op(operands), on arrays by name.
 
     Operations and their `sizes`: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
-    "forward" and "backward" (n, k): solve L x = b and L' x = b.
+    "forward" and "backward" (n, k): solve L x = b and L' x = b; "solve" (n, k): A x = b, any A.
     """
 
     name: str
@@ -58,6 +58,20 @@ class Matrix(NamedTuple):
     def reads(self):
         """Names of the variables that it reads."""
         return set(self.operands)
+
+
+class Store(NamedTuple):
+    """array[index] = value, in place; `name` is what the array is called from then on."""
+
+    name: str
+    array: str
+    index: Any
+    value: Any
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads, the array as it was among them."""
+        return {self.array} | names([self.index, self.value])
 
 
 class Until(NamedTuple):
@@ -89,7 +103,7 @@ class Loop(NamedTuple):
         return inside | names(self.new) | names(start for _, _, start in self.carried)
 
 
-Statement = Define | Array | Matrix | Until | Loop
+Statement = Define | Array | Matrix | Store | Until | Loop
 
 
 def names(entries: Iterable) -> set[str]:

@@ -22,7 +22,6 @@ from tuning.storage.evaluation_log import NAME
 MANY = 64
 """Combinations that are tried at most."""
 
-SIDES = ("before", "after")
 UNFIT = "does not fit"
 """Status of a combination that the rig cannot have."""
 
@@ -71,7 +70,8 @@ def tune_choices(
         result = tune(variant.case, method, checkpoint=folder, resume=old, **own)
         results.append((variant.values, result))
         after = {n: p["after"] for n, p in result.parameters.items()}
-        rows.append(_row(variant, str(result.status), *map(result.objective.get, SIDES), after))
+        before, now = (result.objective[side] for side in ("before", "after"))
+        rows.append(_row(variant, str(result.status), before, now, after))
         if result.status == Status.INTERRUPTED:
             break
     chosen, best = min(results, key=lambda found: _rank(found[1]))

@@ -28,7 +28,9 @@ CODES = """exit codes:
   2    bad input: one line on stderr, nothing written
   3    not converged
   4    a limit is violated
-  130  interrupted: the best point so far is printed and written"""
+  130  interrupted (Ctrl-C): the best point so far is printed and written
+  143  terminated (SIGTERM): the same; so ends a job that a script runs with &, which ignores
+       Ctrl-C. A second signal stops at once; --resume DIR goes on where either stopped"""
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -152,7 +154,7 @@ def _tune(args):
     result = _besides(args, case, result, task, sweep, progress)
     args.out = folder
     _finish(args, result)
-    return EXIT["interrupted" if progress.stop else result.status]
+    return progress.code if progress.stop else EXIT[result.status]
 
 
 def _task(args, case, seed) -> dict[str, Any]:
