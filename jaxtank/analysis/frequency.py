@@ -25,9 +25,8 @@ class OpenLoop(NamedTuple):
     Examples
     --------
     >>> one = jnp.eye(1)
-    >>> loop = OpenLoop(0.9 * one, one, 0.5 * one, 0, 1.0)
-    >>> abs(complex(at(loop, jnp.array([0.5]))[0, 0, 0] - 0.5 / (np.exp(0.5j) - 0.9))) < 1e-12
-    True
+    >>> OpenLoop(0.9 * one, one, 0.5 * one, dead=0, dt=1.0).dead
+    0
     """
 
     A: Any
@@ -159,27 +158,54 @@ def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
     return jnp.einsum("in,fnm->fim", C, X) * (z**-dead)[:, None, None], det
 
 
-def at(loop: OpenLoop, w: Any) -> Any:
-    """Return L (K, m, m) at frequencies w (K,) [rad/s], with first derivatives by the loop and w.
+class Held(NamedTuple):
+    """X = (z I - A)^-1 B (K, n, m) and Y = C (z I - A)^-1 (K, m, n), without derivatives."""
 
-    With X = (z I - A)^-1 B and Y = C (z I - A)^-1 held, C X + Y (B - (z I - A) X) has the value of
-    C X and the derivatives of L: no system is solved for each of many directions.
+    X: Any
+    Y: Any
+
+
+def held(loop: OpenLoop, w: Any) -> Held:
+    """Return what `near` needs at frequencies w (K,) [rad/s].
 
     Examples
     --------
     >>> one = jnp.eye(1)
-    >>> L = lambda a: at(OpenLoop(a * one, one, one, 0, 1.0), jnp.array([0.5]))[0, 0, 0].real
+    >>> held(OpenLoop(0.9 * one, one, 0.5 * one, 0, 1.0), jnp.array([0.5])).X.shape
+    (1, 1, 1)
+    """
+    (A, B, C), w = jax.lax.stop_gradient((loop[:3], w))
+
+    def one(w):
+        M = jnp.exp(1j * w * loop.dt) * jnp.eye(A.shape[0]) - A
+        both = jnp.stack([M, M.T])
+        widest = max(B.shape[1], C.shape[0])
+        pad = lambda v: jnp.pad(v.astype(M.dtype), ((0, 0), (0, widest - v.shape[1])))
+        X, Y = jax.vmap(solve)(both, jnp.stack([pad(B), pad(C.T)]))
+        return Held(X[:, : B.shape[1]], Y[:, : C.shape[0]].T)
+
+    return jax.vmap(one)(w)
+
+
+def near(loop: OpenLoop, held: Held, w: Any) -> Any:
+    """Return L (K, m, m) at frequencies w (K,) [rad/s] next to those of `held`, to second order,
+    with first derivatives by the loop and w.
+
+    C X + Y (B - (z I - A) X) has the value of C X and the derivatives of L: no system is solved
+    for each of many directions.
+
+    Examples
+    --------
+    >>> one, w = jnp.eye(1), jnp.array([0.5])
+    >>> loop = lambda a: OpenLoop(a * one, one, one, 0, 1.0)
+    >>> L = lambda a: near(loop(a), held(loop(a), w), w)[0, 0, 0].real
     >>> exact = (1.0 / (np.exp(0.5j) - 0.3) ** 2).real
     >>> abs(float(jax.grad(L)(0.3)) - exact) < 1e-5
     True
     """
     A, B, C, dead, dt = loop
-
-    def one(w):
-        z = jnp.exp(1j * w * dt)
-        M = z * jnp.eye(A.shape[0]) - A
-        still, b, c = (jax.lax.stop_gradient(v) for v in (M, B, C))
-        X, Y = solve(still, b.astype(z.dtype)), solve(still.T, c.T.astype(z.dtype)).T
-        return (C @ X + Y @ (B - M @ X)) * jnp.exp(-1j * w * dt * dead)
-
-    return jax.vmap(one)(w)
+    z = jnp.exp(1j * w * dt)
+    X, Y = held
+    left = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
+    L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, left)
+    return L * jnp.exp(-1j * w * dt * dead)[:, None, None]

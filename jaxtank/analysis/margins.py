@@ -256,11 +256,10 @@ def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable
     which = np.concatenate([[0], np.tile(np.arange(m), 3)])
     index = np.arange(len(which))
 
-    def alone(loop, w):
-        return _alone(_sensitivity(fr.at(loop, w)))[index, which]
+    held = fr.held(still, w)
 
     def zero(loop, w):
-        one = alone(loop, w)
+        one = _alone(_sensitivity(fr.near(loop, held, w)))[index, which]
         size = jnp.log(jnp.where(jnp.abs(one) > 0.0, jnp.abs(one), 1.0))
         return jnp.where(index <= m, jnp.imag(one), size)
 
@@ -269,10 +268,11 @@ def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable
     moves = brackets.exists & brackets.inside & (index > 0) & (steep != 0.0)
     w = w - jnp.where(moves, zero(loop, w) / jnp.where(steep != 0.0, steep, 1.0), 0.0)
 
-    S = _sensitivity(fr.at(loop, w[:1]))[0]
+    every = _sensitivity(fr.near(loop, held, w))
+    S = every[0]
     u, v, _ = _pair(jax.lax.stop_gradient(S))
     peak = jnp.real(jnp.conj(u) @ S @ v)
-    one = jnp.where(brackets.exists, alone(loop, w), 1.0)  # no zero to divide by
+    one = jnp.where(brackets.exists, _alone(every)[index, which], 1.0)  # no zero to divide by
     size, angle = jnp.log(jnp.abs(one)), jnp.angle(one)
     wrapped = jnp.mod(angle + jnp.pi, 2.0 * jnp.pi)
     found = jnp.where(

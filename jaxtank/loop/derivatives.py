@@ -17,6 +17,7 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
@@ -111,7 +112,8 @@ def sensitivities_compiled(
     floats, dfloats, rest, matrix = carry
 
     def finish(floats: Any, theta: Any) -> Any:
-        return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None
+        run = run_with(at(theta), clock, names)
+        return ms.read(run, carried.join(floats, rest)[1], names), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])

@@ -31,6 +31,7 @@ from jaxtank.loop.closed_loop import (
     zero_of,
 )
 from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import COLUMNS, Trajectory
 from jaxtank.loop.validation import check
@@ -250,7 +251,7 @@ def evaluate_compiled(
     else:
         carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
     state, acc = carry
-    return ms.read(run, acc, names), is_broken(state)
+    return ms.read(run_with(loop, clock, names), acc, names), is_broken(state)
 
 
 @compiled("clock", "save_every")

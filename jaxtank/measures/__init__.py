@@ -4,11 +4,13 @@
 known of them by name, `running` what the loop calls. May import `jaxtank.core` only.
 """
 
-from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run
-from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
+from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.measure import Measure
 from jaxtank.measures.registry import (
     check_names,
     entries,
+    linear,
     of_loop,
     placed,
     refers_to,
@@ -28,8 +30,10 @@ __all__ = [
     "Context",
     "Measure",
     "Run",
+    "Worst",
     "check_names",
     "entries",
+    "linear",
     "needs",
     "of_loop",
     "placed",

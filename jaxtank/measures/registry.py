@@ -13,7 +13,8 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import shortened
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
-from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.measure import Measure
 
 BUILT_IN = frozenset(MEASURES)
 _NAME = re.compile(r"[A-Za-z]\w*")
@@ -160,8 +161,13 @@ def times() -> tuple[str, ...]:
 
 
 def reported() -> tuple[str, ...]:
-    """Return the names of the measures in a result: all but `times()`."""
-    return tuple(m for m in MEASURES if m not in times())
+    """Return the names of the measures in a result: all of the run but `times()`."""
+    return tuple(m for m in MEASURES if m not in times() and not MEASURES[m].linear)
+
+
+def linear() -> tuple[str, ...]:
+    """Return the names of the measures of the linearised loop: computed where they are named."""
+    return tuple(m for m, spec in MEASURES.items() if spec.linear)
 
 
 def placed(field: str) -> tuple[str, ...]:
@@ -202,15 +208,18 @@ def of_loop(loop: Any) -> tuple[str, ...]:
     has: those that a file of it may name. `serves` asks for more.
     """
     missing = _missing(loop)
-    return tuple(m for m in reported() if not missing & refers_to([m]))
+    of_run = (m for m in reported() if not missing & refers_to([m]))
+    return (*of_run, *(m for m in linear() if serves(m, loop)))
 
 
 def serves(name: str, loop: Any) -> bool:
     """Return whether the measure `name` means something for this loop: its reference changes, its
-    tanks have inflow pulses, its steady inputs are known in closed form, its levels have a lower
-    clip, it has a safety filter.
+    holds setpoints, its tanks have inflow pulses, its steady inputs are known in closed form, its
+    levels have a lower clip, it has a safety filter.
     """
     wanted, plant = refers_to([name]), loop.plant
+    if MEASURES[name].linear and loop.reference.held() is None:
+        return False
     if "steady" in wanted and (
         getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs)
     ):
