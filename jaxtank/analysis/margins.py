@@ -179,9 +179,7 @@ def _brackets(w: Any, L: Any) -> _Brackets:
     gain, alone = _largest_gain(S), _alone(S)
     k = jnp.argmax(gain)
     last = len(w) - 1
-    found = [
-        (log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), 0 < last)
-    ]
+    found = [(log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), last > 0)]
     rows = ([], [], [])
     for i in range(L.shape[1]):
         one = alone[:, i]

@@ -6,12 +6,14 @@ May import `loop.operating_point` and the folders below `jaxtank.loop`.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
@@ -110,23 +112,23 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     bare = dataclasses.replace(
         loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None
     )
-    found = _compiled(bare, dataclasses.replace(clock, duration=clock.dt), r)
-    return r, *found
+    one = functools.partial(_compiled, bare, dataclasses.replace(clock, duration=clock.dt))
+    if any(isinstance(v, Tracer) for v in jax.tree.leaves((bare, r))):
+        # one after the other: a program for one of them is compiled in half the time
+        return r, *jax.lax.map(one, r)
+    rows = [one(v) for v in r]  # by one program, however many there are
+    return r, *jax.tree.map(_stacked, *rows)
+
+
+def _stacked(*values: Any) -> Any:
+    return jnp.stack(values)
 
 
 @compiled("clock")
 def _compiled(loop: ClosedLoop, clock: Clock, r: Any) -> tuple[Any, am.Margins]:
-    """(Linearised, Margins) of the plateaus with setpoints r (P, outputs)."""
-
-    def one(r: Any) -> Any:
-        found = linearised(loop, clock, r)
-        dead, dt = found.open_loop.dead, found.open_loop.dt
-        A, B, C = found.open_loop[:3]
-        margins = am.margins(am.OpenLoop(A, B, C, dead, dt))
-        return found._replace(open_loop=(A, B, C)), margins
-
-    # one plateau after the other: a program for one of them is compiled in half the time
-    return jax.lax.map(one, r)
+    """(Linearised, Margins) of one plateau with setpoints r (outputs,)."""
+    found = linearised(loop, clock, r)
+    return found._replace(open_loop=found.open_loop[:3]), am.margins(found.open_loop)
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:

@@ -34,9 +34,9 @@ KINK = 1e-3
 
 REASONS = (
     "",
+    "a tank would be at its rim",
     "the loop has no steady state there, whatever the limits of the pumps",
     "a tank would be empty, or below its laminar threshold",
-    "a tank would be at its rim",
     "a pump would run at or beyond its limits",
     "the controller or an instrument has no derivative there (a switch, a dead zone)",
     "the controller or an instrument counts samples, and has no steady state",
@@ -82,16 +82,16 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     ''
     """
     quiet, dead = _without_limits(loop, clock)
-    found = _rest(clock, quiet, r)
+    found, alone = _rest(clock, quiet, r), _plant_at_rest(quiet.plant, r)[0]
     (closed, B, C, after, u), s, kink = found.slopes, found.s, found.kink
     x = s[: loop.plant.tanks]  # the first numbers of a State
     span = jnp.stack([jnp.asarray(loop.actuator.high), jnp.asarray(loop.actuator.low)])
     moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
     checks = [
+        jnp.any(alone >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
         jnp.any(moved) | ~jnp.all(jnp.stack(finite)),
         jnp.any(x < getattr(loop.plant, "knee", 0.0)),
-        jnp.any(x >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
         jnp.any(u >= span[0]) | jnp.any(u <= span[1]),
         kink,
         found.counts,

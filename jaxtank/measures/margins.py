@@ -16,7 +16,7 @@ NONE_LEFT = (
 NOTHING_HELD = "the reference holds no setpoints at which the loop could be linearised"
 
 
-def _margin(field: str, unit: str, doc: str, unlimited: str) -> Measure:
+def _margin(field: str, unit: str, doc: str, unlimited: str, shown: int) -> Measure:
     """A margin of each pump: larger is better, infinite where nothing crosses."""
 
     def read(run: Run, accumulated: dict[str, Any]) -> Any:
@@ -30,6 +30,7 @@ def _margin(field: str, unit: str, doc: str, unlimited: str) -> Measure:
         doc,
         low=None,
         sense=-1.0,
+        shown=shown,
         undefined=NONE_LEFT,
         worst=UNSTABLE,
         unlimited=unlimited,
@@ -45,6 +46,7 @@ MARGINS: dict[str, Measure] = {
         (),
         lambda run, accumulated: run.margins.sensitivity_peak,
         "Ms of the linearised loop: largest gain of 1/(1 + L), at the pumps",
+        shown=110,
         undefined=NONE_LEFT,
         worst=UNSTABLE,
         unserved=NOTHING_HELD,
@@ -55,18 +57,21 @@ MARGINS: dict[str, Measure] = {
         "-",
         "factor on the loop gain, up or down, that the linearised loop stands",
         "the phase never reaches -180 deg",
+        120,
     ),
     "phase_margin": _margin(
         "phase_margin",
         "deg",
         "change of the phase that the linearised loop stands",
         "the gain never reaches 1",
+        130,
     ),
     "delay_margin": _margin(
         "delay_margin",
         "s",
         "additional dead time that the linearised loop stands",
         "the gain never reaches 1",
+        140,
     ),
 }
 """{name: Measure}, entries of the catalogue."""

@@ -22,7 +22,7 @@ from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, plants_
 from tuning.answer.stay_put import Found, search_from
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.problem import Problem
-from tuning.problem.reported import run_measures
+from tuning.problem.reported import margin_measures, run_measures
 from tuning.problem.scenarios import noisy, with_noise_drawn
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
@@ -297,8 +297,11 @@ def _lost(setting, problem, nominal, values):
 
 
 def _nominal(case):
-    """Return the measures of the case's own run, without noise unless it has some."""
-    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
+    """Return the measures of the case's own run, without noise unless it has some, and the
+    stability margins of its linearised loop.
+    """
+    key = jax.random.key(0) if noisy(case) else None
+    return run_measures(case.loop, case.clock, key) | margin_measures(case.loop, case.clock)
 
 
 def _idle(setting, before, after):

@@ -213,7 +213,5 @@ def bound(
 def _measures(case, found):
     """Return {name: value} of the measures that are defined for the run with the inputs found."""
     loop = open_loop(case.loop, found["u"].T, found["interval"])
-    names = tuple(
-        m for m in ms.reported() if ms.serves(m, loop) and m != "estimation_rms"
-    )
+    names = tuple(m for m in ms.reported() if ms.serves(m, loop) and m != "estimation_rms")
     return {m: np.asarray(v) for m, v in lp.evaluate(loop, case.clock, names).items()}

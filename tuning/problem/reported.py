@@ -13,7 +13,8 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.closed_loop import ClosedLoop, zero_of
+from jaxtank.loop.margins import worst
 from tuning.problem import scenarios as sc
 from tuning.problem.problem import Problem
 
@@ -27,13 +28,25 @@ def run_measures(loop: ClosedLoop, clock: Clock, key: Any) -> dict[str, np.ndarr
     return {m: np.asarray(v) for m, v in values.items()}
 
 
+def margin_measures(loop: ClosedLoop, clock: Clock) -> dict[str, np.ndarray]:
+    """Return {measure: value} of the linearised loop, the worst of its plateaus; {} where the
+    reference holds no setpoints, and outside float64.
+    """
+    names = tuple(m for m in ms.linear() if ms.serves(m, loop))
+    if not names or zero_of(loop).dtype != np.float64:
+        return {}
+    found = worst(loop, clock)
+    return {m: np.asarray(getattr(found, m)) for m in names}
+
+
 def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]:
     """Return {measure: value} of every scenario at {parameter: value}."""
     points = {n: np.array([v]) for n, v in values.items()}
+    linear = tuple(m for m in problem.needed if ms.MEASURES[m].linear)
     table: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
         loop = problem.runs[group.runs[0]].case.loop
-        measures, _ = sc.values_of(group, _names(loop), points)
+        measures, _ = sc.values_of(group, (*_names(loop), *linear), points)
         for j, i in enumerate(group.runs):
             table[i] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
     return table
