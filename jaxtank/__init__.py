@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from jaxtank.loop.run import simulate as simulate
     from jaxtank.loop.trajectory import Trajectory as Trajectory
     from jaxtank.loop.validation import check as check
+    from jaxtank.xla.program_cache import cache as cache
 
 __version__ = "0.1.0"
 
@@ -81,6 +82,7 @@ _NAMES = {
     "sensitivities": "jaxtank.loop.run",
     "stability_margins": "jaxtank.loop.margins",
     "check": "jaxtank.loop.validation",
+    "cache": "jaxtank.xla.program_cache",
 }
 _FOLDERS = (
     "analysis",

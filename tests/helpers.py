@@ -42,6 +42,7 @@ RANKS = [
     "tuning.feasible",
     "tuning.search tuning.falsification",
     "tuning.answer",
+    "tuning.live",
     "tuning.report",
     "tuning.bench",
     "tuning.cli",

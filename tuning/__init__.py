@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from tuning.identification.result import Identifications as Identifications
     from tuning.optimal_input.perfect_information import bound as bound
     from tuning.problem.bounds import Bound as Bound
+    from tuning.problem.functions import Constraint as Constraint
+    from tuning.problem.functions import Objective as Objective
     from tuning.problem.problem import Problem as Problem
     from tuning.problem.status import Status as Status
     from tuning.search.options import LBFGS as LBFGS
@@ -65,6 +67,8 @@ _NAMES = {
     "LBFGS": "tuning.search.options",
     "SQP": "tuning.search.options",
     "TRF": "tuning.search.options",
+    "Constraint": "tuning.problem.functions",
+    "Objective": "tuning.problem.functions",
     "Problem": "tuning.problem.problem",
     "ConstraintRow": "tuning.search.result",
     "Message": "tuning.search.result",

@@ -95,7 +95,7 @@ class PID(Controller):
     """
 
     model: Plant
-    Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc", low=0.0, strict=True)
+    Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc, not 0; below 0 where a pump lowers its output")
     Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
     Td: np.ndarray | None = leaf(
         "s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None
@@ -180,6 +180,11 @@ class PID(Controller):
             raise InputError(
                 f"PID needs one pump per output: the model has {self.model.pumps} and"
                 f" {len(self.model.outputs)}"
+            )
+        if isinstance(self.Kc, np.ndarray) and not np.all(self.Kc):
+            raise InputError(
+                f"controller.Kc = {self.Kc}: must not be 0; a negative gain is for a pump that"
+                " lowers its output"
             )
         if self.feed_forward:
             check_own_pumps(self.model)

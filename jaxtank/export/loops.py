@@ -6,7 +6,7 @@ RULES holds the primitives of jax; `jaxtank.export.lowering` looks them up there
 import numpy as np
 
 from jaxtank.export.primitives import chosen, kind_of, no_code
-from jaxtank.export.statements import Loop, Ref, Until
+from jaxtank.export.statements import REAL, WHOLE, Loop, Ref, Until
 
 
 def _cond(writer, eqn, operands):
@@ -22,14 +22,49 @@ def _cond(writer, eqn, operands):
 def _scan(writer, eqn, operands):
     p = eqn.params
     first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
-    if operands[last:] or len(eqn.outvars) > p["num_carry"]:
-        raise no_code("a loop in it reads or writes a sequence")
-    closed = p["jaxpr"]
+    if len(eqn.outvars) > p["num_carry"]:
+        raise no_code("a loop in it writes a sequence")
+    closed, sequences = p["jaxpr"], operands[last:]
+    starts, read = operands[first:last], lambda counter: []
+    if sequences:
+        starts = [*starts, np.array(0, dtype=object)]
+        read = _reader(writer, sequences, eqn.invars[last:], p["reverse"])
 
     def body(carried):
-        return writer.run(closed.jaxpr, closed.consts, [*operands[:first], *carried])
+        *own, counter = carried if sequences else (*carried, None)
+        out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *own, *read(counter)])
+        if sequences:
+            after = np.empty((), dtype=object)
+            after[()] = writer.define(WHOLE, "add", counter.item(), 1)
+            out = [*out, after]
+        return out
 
-    return _loop(writer, eqn, operands[first:], p["length"], body)
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars] + [WHOLE] * bool(sequences)
+    return _loop(writer, kinds, starts, p["length"], body)[: len(eqn.outvars)]
+
+
+def _reader(writer, sequences, variables, backwards):
+    """Return a function of the counter of a loop that gives what its pass reads of the sequences:
+    each of their elements is an array of its own, indexed by the counter.
+    """
+    arrays = []
+    for rows, v in zip(sequences, variables):
+        rows, names = rows[::-1] if backwards else rows, np.empty(rows.shape[1:], dtype=object)
+        for i in np.ndindex(names.shape):
+            names[i] = writer.array(rows[(slice(None), *i)])
+        arrays.append((kind_of(v.aval.dtype), names))
+
+    def read(counter):
+        found = []
+        for kind, names in arrays:
+            entries = np.empty(names.shape, dtype=object)
+            for i in np.ndindex(names.shape):
+                entry = Ref(names[i], counter.item())
+                entries[i] = entry if kind == REAL else writer.define(kind, kind, entry)
+            found.append(entries)
+        return found
+
+    return read
 
 
 def _while(writer, eqn, operands):
@@ -42,14 +77,15 @@ def _while(writer, eqn, operands):
         writer.scopes[-1].append(Until(on.item()))
         return writer.run(body.jaxpr, body.consts, [*operands[first:last], *carried])
 
-    return _loop(writer, eqn, operands[last:], None, tested_body)
+    kinds = [kind_of(v.aval.dtype) for v in eqn.outvars]
+    return _loop(writer, kinds, operands[last:], None, tested_body)
 
 
-def _loop(writer, eqn, starts, count, body):
+def _loop(writer, kinds, starts, count, body):
     """The carried variables after a loop; body: function of them that returns the next ones."""
     carried, variables = [], []
-    for v, start in zip(eqn.outvars, starts):
-        kind, refs = kind_of(v.aval.dtype), np.empty(start.shape, dtype=object)
+    for kind, start in zip(kinds, starts):
+        refs = np.empty(start.shape, dtype=object)
         for i in np.ndindex(start.shape):
             ref = refs[i] = Ref(writer.fresh("c"))
             carried.append((kind, ref.name, start[i]))

@@ -6,16 +6,18 @@ left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) and products of large mat
 Imported by `jaxtank.export.printer`.
 """
 
+from typing import Any, NamedTuple
+
 import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jaxtank.export import loops, matrices, primitives
+from jaxtank.export import lines, loops, matrices, primitives
 from jaxtank.export.primitives import constant, elements, kind_of, no_code
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import REAL, Array, Define, Matrix, Ref, names, used
 
-RULES = {**primitives.RULES, **matrices.RULES, **loops.RULES}
+RULES = {**primitives.RULES, **matrices.RULES, **loops.RULES, **lines.RULES}
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
 
@@ -125,23 +127,58 @@ def lower(f, arguments):
     >>> [(s.name, s.op, s.args) for s in statements]
     [('v1', 'mul', (Ref(name='y', index=0), Ref(name='y', index=1)))]
     """
-    closed = jax.make_jaxpr(f)(*arguments.values())
-    writer = Writer()
-    inputs = [a for name, tree in arguments.items() for a in _inputs(writer, name, tree)]
+    made = lower_all(f, arguments)
+    outputs = [np.asarray(v, dtype=object) for v in jax.tree.leaves(made.outputs)]
+    return made.statements, outputs
+
+
+class Lowered(NamedTuple):
+    """What `lower_all` returns."""
+
+    statements: list
+    outputs: Any
+    """What the function returns, with arrays of Refs and numbers in place of arrays."""
+    lines: dict
+    """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
+
+
+def lower_all(f, arguments):
+    """Return the Lowered form of a function: `lower`, with the outputs as the tree they are.
+
+    An array of the arguments that the function writes to at an index that it computes is an input
+    of its own, of which element i is Ref(its name, i).
+
+    Examples
+    --------
+    >>> pair = jax.ShapeDtypeStruct((2,), np.float32)
+    >>> lower_all(lambda y: {"twice": 2.0 * y[1]}, {"y": pair}).outputs
+    {'twice': array(Ref(name='v1', index=None), dtype=object)}
+    """
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
+    writer, moved = Writer(), lines.written(closed.jaxpr)
+    inputs, found = [], {}
+    for name, tree in arguments.items():
+        for start, array in _inputs(writer, name, tree):
+            if closed.jaxpr.invars[len(inputs)] in moved:
+                found[start] = f"{name}_{start.index}"
+                array = lines.elements_of(found[start], array.size)
+            inputs.append(array)
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
     wanted = names(e for out in outputs for e in out.ravel())
-    return used(writer.scopes[0], wanted), outputs
+    kept = used(writer.scopes[0], wanted)
+    return Lowered(kept, jax.tree.unflatten(jax.tree.structure(shape), outputs), found)
 
 
 def _inputs(writer, name, tree):
-    """The arrays of elements of one argument, converted to their kind: every input is a real."""
-    count, arrays = 0, []
+    """Yield (Ref of the first element, elements) of each array of an argument; each element is
+    converted to its kind, for every input is a real.
+    """
+    count = 0
     for leaf in jax.tree.leaves(tree):
         size = int(np.prod(leaf.shape))
         kind, refs = kind_of(leaf.dtype), np.empty(size, dtype=object)
         for i in range(size):
             source = Ref(name, None if leaf is tree and leaf.shape == () else count + i)
             refs[i] = source if kind == REAL else writer.define(kind, kind, source)
-        arrays.append(refs.reshape(leaf.shape))
+        yield Ref(name, count), refs.reshape(leaf.shape)
         count += size
-    return arrays

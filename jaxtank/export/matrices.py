@@ -68,14 +68,51 @@ def _triangular(writer, eqn, operands):
 
 
 def _linear_solve(writer, eqn, operands):
-    """A solve with a right side of zero, of a term that carries derivatives alone."""
-    if not all(is_number(e) and e == 0 for e in operands[-1].ravel()):
-        raise no_code("it uses the operation custom_linear_solve")
-    return [operands[-1]]
+    """Solves with the matrix of a linear function, found by applying it to unit vectors. Numbers
+    that do not meet in it (several right sides) are solved for apart.
+    """
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    right = operands[sum(lengths) :]
+    if len(right) != 1:
+        raise no_code("it solves for several arrays at once")
+    b, shape = right[0].ravel(), right[0].shape
+    if all(is_number(e) and e == 0 for e in b):
+        return right
+    closed, consts = jaxprs.matvec, operands[: lengths.matvec]
+    columns = []
+    for i in range(b.size):
+        unit = np.zeros(b.size, dtype=object)
+        unit[:] = [float(i == j) for j in range(b.size)]
+        (column,) = writer.run(closed.jaxpr, closed.consts, [*consts, unit.reshape(shape)])
+        columns.append(column.ravel())
+    a, x = np.stack(columns, axis=1), np.empty(b.size, dtype=object)
+    for matrix, places in _blocks(a):
+        n, k = places.shape
+        x[places] = writer.matrix("solve", (matrix, b[places]), (n, k), (n, k))
+    return [x.reshape(shape)]
+
+
+def _blocks(a):
+    """Yield (matrix (n, n), places (n, k) in the vector) of each group of equal diagonal blocks."""
+    size = len(a)
+    meet = np.array([[not (is_number(e) and e == 0) for e in row] for row in a]) | np.eye(
+        size, dtype=bool
+    )
+    meet = meet | meet.T
+    for _ in range(size.bit_length()):
+        meet = meet @ meet
+    groups = {}
+    for first in range(size):
+        own = np.flatnonzero(meet[first])
+        if own[0] == first:
+            block = a[np.ix_(own, own)]
+            groups.setdefault(tuple(block.ravel()), (block, []))[1].append(own)
+    for block, places in groups.values():
+        yield block, np.stack(places, axis=1)
 
 
 def _lu(writer, eqn, operands):
-    """The factors of a matrix whose equations have a right side of zero: see `_linear_solve`."""
+    """The factors of a matrix, which `_linear_solve` does not read."""
     return [operands[0], *(np.zeros(v.aval.shape, dtype=object) for v in eqn.outvars[1:])]
 
 

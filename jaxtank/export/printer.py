@@ -73,7 +73,7 @@ class Printer:
         """Return a number or a Ref as text."""
         if isinstance(e, Ref):
             name = self.rename.get(e.name, e.name)
-            return name if e.index is None else self.entry.format(name, e.index + self.first)
+            return name if e.index is None else self.entry.format(name, self._index(e.index))
         if isinstance(e, bool):
             return self.truths[e]
         if np.isnan(e):
@@ -82,6 +82,11 @@ class Printer:
             return self.infinity if e > 0 else f"(-{self.infinity})"
         text = f"({e!r})" if str(e).startswith("-") else repr(e)
         return text if isinstance(e, int) else self.real.format(text)
+
+    def _index(self, index):
+        if isinstance(index, Ref):
+            return f"{index.name} + {self.first}" if self.first else index.name
+        return index + self.first
 
     def right(self, op, args):
         """Return op(args) as an expression."""

@@ -11,6 +11,8 @@ from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import print_c
+from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES
+from jaxtank.export.javascript import print_javascript
 from jaxtank.export.matlab import RESERVED, print_matlab
 from jaxtank.export.printer import function_name
 from jaxtank.export.program import Program, program
@@ -37,7 +39,11 @@ class Language(NamedTuple):
     reserved: Collection[str] = ()
 
 
-LANGUAGES = {"c": Language(print_c, PRECISIONS), "m": Language(print_matlab, reserved=RESERVED)}
+LANGUAGES = {
+    "c": Language(print_c, PRECISIONS),
+    "m": Language(print_matlab, reserved=RESERVED),
+    "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
+}
 """{name, which is also the suffix of the file: Language}."""
 
 
@@ -81,7 +87,7 @@ def export(
     Parameters
     ----------
     case : Case
-    language : "c" (C99), "m" (MATLAB), or one that was added by `register`
+    language : "c" (C99), "m" (MATLAB), "js" (JavaScript), or one that was added by `register`
     precision : "double" or, in C, "float"
     name : of the functions; None: made from the case's
 

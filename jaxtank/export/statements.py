@@ -10,10 +10,10 @@ REAL, WHOLE, TRUTH = "real", "whole", "truth"
 
 
 class Ref(NamedTuple):
-    """A variable, or an entry of an array."""
+    """A variable, or an entry of an array, whose index is a number or a variable."""
 
     name: str
-    index: int | None = None
+    index: "int | Ref | None" = None
 
 
 class Define(NamedTuple):
@@ -46,7 +46,7 @@ class Matrix(NamedTuple):
     """A matrix operation, name = op(operands), on arrays by name.
 
     Operations and their `sizes`: "product" (m, k, n) of A (m, k) and B (k, n); "cholesky" (n,);
-    "forward" and "backward" (n, k): solve L x = b and L' x = b.
+    "forward" and "backward" (n, k): solve L x = b and L' x = b; "solve" (n, k): A x = b, any A.
     """
 
     name: str
@@ -58,6 +58,20 @@ class Matrix(NamedTuple):
     def reads(self):
         """Names of the variables that it reads."""
         return set(self.operands)
+
+
+class Store(NamedTuple):
+    """array[index] = value, in place; `name` is what the array is called from then on."""
+
+    name: str
+    array: str
+    index: Any
+    value: Any
+
+    @property
+    def reads(self):
+        """Names of the variables that it reads, the array as it was among them."""
+        return {self.array} | names([self.index, self.value])
 
 
 class Until(NamedTuple):
@@ -89,12 +103,13 @@ class Loop(NamedTuple):
         return inside | names(self.new) | names(start for _, _, start in self.carried)
 
 
-Statement = Define | Array | Matrix | Until | Loop
+Statement = Define | Array | Matrix | Store | Until | Loop
 
 
 def names(entries: Iterable) -> set[str]:
     """Return the names of the variables among numbers and Refs."""
-    return {e.name for e in entries if isinstance(e, Ref)}
+    found = [e for e in entries if isinstance(e, Ref)]
+    return {e.name for e in found} | {e.index.name for e in found if isinstance(e.index, Ref)}
 
 
 def every(statements: Iterable[Statement]) -> Iterator[Statement]:

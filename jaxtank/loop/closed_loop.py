@@ -125,18 +125,28 @@ def inputs(
     times: Any = clock
     if batch is not None:
         times = Chunk(first=batch * CHUNK, samples=samples, dt=clock.dt)
-    r, dr, ddr = loop.reference.sample(times)
-    d = None if loop.disturbance is None else loop.disturbance.sample(times)[0]
+    return inputs_at(loop, times, names, loop.sensor.draw(key, times.samples, batch))
+
+
+def inputs_at(
+    loop: ClosedLoop, times: Clock | Chunk, names: tuple[str, ...], xi: Group | None
+) -> Inputs:
+    """Return `inputs` of a clock or of a chunk of one, with deviates xi of the sensor noise, (n,)
+    arrays (samples,), that were drawn before; None: none.
+    """
+    moments: Any = times
+    r, dr, ddr = loop.reference.sample(moments)
+    d = None if loop.disturbance is None else loop.disturbance.sample(moments)[0]
     return Inputs(
         r=r,
         dr=dr,
         ddr=ddr,
         d=d,
-        xi=loop.sensor.draw(key, times.samples, batch),
-        context=_context(loop, times, names, r),
+        xi=xi,
+        context=_context(loop, moments, names, r),
         plan=loop.controller.prepare(r, dr, ddr),
-        own=loop.controller.inputs(times),
-        fault=None if loop.faults is None else loop.faults.sample(times),
+        own=loop.controller.inputs(moments),
+        fault=None if loop.faults is None else loop.faults.sample(moments),
     )
 
 

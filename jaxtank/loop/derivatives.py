@@ -17,6 +17,7 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
@@ -62,11 +63,11 @@ def sensitivities_compiled(
     squares: tuple[tuple[str, float], ...] = (("mean_square_error", 1.0),),
     batched: bool = False,
 ) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
-    """Return what `loop.run.sensitivities` returns, unchecked.
-
-    order, values: names and values of the parameters; batched: whether this will be one of several
-    runs side by side.
+    """Return what `loop.run.sensitivities` returns, unchecked, for parameters `order` at `values`;
+    batched: whether this will be one of several runs side by side.
     """
+    if ms.functions(names):
+        return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
@@ -108,8 +109,7 @@ def sensitivities_compiled(
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    carry = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
-    floats, dfloats, rest, matrix = carry
+    floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
         run = run_with(at(theta), clock, names)
@@ -117,6 +117,36 @@ def sensitivities_compiled(
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
+
+
+def _with_functions(
+    loop: ClosedLoop,
+    clock: Clock,
+    names: tuple[str, ...],
+    order: tuple[str, ...],
+    values: tuple[ArrayLike, ...],
+    key: jax.Array | None,
+    squares: tuple[tuple[str, float], ...],
+    batched: bool,
+) -> tuple[dict[str, jax.Array], dict[str, jax.Array], jax.Array, jax.Array]:
+    """`sensitivities_compiled` of functions of the run, by the chain rule: along the measures that
+    they read, and along the run that is kept for them.
+    """
+    flat, unflatten = ravel_pytree(values)
+
+    def at(theta: Any) -> ClosedLoop:
+        return with_values(loop, dict(zip(order, unflatten(theta))))
+
+    kept = needed_by(at(flat), clock, names)
+    known = sensitivities_compiled(loop, clock, kept, order, values, key, squares, batched)
+    measures, slopes, matrix, broken = known
+
+    def functions(measures: Any, theta: Any) -> Any:
+        return values_of(at(theta), clock, names, key, measures), None
+
+    basis = jnp.eye(flat.size, dtype=flat.dtype)
+    found, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
+    return found, rates, matrix, broken
 
 
 def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> Any:

@@ -35,10 +35,10 @@ KINK = 1e-3
 REASONS = (
     "",
     "a tank would be at its rim",
+    "the controller or an instrument has no derivative there (a switch, a dead zone)",
     "the loop has no steady state there, whatever the limits of the pumps",
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
-    "the controller or an instrument has no derivative there (a switch, a dead zone)",
     "the controller or an instrument counts samples, and has no steady state",
     "the controller does not use the readings",
 )
@@ -90,10 +90,10 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
     checks = [
         jnp.any(alone >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
+        kink,
         jnp.any(moved) | ~jnp.all(jnp.stack(finite)),
         jnp.any(x < getattr(loop.plant, "knee", 0.0)),
         jnp.any(u >= span[0]) | jnp.any(u <= span[1]),
-        kink,
         found.counts,
         jnp.all(C == 0.0),
     ]

@@ -8,7 +8,7 @@ other modules of `loop` and the folders below.
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,20 +20,13 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.loop.closed_loop import (
-    ClosedLoop,
-    Inputs,
-    initial,
-    inputs,
-    is_broken,
-    keyed,
-    run_of,
-    zero_of,
-)
+from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
+from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
-from jaxtank.loop.trajectory import COLUMNS, Trajectory
+from jaxtank.loop.trajectory import Trajectory
 from jaxtank.loop.validation import check
 from jaxtank.xla.hoist import checkpointed_scan, scan
 from jaxtank.xla.jit import compiled
@@ -230,76 +223,44 @@ def evaluate_compiled(
     loop: ClosedLoop, clock: Clock, names: tuple[str, ...], key: jax.Array | None, checkpoint: bool
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """Return (measures, True if the run diverged), unchecked; checkpoint: for reverse mode."""
+    if ms.functions(names):
+        values, broken = evaluate_compiled(
+            loop, clock, needed_by(loop, clock, names), key, checkpoint
+        )
+        return values_of(loop, clock, names, key, values, checkpoint), broken
     loop = keyed(loop, key)
     run = run_of(loop, clock)
+    pointwise = clock.samples > CHUNK and is_pointwise(loop)
+    drawn = not checkpoint and (clock.samples <= CHUNK or pointwise)
+    drawn = drawn and loop.sensor.draws_in_loop(key)  # else before the loop
 
-    def body(carry: Any, now: Inputs) -> Any:
-        state, acc = carry
-        state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.context)), None
+    def scanned(carry: Any, number: Any, samples: int, first: Any = 0) -> Any:
+        here = jax.random.fold_in(cast(Any, key), number) if drawn and pointwise else key
+
+        def body(carry: Any, now: Inputs) -> Any:
+            state, acc = carry
+            if drawn:
+                now = now._replace(xi=loop.sensor.draw_sample(here, samples, state.k - first))
+            state, sample = step(loop, clock, state, now)
+            return (state, ms.update(run, acc, sample, now.context)), None
+
+        xs = inputs(loop, clock, names, None if drawn else key, number, samples)
+        if checkpoint:
+            return checkpointed_scan(body, carry, xs, samples)
+        return scan(body, carry, xs, samples)[0]
 
     def batch(carry: Any, number: Any, samples: int = CHUNK) -> Any:
-        return scan(body, carry, inputs(loop, clock, names, key, number, samples), samples)[0], None
+        return scanned(carry, number, samples, number * CHUNK), None
 
     carry: Any = (initial(loop, clock), ms.start(run, names))
-    if checkpoint:
-        carry = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    elif clock.samples > CHUNK and is_pointwise(loop):
+    if pointwise and not checkpoint:
         whole, left = divmod(clock.samples, CHUNK)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
         carry = batch(carry, whole, left)[0] if left else carry
     else:
-        carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
+        carry = scanned(carry, None, clock.samples)
     state, acc = carry
     return ms.read(run_with(loop, clock, names), acc, names), is_broken(state)
-
-
-@compiled("clock", "save_every")
-def simulate_compiled(
-    loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int
-) -> tuple[Trajectory, jax.Array]:
-    """Return (Trajectory, True if the run diverged), unchecked."""
-    loop = keyed(loop, key)
-    rows = (clock.samples - 1) // save_every + 1
-    spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
-
-    def in_rows(a: Any) -> Any:
-        padded = jnp.pad(a, (0, max(spare, 0)), mode="edge")
-        return padded[: rows * save_every].reshape(rows, save_every)
-
-    def one(carry: Any, now: Any) -> Any:
-        state, spilled = carry
-        state, sample = step(loop, clock, state, now)
-        return (state, tuple(a + b for a, b in zip(spilled, sample.spilled))), sample
-
-    def unsaved(carry: Any, now: Any) -> Any:
-        return one(carry, now)[0], None
-
-    def row(carry: Any, now: Any) -> Any:
-        spilled = carry[1]
-        carry, sample = one(carry, jax.tree.map(_first, now))
-        if save_every > 1:
-            others = jax.tree.map(_but_first, now)
-            carry = scan(unsaved, carry, others, length=save_every - 1)[0]
-        return carry, sample._replace(spilled=spilled)
-
-    zero = zero_of(loop)
-    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key))
-    start = (initial(loop, clock), (zero,) * loop.plant.tanks)
-    (state, _), saved = scan(row, start, xs, length=rows)
-    columns: dict[str, Any] = {}
-    for name in COLUMNS:
-        value: Any = getattr(saved, name)
-        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
-    return Trajectory(**columns, units=loop.units), is_broken(state)
-
-
-def _first(a: Any) -> Any:
-    return a[0]
-
-
-def _but_first(a: Any) -> Any:
-    return a[1:]
 
 
 def _report_broken(

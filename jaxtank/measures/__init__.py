@@ -1,11 +1,13 @@
 """Numbers that describe a run, accumulated in the time loop: memory does not grow with its length.
 
 `catalogue` holds the measures, `accumulators` what the loop carries for them, `registry` what is
-known of them by name, `running` what the loop calls. May import `jaxtank.core` only.
+known of them by name, `running` what the loop calls, `functions` those that are a function of a
+whole run. May import `jaxtank.core` only.
 """
 
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
 from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
 from jaxtank.measures.measure import Measure
 from jaxtank.measures.registry import (
     check_names,
@@ -20,6 +22,7 @@ from jaxtank.measures.registry import (
     squares,
     times,
     unit,
+    unreadable,
 )
 from jaxtank.measures.running import needs, read, residual_weights, residuals, start, update
 
@@ -30,10 +33,14 @@ __all__ = [
     "Context",
     "Measure",
     "Run",
+    "RunFunction",
     "Worst",
     "check_names",
     "entries",
+    "from_function",
+    "functions",
     "linear",
+    "name_of",
     "needs",
     "of_loop",
     "placed",
@@ -48,5 +55,6 @@ __all__ = [
     "start",
     "times",
     "unit",
+    "unreadable",
     "update",
 ]

@@ -10,13 +10,22 @@ from typing import Any
 import jax
 
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.installed import imported, installed
 from jaxtank.core.tree import shortened
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
 from jaxtank.measures.catalogue import MEASURES
+from jaxtank.measures.functions import from_function, functions
 from jaxtank.measures.measure import Measure
 
 BUILT_IN = frozenset(MEASURES)
+GROUP = "jaxtank.measures"
+"""Entry points by which an installed package names its measures: name = "package.module:object", a
+Measure, or a function as in `from_function`.
+"""
+_COMPILED: dict[str, Measure] = {}
+"""What was last registered by each name, also of measures that were deleted since."""
+
 _NAME = re.compile(r"[A-Za-z]\w*")
 _SIZES: dict[str, Callable[[Any], int]] = {
     "run": lambda plant: 1,
@@ -82,13 +91,13 @@ def register(
         _check_name("accumulator", a, _BUILT_IN_ACCUMULATORS)
         _check_accumulator(a, accumulator)
     _check_measure(name, measure, {**ACCUMULATORS, **own})
-    replaced = MEASURES.get(name, measure) is not measure or any(
+    replaced = _COMPILED.get(name, measure) != measure or any(
         ACCUMULATORS.get(a, accumulator) is not accumulator for a, accumulator in own.items()
     )
     if replaced:
         jax.clear_caches()  # compiled runs know a measure by its name
     ACCUMULATORS.update(own)
-    MEASURES[name] = measure
+    MEASURES[name] = _COMPILED[name] = measure
     return measure
 
 
@@ -142,10 +151,23 @@ def _check_measure(name, measure, accumulators):
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Raise InputError for a name that is no measure."""
+    """Raise InputError for a name that is no measure; one of an installed package is registered."""
     for name in names:
-        if name not in MEASURES:
-            raise unknown("measure", name, MEASURES)
+        if name in MEASURES:
+            continue
+        points = installed(GROUP)
+        if name not in points:
+            raise unknown("measure", name, [*MEASURES, *points])
+        found = imported(points[name])
+        register(name, found if isinstance(found, Measure) else from_function(found))
+
+
+def unreadable(names: Iterable[str]) -> tuple[str, ...]:
+    """Return those of `names` that a rig file cannot name: functions of this process alone, which
+    no installed package has.
+    """
+    own = functions(names)
+    return tuple(own.keys() - installed(GROUP).keys()) if own else ()
 
 
 def squares() -> tuple[str, ...]:
@@ -161,8 +183,11 @@ def times() -> tuple[str, ...]:
 
 
 def reported() -> tuple[str, ...]:
-    """Return the names of the measures in a result: all of the run but `times()`."""
-    return tuple(m for m in MEASURES if m not in times() and not MEASURES[m].linear)
+    """Return the names of the measures in every result: all but `times()`, functions of a whole
+    run and those of the linearised loop, which are computed where they are named.
+    """
+    left_out = {*times(), *functions(MEASURES), *linear()}
+    return tuple(m for m in MEASURES if m not in left_out)
 
 
 def linear() -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
+from jaxtank.measures import unreadable
 from jaxtank.rig import components, network, schedule, signals, template
 from jaxtank.rig.lines import Block, Line, block, lines_of, terse, toml
 from jaxtank.rig.preset_match import origin_of, structures
@@ -238,16 +239,16 @@ def _tuning(case):
         ("objective", case.objective, float, template.of_measure, str, template.objective),
         ("uncertain", case.uncertain, float, template.of_uncertain, toml, template.uncertain),
     )
-    found = [
-        Block(
-            SECTIONS[title].title,
-            [
-                *(Line(key(name), text(value), about(case, name)) for name, value in own.items()),
-                *more(case),
-            ],
-        )
-        for title, own, text, about, key, more in tables
-    ]
+    found = []
+    for title, own, text, about, key, more in tables:
+        # functions of Python stay behind, commented out
+        off = unreadable(own) if title in ("limits", "objective") else ()
+        lines = [
+            Line(key(name), text(value), about(case, name), name not in off)
+            for name, value in own.items()
+        ]
+        on = title != "objective" or any(line.on for line in lines)
+        found.append(Block(SECTIONS[title].title, [*lines, *more(case)], on=on))
     if case.covariance is not None:
         names, rows = case.covariance
         values = {"names": names, "matrix": [list(map(float, row)) for row in rows]}

@@ -49,23 +49,24 @@ def brackets(
     above, below = others[1], others[0]
     enters = rise(rates, tank, 0.0 * top, above)
     least_enters = fall(rates, tank, 0.0 * top, below)
-    gains = rates.pumps[tank].items()
-    most: Any = sum(jnp.where(line[j] >= 0.0, b, a) * line[j] for j, (a, b) in gains)
-    least: Any = sum(jnp.where(line[j] >= 0.0, a, b) * line[j] for j, (a, b) in gains)
+    gains = list(rates.pumps[tank].values())
     # within the laminar threshold, and where outflow may be limited, nothing leaves for certain
     shallow = lower_clip(rates.empty[tank] + 0.0 * top, rates.knee)
 
-    def one(pair, flows):
+    def one(pair, inputs):
         low, high = pair
+        most: Any = sum(jnp.where(u >= 0.0, b, a) * u for u, (a, b) in zip(inputs, gains))
+        least: Any = sum(jnp.where(u >= 0.0, a, b) * u for u, (a, b) in zip(inputs, gains))
         for _ in range(substeps):
-            high = _from_above(high, flows[1], rates.out[tank], step, rates.knee, shallow)
+            high = _from_above(high, enters + most, rates.out[tank], step, rates.knee, shallow)
             high = jnp.where(high < top, high, top)
-            low = _from_below(low, flows[0], rates.out_most[tank], step, rates.knee)
+            low = _from_below(low, least_enters + least, rates.out_most[tank], step, rates.knee)
         return (low, high), None
 
-    begin = (low + 0.0 * least[0], jnp.where(high < top, high, top) + 0.0 * most[0])
-    flows = (least_enters + least, enters + most)
-    return jax.lax.scan(one, begin, flows)[0]
+    way = tuple(line[j] for j in rates.pumps[tank])
+    zero = 0.0 * sum(v[0] for v in way)
+    begin = (low + zero, jnp.where(high < top, high, top) + zero)
+    return jax.lax.scan(one, begin, way)[0]
 
 
 def _explicit(h, flow, out, step, knee):

@@ -16,7 +16,7 @@ from tuning.cli.parser import parser
 COMMANDS = {
     *("list", "show", "simulate", "tune", "uncertainty", "merge", "sensitivity", "identify"),
     "attack",
-    *("init", "export", "compare", "completion", "bench"),
+    *("init", "export", "compare", "completion", "bench", "cache"),
 }
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}
 

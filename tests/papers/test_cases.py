@@ -28,6 +28,8 @@ CONTRACT = {
     ),
     "calofir": "backstepping backstepping-perturbed",
     "cascaded": "pi open-loop",
+    "dts200": "pi pi-faults",
+    "johansson": "pi-minimum pi-nonminimum",
     "khalid": (
         "gpc gpc-nc2 gpc-nc30 laguerre gpc-mimo laguerre-mimo gpc-constrained gpc-nc2-constrained"
         " gpc-nc30-constrained laguerre-constrained gpc-mimo-constrained laguerre-mimo-constrained"

@@ -11,6 +11,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from tuning.answer.judged import FRESH
 from tuning.answer.recommend import recommend
+from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.search import tuner
 from tuning.search.options import Solver, check_options, check_precision
@@ -27,8 +28,8 @@ def tune(
     *,
     nominal: bool | None = None,
     free: Mapping[str, Any] | None = None,
-    objective: Mapping[str, float] | None = None,
-    limits: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
     distributions: Mapping[str, Any] | None = None,
     safety_filter: bool | None = None,
     mend: str | None = None,
@@ -74,9 +75,11 @@ def tune(
         default answer unless method, scenarios, risk, choices, batch, screening or tolerance are
         given.
     free : {name: (low, high) or Free}; the case's own where None.
-    objective : {measure: weight}; where None the case's own (of a preset, the default cost, unless
-        nominal).
-    limits : {measure: value}, {} for none, the case's own where None.
+    objective : {measure: weight}, or a function of one's own, (measures) or (measures, trajectory)
+        -> number, alone or in the place of a measure (`Objective` gives it a name and a unit);
+        where None the case's own (of a preset, the default cost, unless nominal).
+    limits : {measure: value}, {} for none, the case's own where None. A list of such and of
+        `Constraint`, [case.limits, Constraint("name", function, upper=1.0)].
     distributions : {name: distribution or share}, the plants of the default answer; what the case
         calls uncertain where None, 5 % of every flow where that is nothing.
     safety_filter : of the default answer; None: where a level comes near its limit.
@@ -85,7 +88,9 @@ def tune(
         tune.
     scenarios : tuple of Scenario, () for the case's own run alone.
     risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
-    choices : {static name: [values]}, each combination of which is tuned, the best taken.
+    choices : {static name: [values]}, each combination of which is tuned, the best taken;
+        {"controller.kind": ["pid", "lqi"]} tunes each of these controllers with gains and ranges of
+        its own.
     starts : local searches, 8 if nominal; else at most 4, until two agree.
     seed : of the Sobol points, the plants and the sensor noise.
     screening : number of Sobol points (64); nominal only.
@@ -115,6 +120,7 @@ def tune(
     >>> result = tuning.tune(presets.find("gouta2015/backstepping"))  # doctest: +SKIP
     >>> result["controller.k1"].after, result.answer.held  # doctest: +SKIP
     """
+    objective, limits = as_measures(objective, limits)
     asked = _asked(method, scenarios, risk, choices, batch, tolerance, screening)
     _check_nominal(nominal, asked, case)
     own = NOMINAL if nominal or asked or isinstance(case, Problem) else DEFAULT

@@ -13,6 +13,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from tuning.answer.setting import Setting, limited_levels, measured, setting_of
 from tuning.feasible.study import can_follow, can_judge
+from tuning.problem.functions import as_measures
 from tuning.problem.result import Shown
 from tuning.search.options import check_options, check_precision
 from tuning.uncertainty.result import Ensemble
@@ -119,8 +120,8 @@ def validate(
     seed: int = 0,
     *,
     distributions: Mapping[str, Any] | None = None,
-    objective: Mapping[str, float] | None = None,
-    limits: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
 ) -> Judged:
     """Return how a case does on plants that are not exactly known, with noise in the readings.
 
@@ -134,8 +135,8 @@ def validate(
     seed : of plants and noise.
     distributions : {name: distribution or share}; what the case calls uncertain where None, 5 % of
         every flow where that is nothing.
-    objective : {measure: weight}; as in `tuning.tune`.
-    limits : {measure: value}; those of the case where None.
+    objective : {measure: weight} or a function of one's own; as in `tuning.tune`.
+    limits : {measure: value}, and `Constraint`s, as in `tuning.tune`; those of the case where None.
 
     Returns
     -------
@@ -156,6 +157,7 @@ def validate(
     """
     check_precision()
     check_options(samples=samples)
+    objective, limits = as_measures(objective, limits)
     return judge(setting_of(case, objective, limits, distributions), samples, seed)
 
 

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing
 written), 3 not converged, 4 a limit is violated (`attack`: passed), 5 bad data file,
-130 interrupted (the best point so far of a search is written and printed), 143 terminated. Nothing
+130 interrupted, 143 terminated (the best point so far of a search is written and printed). Nothing
 heavy is imported before the arguments are read.
 """
 
@@ -10,6 +10,9 @@ import os
 import sys
 
 from tuning.cli import interrupts, terminal
+
+COMPILES_NOTHING = ("cache", "completion", "list")
+"""Commands that need no compiled programs."""
 
 
 def main(argv=None):
@@ -68,8 +71,19 @@ def _command(argv):
             f"--resume: {folder!r} cannot be read as a run to go on with: there is no such folder"
         )
     shared = getattr(args, "shard", None) is not None
+    if argv is None and args.command not in COMPILES_NOTHING:
+        _keep_programs(args)
     with hold(folder, shared=shared, leaving=interrupts.before_leaving):
         return args.run(args)
+
+
+def _keep_programs(args):
+    """Use the programs that earlier calls have compiled, and keep those of this one."""
+    from jaxtank.xla.program_cache import keep_for_this_process
+
+    why = keep_for_this_process()
+    if why and not getattr(args, "quiet", False):
+        print(f"jaxtank: note: compiled programs are not kept: {why}", file=sys.stderr)
 
 
 def _arguments(argv):

@@ -17,9 +17,11 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
 from tuning.problem.bounds import bounds
+from tuning.problem.functions import as_measures
 from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
 from tuning.problem.point import Floats, Point
 from tuning.storage.evaluation_log import EvaluationCache
@@ -40,6 +42,12 @@ worst.
 TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
 
+LANES = 256
+"""Runs without derivatives that one program makes side by side: enough to fill the vector units."""
+
+IDLE = 2**23
+"""Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
+
 Row = Mapping[str, Any]
 """Measures of one scenario, {name: value}."""
 
@@ -53,8 +61,10 @@ class Problem:
     ----------
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
-    objective : {measure: weight}; a measure with several entries counts with their sum.
-    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario.
+    objective : {measure: weight}; a measure with several entries counts with their sum. A function
+        of one's own may stand in the place of a measure, or alone (`tuning.Objective`).
+    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario. With
+        functions of one's own a list: [{measure: value}, tuning.Constraint(...)].
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     cache : an EvaluationCache of what was evaluated before.
@@ -76,8 +86,8 @@ class Problem:
         self,
         case: Case,
         free: Mapping[str, Any] | None = None,
-        objective: Mapping[str, float] | None = None,
-        limits: Mapping[str, Any] | None = None,
+        objective: Any = None,
+        limits: Any = None,
         scenarios: Sequence[Scenario] | None = None,
         seed: int = 0,
         cache: EvaluationCache | None = None,
@@ -90,6 +100,7 @@ class Problem:
         if risk not in RISKS:
             raise InputError(f"risk = {risk!r}: must be one of {', '.join(RISKS)}")
         self.risk = risk
+        objective, limits = as_measures(objective, limits)
         self.bounds = bounds(case.loop, case.free if free is None else free)
         self.objective = check_objective(case.objective if objective is None else objective)
         self.scenarios = sc.check_scenarios(
@@ -100,18 +111,34 @@ class Problem:
         self.limit(limits)
         self.cache = EvaluationCache() if cache is None else cache
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
+        self.points: dict[bool, int] = {}
 
-    def limit(self, limits: Mapping[str, Any] | None) -> None:
+    def limit(self, limits: Any) -> None:
         """Replace the limits by `limits`, as in `resolve_limits`.
 
         The evaluation cache holds margins of the former limits, and is emptied."""
         self.given["limits"] = limits
+        limits = as_measures(None, limits, self.objective)[1]
         self.limits: list[Limit] = resolve_in(self.runs, limits)
         self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
+        check_functions(self.loop, self.clock, self.needed)
         self.cache = EvaluationCache()
+
+    def check_slopes(self, point: Point) -> None:
+        """Raise InputError for a function of the user's whose derivative at a Point is NaN."""
+        if not np.isfinite(point.cost):
+            return
+        bad = [*ms.functions(self.objective)] if np.isnan(point.gradient).any() else []
+        measured = zip(self.limits, point.margin_slopes)
+        bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
+        for name in ms.functions(bad):
+            raise InputError(
+                f"function {name}: its derivative by {', '.join(self.names)} is not a number at the"
+                " starting values, as of a root or a quotient at 0"
+            )
 
     @property
     def names(self) -> list[str]:
@@ -189,8 +216,29 @@ class Problem:
         """
         zs = np.asarray(zs, dtype=float)
         self.simulations += len(zs) * len(self.runs)
-        found = self.cache.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse))
+        size = self._block(len(zs), coarse)
+        found = self.cache.recall("screen", [zs, coarse], lambda: self._blocks(zs, coarse, size))
         return found[0].copy(), found[1].copy()
+
+    def _block(self, count: int, coarse: bool) -> int:
+        """Return how many points one program runs: as many as in an earlier call where that serves,
+        so that the fewest programs are compiled. It follows from the calls alone, not from what is
+        known: a search that is continued gives the same bits.
+        """
+        size, wanted = self.points.get(coarse, 0), min(count, max(1, LANES // len(self.runs)))
+        if size < wanted:
+            self.points[coarse] = wanted
+            return wanted
+        samples = max(group.clock.samples for group in self.groups) // (sc.COARSE if coarse else 1)
+        idle = -count % size * len(self.runs) * samples
+        return size if idle <= IDLE else wanted
+
+    def _blocks(self, zs: Floats, coarse: bool, size: int) -> tuple[Floats, Floats]:
+        """Return `_screen` of all points, `size` at a time, the last one repeated to fill up."""
+        filled = np.concatenate([zs, np.repeat(zs[-1:], -len(zs) % size, axis=0)])
+        found = [self._screen(filled[i : i + size], coarse) for i in range(0, len(filled), size)]
+        costs, margins = (np.concatenate(parts)[: len(zs)] for parts in zip(*found))
+        return costs, margins
 
     def _screen(self, zs: Floats, coarse: bool) -> tuple[Floats, Floats]:
         points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}

@@ -6,6 +6,7 @@ Imported by `search` and by `jaxtank simulate`.
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,15 @@ from tuning.problem import scenarios as sc
 from tuning.problem.problem import Problem
 
 
-def run_measures(loop: ClosedLoop, clock: Clock, key: Any) -> dict[str, np.ndarray]:
+def run_measures(
+    loop: ClosedLoop, clock: Clock, key: Any, besides: Iterable[str] = ()
+) -> dict[str, np.ndarray]:
     """Return {measure: value} of everything that is reported of one run.
 
-    key : of the sensor noise, None where there is none.
+    key : of the sensor noise, None where there is none. besides : names, of which the functions of
+    the user's are reported too.
     """
-    values = lp.evaluate(loop, clock, _names(loop), key)
+    values = lp.evaluate(loop, clock, _names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
 
 
@@ -46,12 +50,14 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
     table: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
         loop = problem.runs[group.runs[0]].case.loop
-        measures, _ = sc.values_of(group, (*_names(loop), *linear), points)
+        names = (*_names(loop, problem.needed), *linear)
+        measures, _ = sc.values_of(group, names, points)
         for j, i in enumerate(group.runs):
             table[i] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
     return table
 
 
-def _names(loop: ClosedLoop) -> tuple[str, ...]:
+def _names(loop: ClosedLoop, besides: Iterable[str]) -> tuple[str, ...]:
     """Return the measures that are reported of a loop, and when levels were reached."""
-    return (*(m for m in ms.reported() if ms.serves(m, loop)), *ms.times())
+    known = (m for m in ms.reported() if ms.serves(m, loop))
+    return (*known, *ms.times(), *ms.functions(besides))

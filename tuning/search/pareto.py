@@ -12,6 +12,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
+from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
 from tuning.search.methods import approach, find_feasible, restore, slsqp
@@ -27,8 +28,8 @@ def tradeoff(
     values: Sequence[float],
     *,
     free: Mapping[str, Any] | None = None,
-    objective: Mapping[str, float] | None = None,
-    limits: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
     scenarios: Sequence[Scenario] | None = None,
     seed: int = 0,
     iterations: int = 60,
@@ -69,6 +70,7 @@ def tradeoff(
     >>> case = presets.find("cascaded/pi")
     >>> tuning.tradeoff(case, "input_travel", [80.0, 40.0])  # doctest: +SKIP
     """
+    objective, limits = as_measures(objective, limits)
     ms.check_names([measure])
     values = [float(v) for v in values]
     if not 1 <= len(values) <= MANY or not all(math.isfinite(v) for v in values):

@@ -14,6 +14,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
+from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
 from tuning.search.result import Message, TuningResult
@@ -176,6 +177,8 @@ def tune_robust(
     >>> tuning.tune_robust(case, samples=16, back_off=0.03).certificate  # doctest: +SKIP
     """
     _check(samples, fresh, back_off)
+    objective, limits = as_measures(options.get("objective"), options.get("limits"))
+    options |= {"objective": objective, "limits": limits}
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = check_limits(
         case.loop, case.limits if options.get("limits") is None else options["limits"]

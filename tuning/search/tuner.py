@@ -16,6 +16,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from tuning.problem.functions import as_measures, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.reported import run_measures, table_of
@@ -43,8 +44,8 @@ def tune(
     method: str | Solver = "auto",
     *,
     free: Mapping[str, Any] | None = None,
-    objective: Mapping[str, float] | None = None,
-    limits: Mapping[str, Any] | None = None,
+    objective: Any = None,
+    limits: Any = None,
     scenarios: Sequence[Scenario] | None = None,
     risk: str = "mean",
     choices: Mapping[str, Sequence] | None = None,
@@ -85,6 +86,7 @@ def tune(
     >>> result["controller.k"].after  # doctest: +SKIP
     """
     folder = checkpoint_folder(checkpoint, log=log)
+    objective, limits = as_measures(objective, limits)
     options: dict[str, Any] = dict(
         free=free,
         objective=objective,
@@ -125,8 +127,8 @@ def _tune(case, method, *, checkpoint, resume, validation, progress, **options):
     )
     first = problem.start()
     # a start that is not finite is an input error, reported by evaluate
-    before = run_measures(case.loop, case.clock, key)
-    _check_objective(problem, before)
+    before = run_measures(case.loop, case.clock, key, problem.needed)
+    _check_start(problem, before, first)
     if checkpoint is not None:
         problem.cache = EvaluationLog(checkpoint, _what(problem, plan, validation), resume)
     found = solve(problem, first, plan, progress)
@@ -152,6 +154,7 @@ def _what(problem, plan, validation):
         scenarios=[(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios],
         risk=problem.risk,
         validation=validation,
+        **digests(problem.loop, problem.clock, problem.needed),
         **vars(plan),
     )
 
@@ -178,7 +181,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
     complete = best is not None and not found.interrupted
     change = found.change if complete and found.change else [None] * len(z)
     tuned = case.replace(loop=with_values(case.loop, values))
-    after = run_measures(tuned.loop, tuned.clock, key)
+    after = run_measures(tuned.loop, tuned.clock, key, problem.needed)
     tables = {"before": [before], "after": [after]}
     if problem.scenarios:
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
@@ -234,13 +237,19 @@ def _parameters(problem, z, values, change, idle):
     }
 
 
-def _check_objective(problem, before):
-    for measure in problem.objective:
+def _check_start(problem, before, first):
+    """Raise InputError for an objective, and functions of the user's, without value or slope."""
+    for measure in (*problem.objective, *ms.functions(problem.needed)):
         if measure not in before or not np.all(np.isfinite(before[measure])):
             raise InputError(
-                f"objective {measure} is not a number at the starting values (it cannot be measured"
-                " on this run), so it cannot be tuned"
+                f"{'objective' if measure in problem.objective else 'constraint'} {measure} is not"
+                " a number at the starting values (it cannot be measured on this run), so it cannot"
+                " be tuned"
             )
+    if ms.functions(problem.needed):  # before anything is written
+        cache = problem.cache
+        problem.check_slopes(problem.point(first))
+        problem.cache, problem.simulations, problem.gradients = cache, 0, 0
 
 
 def _method(method, problem, batch):

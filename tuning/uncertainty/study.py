@@ -15,6 +15,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.loop import run as lp
+from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage.batch_store import BatchStore
@@ -40,7 +41,7 @@ def ensemble(
     *,
     draws: str = "random",
     measures: Sequence[str] | None = None,
-    limits: Mapping[str, Any] | None = None,
+    limits: Any = None,
     fan: bool = True,
     batch: int | None = None,
     devices: int = 1,
@@ -112,6 +113,7 @@ def ensemble(
     _check_arguments(shard, samples, key)
     check_devices(devices)
     distributions = spread_of(case) if distributions is None else stated(distributions)
+    limits = as_measures(None, limits)[1]
     limited = resolve_limits(case, limits)
     names = _measure_names(case, measures, limited)
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
@@ -248,4 +250,5 @@ def _what(case, distributions, samples, key, draws, names, batch):
         draws=draws,
         measures=names,
         batch=batch,
+        **digests(case.loop, case.clock, names),
     )

@@ -26,7 +26,7 @@ def add(commands, parents):
     one = commands.add_parser(
         "simulate",
         parents=[common, case, run],
-        help="one run: measures; with --out its trajectory and pictures",
+        help="one run: measures; with --out its trajectory, pictures and a page",
     )
     one.set_defaults(run=simulate)
     one.add_argument(
@@ -120,7 +120,7 @@ def simulate(args):
     from jaxtank.loop.margins import stability_margins
     from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import artifacts, margin_tables, tables
+    from tuning.report import artifacts, margin_tables, run_page, tables
     from tuning.report import case as manual
 
     key = jax.random.key(seed) if noisy(case) else None
@@ -143,7 +143,9 @@ def simulate(args):
     written = []
     if args.out:
         trajectory = artifacts.run_for_people(case, key)
-        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif)
+        made = payload["provenance"]
+        page = lambda drawn: run_page.page_of(case, values, drawn, args.line, made)
+        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page)
     if args.json:
         print(tables.dumps(payload))
     else:

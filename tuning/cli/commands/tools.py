@@ -1,5 +1,7 @@
-"""`jaxtank compare`, `completion` and `bench`: the papers, the shell, the speed of this machine."""
+"""`jaxtank compare`, `completion`, `bench` and `cache`: the papers, the shell, the speed of this
+machine, the programs that are kept."""
 
+import os
 import sys
 
 from tuning.cli.arguments import option
@@ -24,6 +26,14 @@ def add(commands, parents):
     )
     one.set_defaults(run=completion)
     one.add_argument("shell", metavar="SHELL", help='as in: eval "$(jaxtank completion bash)"')
+    one = commands.add_parser(
+        "cache",
+        parents=[parents.common],
+        help="where compiled programs are kept, and their size; cache clear removes them"
+        " (JAXTANK_CACHE=0: none are kept; JAXTANK_CACHE=DIR: there)",
+    )
+    one.set_defaults(run=cache)
+    one.add_argument("what", nargs="?", metavar="clear", help="remove the programs of all versions")
     one = commands.add_parser(
         "bench", parents=[parents.common], help="ns per closed-loop step here, beside a C loop"
     )
@@ -78,6 +88,36 @@ def bench(args):
         return 0
     found = timing.measure(rounds)
     print(tables.dumps(found) if args.json else timing.text(found))
+    return 0
+
+
+def cache(args):
+    """Print where compiled programs are kept, or remove them."""
+    from jaxtank.core.errors import InputError, nearest
+    from jaxtank.xla import program_cache as kept
+    from tuning.report import tables
+
+    if args.what not in (None, "clear"):
+        close = nearest(args.what, ["clear"])
+        raise InputError(f"cache: unknown action {args.what!r}{close}: must be clear, or left out")
+    base = kept.base_folder()
+    if base is None:
+        why = "JAXTANK_CACHE=0" if os.environ.get(kept.SWITCH) else "there is no home folder"
+        print(tables.dumps({"folder": None, "why": why}) if args.json else f"off: {why}")
+        return 0
+    why = kept.refused(base) if base.exists() else ""
+    if why:
+        raise InputError(f"cache: {why}")
+    removed = kept.clear(base) if args.what else None
+    count, size = (sum(column) for column in zip((0, 0), *kept.contents(base).values()))
+    found = {"folder": str(base), "programs": count, "bytes": size, "largest": kept.LARGEST}
+    if args.json:
+        print(tables.dumps(found if removed is None else found | {"removed": removed}))
+        return 0
+    if removed is not None:
+        print(f"{removed} programs removed")
+    limit = f"at most {kept.LARGEST / 2**20:.0f} MiB for each version"
+    print(f"{base}: {count} programs, {size / 2**20:.2g} MiB ({limit})")
     return 0
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtank import measures as ms
 from tuning.answer.setting import limited_levels
 from tuning.problem.wording import numbered
-from tuning.report.tables import number, table
+from tuning.report.tables import number, objective_unit, table
 from tuning.report.tuned.tables import parts_of as all_parts
 
 WIDTH = 80
@@ -141,7 +141,7 @@ def _effects(answer):
     ]
     rows += _margins(answer)
     if answer.setting.own_objective:
-        rows.insert(0, [f"objective, mean of {n} plants", *(_mean(s.cost, s) for s in sides)])
+        rows.insert(0, [_objective_words(answer), *(_mean(s.cost, s) for s in sides)])
     if answer.before.limits:
         broken = [f"{100 * (1 - s.held.mean()):.3g} %" for s in sides]
         rows.append(["plants that violate a limit", *broken])
@@ -169,6 +169,15 @@ def _margins(answer):
         cells = ["any" if d == np.inf else number(d, 3) for d in delays]
         rows.append(["delay margin, nominal plant [s]", *cells])
     return rows
+
+
+def _objective_words(answer):
+    """The objective of the user's in the table: its name, if it has one, and its unit, if any."""
+    terms = answer.setting.objective
+    unit = objective_unit(terms, answer.setting.case.loop.units)
+    name = f" {next(iter(terms))}" if len(terms) == 1 else ""
+    words = f"objective{name}, mean of {answer.before.samples} plants"
+    return words if unit == "-" else f"{words} [{unit}]"
 
 
 def _mean(values, judged, digits=3):

@@ -69,7 +69,7 @@ def _measure_table(result):
     rows = [["objective", unit, number(objective["before"]), number(objective["after"])]]
     shown = []
     alone = set(objective["terms"])
-    for m in ms.placed("shown"):
+    for m in (*ms.placed("shown"), *ms.functions(measures["after"])):
         if m not in measures["after"] or (m == "rms_error_total" and alone == {m}):
             continue
         before = numbers(measures["before"][m], 4)
@@ -285,12 +285,13 @@ def _choice_table(result):
         [
             ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
             c["status"],
-            number(c["objective"]["before"]),
-            number(c["objective"]["after"]),
+            *("-" if v is None else number(v) for v in c["objective"].values()),
         ]
         for c in result.choices
     ]
-    return [table(rows, ["choice", "status", "objective before", "after"]), ""]
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    sides = [f"objective {side} [{unit}]" for side in ("before", "after")]
+    return [table(rows, ["choice", "status", *sides]), ""]
 
 
 def _tradeoff_table(result):

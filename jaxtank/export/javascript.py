@@ -1,0 +1,221 @@
+"""Controllers as JavaScript. Imported by `jaxtank.export.source` and by `tuning.live`."""
+
+from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
+from jaxtank.export.statements import REAL, TRUTH, WHOLE, Define, Ref, every, matrix_operations
+
+MISSING = ("erf", "erfc")
+"""Functions that most languages have and JavaScript has not."""
+
+
+class JavaScript(Printer):
+    """The statements of JavaScript (ECMAScript 2015), in double precision.
+
+    Examples
+    --------
+    >>> JavaScript().value(-1.5)
+    '(-1.5)'
+    """
+
+    operations = {
+        **OPERATIONS,
+        **{name: f"Math.{name}({{0}})" for name in FUNCTIONS if name not in MISSING},
+        **{name: f"Math.{name}({{0}})" for name in ("abs", "cbrt", "sign")},
+        **{name: f"Math.{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow")},
+        "round": "rint({0})",
+        "rem": "{0} % {1}",
+        "is_finite": "Number.isFinite({0})",
+        "not": "!{0}",
+        "ne": "{0} !== {1}",
+        "eq": "{0} === {1}",
+        "and": "{0} && {1}",
+        "or": "{0} || {1}",
+        "rsqrt": "1 / Math.sqrt({0})",
+        "exp2": "Math.pow(2, {0})",
+        "logistic": "1 / (1 + Math.exp(-{0}))",
+        "quotient": "Math.trunc({0} / {1})",
+        "remainder": "{0} % {1}",
+        "select": "{0} ? {2} : {1}",
+        "real": "+{0}",
+        "whole": "Math.trunc({0})",
+        "truth": "{0} != 0",
+    }
+    kinds = {REAL: "", WHOLE: "", TRUTH: ""}
+    nan, infinity = "NaN", "Infinity"
+    constant, variable = "const {name} = {value};", "let {name} = {value};"
+    open_array = "const {name} = ["
+    matrix_call = "const {name} = {op}({arguments});"
+    counted, endless, end = "for (let i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
+    until = "if (!({0})) break;"
+
+    def value(self, e):
+        """Return a number or a Ref as text, a real number in as few characters as it takes."""
+        text = super().value(e)
+        return text.replace(".0)", ")").removesuffix(".0") if isinstance(e, float) else text
+
+    def as_real(self, e):
+        """Return a number or a Ref of any kind as a real."""
+        return self.value(e) if isinstance(e, float) else f"+{self.value(e)}"
+
+
+ROUND = """
+function rint(x) {
+    const below = Math.floor(x), rest = x - below;
+    return rest < 0.5 || (rest === 0.5 && below % 2 === 0) ? below : below + 1;
+}"""
+
+MATRICES = {
+    "product": """
+function product(m, k, n, a, b) {
+    const out = new Float64Array(m * n);
+    for (let i = 0; i < m; ++i)
+        for (let j = 0; j < n; ++j) {
+            let s = 0;
+            for (let l = 0; l < k; ++l) s += a[i * k + l] * b[l * n + j];
+            out[i * n + j] = s;
+        }
+    return out;
+}""",
+    "cholesky": """
+function cholesky(n, a) {
+    const out = new Float64Array(n * n);
+    for (let j = 0; j < n; ++j)
+        for (let i = j; i < n; ++i) {
+            let s = a[i * n + j];
+            for (let l = 0; l < j; ++l) s -= out[i * n + l] * out[j * n + l];
+            out[i * n + j] = i === j ? Math.sqrt(s) : s / out[j * n + j];
+        }
+    return out;
+}""",
+    "forward": """
+function forward(n, k, a, b) {
+    const out = new Float64Array(n * k);
+    for (let c = 0; c < k; ++c)
+        for (let i = 0; i < n; ++i) {
+            let s = b[i * k + c];
+            for (let l = 0; l < i; ++l) s -= a[i * n + l] * out[l * k + c];
+            out[i * k + c] = s / a[i * n + i];
+        }
+    return out;
+}""",
+    "backward": """
+function backward(n, k, a, b) {
+    const out = new Float64Array(n * k);
+    for (let c = 0; c < k; ++c)
+        for (let i = n - 1; i >= 0; --i) {
+            let s = b[i * k + c];
+            for (let l = i + 1; l < n; ++l) s -= a[l * n + i] * out[l * k + c];
+            out[i * k + c] = s / a[i * n + i];
+        }
+    return out;
+}""",
+    "solve": """
+function solve(n, k, a, b) {
+    const A = Float64Array.from(a), out = Float64Array.from(b);
+    const swap = (v, i, j) => { const old = v[i]; v[i] = v[j]; v[j] = old; };
+    for (let j = 0; j < n; ++j) {
+        let best = j;
+        for (let i = j + 1; i < n; ++i)
+            if (Math.abs(A[i * n + j]) > Math.abs(A[best * n + j])) best = i;
+        if (best !== j) {
+            for (let l = 0; l < n; ++l) swap(A, j * n + l, best * n + l);
+            for (let c = 0; c < k; ++c) swap(out, j * k + c, best * k + c);
+        }
+        for (let i = j + 1; i < n; ++i) {
+            const f = A[i * n + j] / A[j * n + j];
+            for (let l = j; l < n; ++l) A[i * n + l] -= f * A[j * n + l];
+            for (let c = 0; c < k; ++c) out[i * k + c] -= f * out[j * k + c];
+        }
+    }
+    for (let c = 0; c < k; ++c)
+        for (let i = n - 1; i >= 0; --i) {
+            let s = out[i * k + c];
+            for (let l = i + 1; l < n; ++l) s -= A[i * n + l] * out[l * k + c];
+            out[i * k + c] = s / A[i * n + i];
+        }
+    return out;
+}""",
+}
+"""{matrix operation: a function of its sizes and of its operands, row by row}."""
+
+_RESERVED = """
+arguments await break case catch class const continue debugger default delete do else enum eval
+export extends false finally for function if implements import in instanceof interface let module
+new null package private protected public return static super switch this throw true try typeof
+undefined var void while with yield Math Number NaN Infinity Float64Array rint product cholesky
+forward backward solve s t y r dr ddr u
+"""
+RESERVED = frozenset(_RESERVED.split())
+"""Names that the functions may not have: keywords, what they call, and their variables."""
+
+
+def helpers(statements):
+    """Return the functions, each a text, that printed statements call."""
+    used = matrix_operations(statements)
+    rounds = any(isinstance(s, Define) and s.op == "round" for s in every(statements))
+    return [*([ROUND] if rounds else []), *(text for op, text in MATRICES.items() if op in used)]
+
+
+def print_javascript(program, name, precision):
+    """Return a Program as the text of a JavaScript file.
+
+    It is a script that defines NAME, an object of functions and sizes, and a module of node.
+
+    Parameters
+    ----------
+    program : Program
+    name : of the object
+    precision : "double", which is JavaScript's
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> from jaxtank.export.program import program
+    >>> text = print_javascript(program(presets.find("cascaded/pi")), "tanks", "double")
+    >>> "const tanks = (() => {" in text, "dt: 4," in text
+    (True, True)
+    """
+    printer = JavaScript()
+    begin = f"{name}.init(y, u) returns the state from the levels and inputs before the first."
+    sizes = {
+        "dt": program.case.clock.dt,
+        "state": program.state,
+        "tanks": program.tanks,
+        "outputs": program.outputs,
+        "pumps": program.pumps,
+    }
+    facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes.items())
+    first = ", ".join(map(printer.as_real, program.first))
+    lines = [
+        *header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin),
+        "// step changes the state s and returns u.",
+        '"use strict";',
+        f"const {name} = (() => {{",
+        *helpers([*program.begin, *program.step]),
+        "",
+        "function init(y, u) {",
+        *printer.lines(program.begin),
+        f"    return Float64Array.of({first});",
+        "}",
+        "",
+        "function step(s, t, y, r, dr, ddr) {",
+        *_step(printer, program),
+        "}",
+        "",
+        f"return {{init, step, {facts}}};",
+        "})();",
+        f'if (typeof module === "object") module.exports = {name};',
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _step(printer, program):
+    # a state that is returned as it was must be read before it is written
+    kept = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
+    inputs = ", ".join(printer.value(e) for e in program.u)
+    return [
+        *printer.lines(program.step),
+        *(f"    const next{i} = {printer.as_real(e)};" for i, e in kept),
+        *(f"    s[{i}] = next{i};" for i, _ in kept),
+        f"    return [{inputs}];",
+    ]

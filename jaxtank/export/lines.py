@@ -1,0 +1,82 @@
+"""Arrays of the state that are read and written at an index: the lines of transport delays.
+
+Such an array stays an array: "item" reads an element, `Store` writes one in its place. RULES holds
+the primitives of jax; `jaxtank.export.lowering` looks them up there.
+"""
+
+import numpy as np
+from jax.extend.core import Literal
+
+from jaxtank.export import primitives
+from jaxtank.export.primitives import no_code
+from jaxtank.export.simplify import is_number
+from jaxtank.export.statements import REAL, Ref, Store
+
+
+def written(jaxpr):
+    """Return the inputs of a jaxpr that it writes to at an index that it computes.
+
+    Examples
+    --------
+    >>> import jax
+    >>> line = jax.ShapeDtypeStruct((3,), np.float32)
+    >>> whole = jax.ShapeDtypeStruct((), np.int32)
+    >>> put = lambda a, i: jax.lax.dynamic_update_index_in_dim(a, 1.0, i, 0)
+    >>> len(written(jax.make_jaxpr(put)(line, whole).jaxpr))
+    1
+    """
+    inputs = set(jaxpr.invars)
+    return {
+        eqn.invars[0]
+        for eqn in jaxpr.eqns
+        if eqn.primitive.name == "dynamic_update_slice"
+        and not isinstance(eqn.invars[0], Literal)
+        and eqn.invars[0] in inputs
+        and len(eqn.invars[0].aval.shape) == 1
+    }
+
+
+def elements_of(name, size):
+    """Return the elements of the line `name`.
+
+    Examples
+    --------
+    >>> elements_of("c_3", 2).tolist()
+    [Ref(name='c_3', index=0), Ref(name='c_3', index=1)]
+    """
+    out = np.empty(size, dtype=object)
+    out[:] = [Ref(name, i) for i in range(size)]
+    return out
+
+
+def line_of(array):
+    """Return the name of the line whose elements are those of an array; None of another array."""
+    whole = array.ndim == 1 and all(isinstance(e, Ref) and e.index == i for i, e in enumerate(array))
+    same = {e.name for e in array.ravel()} if whole else set()
+    return same.pop() if len(same) == 1 else None
+
+
+def _read(writer, eqn, operands):
+    array, *index = operands
+    if all(is_number(i.item()) for i in index):
+        return primitives.RULES["slice"](writer, eqn, operands)
+    name = line_of(array)
+    if name is None or eqn.params["slice_sizes"] != (1,):
+        raise no_code("it reads an array at an index that it computes")
+    out = np.empty(1, dtype=object)
+    out[0] = writer.define(REAL, "item", Ref(name), index[0].item())
+    return [out]
+
+
+def _write(writer, eqn, operands):
+    array, update, index = operands
+    name = line_of(array)
+    if name is None or update.shape != (1,):
+        raise no_code("it writes to an array at an index")
+    new = writer.fresh("l")
+    writer.scopes[-1].append(Store(new, name, index.item(), update[0]))
+    return [elements_of(new, array.size)]
+
+
+RULES = {"dynamic_slice": _read, "dynamic_update_slice": _write}
+"""{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""

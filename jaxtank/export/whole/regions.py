@@ -1,0 +1,154 @@
+"""Statements sorted by what they depend on, so that each is computed as seldom as possible.
+
+Imported by the printers of whole loops.
+"""
+
+from collections.abc import Iterable, Mapping
+
+from jaxtank.export.statements import (
+    Array,
+    Define,
+    Loop,
+    Ref,
+    Statement,
+    Store,
+    Until,
+    names,
+    used,
+)
+
+CHEAP = frozenset(
+    "add sub mul neg abs max min lt le gt ge eq ne and or not select real square truth".split()
+)
+"""Operations that cost less than a number that is kept for every sample."""
+
+
+def hoisted(statements: Iterable[Statement]) -> list[Statement]:
+    """Return statements with those of a loop's body that no pass changes moved in front of it.
+
+    Examples
+    --------
+    >>> inner = Define("real", "v1", "sqrt", (Ref("x"),))
+    >>> loop = Loop(3, (("real", "c1", 0.0),), [inner], (Ref("v1"),))
+    >>> [type(s).__name__ for s in hoisted([loop])]
+    ['Define', 'Loop']
+    """
+    out: list[Statement] = []
+    for s in statements:
+        if not isinstance(s, Loop):
+            out.append(s)
+            continue
+        inside, own = {name for _, name, _ in s.carried}, []
+        for one in hoisted(s.body):
+            free = isinstance(one, Define | Array) and not one.reads & inside
+            if free:
+                out.append(one)
+                continue
+            own.append(one)
+            inside |= defined(one)
+        out.append(s._replace(body=own))
+    return out
+
+
+def defined(statement: Statement) -> set[str]:
+    """Return the names that a statement defines for those after it."""
+    if isinstance(statement, Loop):
+        return {name for _, name, _ in statement.carried}
+    return set() if isinstance(statement, Until) else {statement.name}
+
+
+def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str, int]:
+    """Return {name: rank} of every variable: the largest rank of what it depends on.
+
+    given: {input: its rank}.
+
+    Examples
+    --------
+    >>> one = Define("real", "v1", "add", (Ref("x"), Ref("t")))
+    >>> ranks([one], {"x": 0, "t": 1})["v1"]
+    1
+    """
+    found = dict(given)
+    for s in statements:
+        own = s.reads if not isinstance(s, Loop) else s.reads - local(s)
+        rank = max((found[n] for n in own), default=0)
+        if isinstance(s, Store):
+            rank = max(rank, found[s.array])
+        found.update(dict.fromkeys(defined(s), rank))
+    return found
+
+
+def local(loop: Loop) -> set[str]:
+    """Return the names that exist in a loop's body alone, and its carried variables."""
+    inside = {name for _, name, _ in loop.carried}
+    for s in loop.body:
+        inside |= local(s) if isinstance(s, Loop) else defined(s)
+    return inside
+
+
+def of_rank(
+    statements: Iterable[Statement], rank: Mapping[str, int], wanted: int
+) -> list[Statement]:
+    """Return the statements of one rank, in order."""
+    return [s for s in statements if any(rank[n] == wanted for n in defined(s))]
+
+
+def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
+    """Return every Ref that statements and entries read, without those that a loop has inside."""
+    found = {e for e in entries if isinstance(e, Ref)}
+    for s in statements:
+        if isinstance(s, Loop):
+            inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
+            own = local(s)
+            found |= {e for e in inside if e.name not in own}
+        elif isinstance(s, Define):
+            found |= {e for e in s.args if isinstance(e, Ref)}
+        elif isinstance(s, Array):
+            found |= {e for e in s.entries if isinstance(e, Ref)}
+        elif isinstance(s, Store):
+            found |= {e for e in (s.index, s.value, Ref(s.array)) if isinstance(e, Ref)}
+        elif isinstance(s, Until):
+            found |= {s.test} if isinstance(s.test, Ref) else set()
+    return found
+
+
+def kept_in_time(
+    timed: list[Statement], wanted: set[Ref], rank: Mapping[str, int]
+) -> tuple[set[Ref], list[Statement]]:
+    """Return (values of rank 1 to keep for every sample, statements that follow from them).
+
+    Parameters
+    ----------
+    timed : statements of rank 1, in order
+    wanted : values of rank 1 that the state depends on
+    rank : of every variable
+
+    A value that follows from others that are kept anyway by one cheap operation is computed again.
+    """
+    made = {s.name: s for s in timed if isinstance(s, Define)}
+    kept, again = set(wanted), set()
+
+    def free(ref: Ref, depth: int) -> bool:
+        """Whether a value needs nothing to be kept that is not."""
+        if rank[ref.name] == 0 or ref in kept or ref.name == "k":
+            return True
+        s = made.get(ref.name)
+        cheap = s is not None and s.op in CHEAP and depth > 0
+        return cheap and all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
+
+    for ref in sorted(wanted, key=lambda r: order(timed, r), reverse=True):
+        s = made.get(ref.name)
+        if s is None or s.op not in CHEAP:
+            continue
+        kept.discard(ref)
+        if all(free(a, 1) for a in s.args if isinstance(a, Ref)):
+            again.add(ref)
+        else:
+            kept.add(ref)
+    rest = [s for s in timed if not isinstance(s, Define) or Ref(s.name) not in kept]
+    return kept, used(rest, names(again))
+
+
+def order(statements: list[Statement], ref: Ref) -> int:
+    """Return the position of the statement that defines a Ref, -1 for an input."""
+    return next((i for i, s in enumerate(statements) if ref.name in defined(s)), -1)

@@ -1,0 +1,186 @@
+"""Measures that are a function of a whole run: which other measures they read, and their values.
+
+May import `loop.closed_loop`, `loop.saved_rows` and the folders below `jaxtank.loop`.
+"""
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn
+
+import jax
+import jax.numpy as jnp
+
+from jaxtank import measures as ms
+from jaxtank.core.clock import Clock
+from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.text import one_line
+from jaxtank.loop.closed_loop import ClosedLoop, zero_of
+from jaxtank.loop.saved_rows import simulate_compiled
+
+NOT_TRACEABLE = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""What jax raises where a program asks for the number behind a traced value."""
+
+
+class Measures(Mapping[str, Any]):
+    """The measures of one run as a function of the user's reads them; it keeps what was read."""
+
+    def __init__(self, values: Mapping[str, Any], served: tuple[str, ...]):
+        self.values_of_run, self.served = values, served
+        self.read: dict[str, None] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self.served:
+            if name in ms.MEASURES and name not in ms.functions([name]):
+                raise InputError(f"reads {name}, which has no value on this rig")
+            raise unknown("measure", str(name), self.served)
+        self.read[name] = None
+        return self.values_of_run[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.served)
+
+    def __len__(self) -> int:
+        return len(self.served)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.served
+
+
+def needed_by(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return those of `names` that are kept along with the run, and those that functions among
+    `names` read.
+
+    Raises InputError as `check_functions`.
+    """
+    own = ms.functions(names)
+    read = (m for name, spec in own.items() for m in _read_by(loop, clock, name, spec))
+    return tuple(dict.fromkeys([*(n for n in names if n not in own), *read]))
+
+
+def check_functions(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> None:
+    """Raise InputError for a function among `names` that jax cannot trace, that reads a measure
+    which this rig does not have, or that does not return one real number.
+    """
+    needed_by(loop, clock, names)
+
+
+def values_of(
+    loop: ClosedLoop,
+    clock: Clock,
+    names: tuple[str, ...],
+    key: Any,
+    measures: Mapping[str, Any],
+    checkpoint: bool = False,
+) -> dict[str, Any]:
+    """Return {name: value} of `names`: those of `measures`, and functions of them and of the run.
+
+    key: of the sensor noise, as of the run that `measures` are of. checkpoint: for reverse mode.
+    """
+    own, served, zero = ms.functions(names), _served(loop), zero_of(loop)
+    rows: dict[int, Any] = {}
+    for spec in own.values():
+        if spec.trajectory and spec.save_every not in rows:
+            every = min(spec.save_every, clock.samples)
+            rows[spec.save_every] = simulate_compiled(loop, clock, key, every, checkpoint)[0]
+    found = {name: measures[name] for name in names if name not in own}
+    for name, spec in own.items():
+        value = _called(name, spec, Measures(measures, served), rows.get(spec.save_every))
+        found[name] = jnp.asarray(value, zero.dtype)
+    return {name: found[name] for name in names}
+
+
+def program_of(loop: ClosedLoop, clock: Clock, name: str) -> str:
+    """Return the program of a function as text: two functions with one text are the same, whatever
+    they close over.
+    """
+    spec, served = ms.functions([name])[name], _served(loop)
+
+    def function(values: Any, run: Any) -> Any:
+        return _called(name, spec, Measures(values, served), run)
+
+    shapes: Any = {m: v for m, v in _shapes(loop).items() if m in _read_by(loop, clock, name, spec)}
+    lowered: Any = jax.jit(function).lower(shapes, _rows(loop, clock, spec))
+    return f"every {spec.save_every}: {lowered.as_text()}"
+
+
+def _read_by(loop: ClosedLoop, clock: Clock, name: str, spec: ms.RunFunction) -> tuple[str, ...]:
+    """Return the measures that a function reads, found by tracing it without a run."""
+    served = _served(loop)
+    read: dict[str, None] = {}
+
+    def function(values: Any, run: Any) -> Any:
+        measures = Measures(values, served)
+        value = _called(name, spec, measures, run)
+        read.update(measures.read)
+        return value
+
+    try:
+        out: Any = jax.eval_shape(function, _shapes(loop), _rows(loop, clock, spec))
+    except TypeError as error:  # of jax, for what is no array
+        _refuse(name, f"must return one number ({one_line(str(error), 120)})")
+    leaves: list[Any] = jax.tree.leaves(out)
+    if len(leaves) != 1 or jax.tree.structure(out) != jax.tree.structure(0.0):
+        _refuse(name, f"returns a {type(out).__name__}: must return one number")
+    if out.shape != ():
+        _refuse(name, f"returns an array of shape {out.shape}: must return one number")
+    if not (jnp.issubdtype(out.dtype, jnp.floating) or jnp.issubdtype(out.dtype, jnp.integer)):
+        _refuse(name, f"returns a number of type {out.dtype}: must be a real number")
+    return tuple(read)
+
+
+def _called(name: str, spec: ms.RunFunction, measures: Measures, run: Any) -> Any:
+    """Return the value of a function; InputError, naming it, for whatever it raises."""
+    # what jax has compiled takes no Mapping: the function that it was made of does
+    function: Callable[..., Any] = spec.function
+    if hasattr(function, "lower"):
+        function = getattr(function, "__wrapped__", function)
+    try:
+        return function(measures, run) if spec.trajectory else function(measures)
+    except InputError as error:
+        _refuse(name, str(error))
+    except NOT_TRACEABLE as error:
+        _refuse(
+            name,
+            "jax cannot trace it: write it with functions of jax.numpy, and without float(), if and"
+            f" while on values of the run ({type(error).__name__})",
+        )
+    except Exception as error:  # whatever a function of the user's raises
+        words = one_line(f"{type(error).__name__}: {error}", 200)
+        raise InputError(f"function {name}: {words}") from error
+
+
+def _refuse(name: str, why: str) -> NoReturn:
+    raise InputError(f"function {name}: {why}") from None
+
+
+def _served(loop: ClosedLoop) -> tuple[str, ...]:
+    """The measures that are kept along with a run of the loop."""
+    own = ms.functions(ms.MEASURES)
+    return tuple(m for m in ms.MEASURES if m not in own and ms.serves(m, loop))
+
+
+def _shapes(loop: ClosedLoop) -> dict[str, Any]:
+    """{measure: its shape and type} of `_served`."""
+    dtype: Any = zero_of(loop).dtype
+    sizes = {
+        m: () if ms.MEASURES[m].per == "run" else (ms.entries(m, loop.plant),)
+        for m in _served(loop)
+    }
+    return {m: jax.ShapeDtypeStruct(shape, dtype) for m, shape in sizes.items()}
+
+
+def _rows(loop: ClosedLoop, clock: Clock, spec: ms.RunFunction) -> Any:
+    """The shapes of the trajectory that a function is given, None where it takes none."""
+    if not spec.trajectory:
+        return None
+    every = min(spec.save_every, clock.samples)
+
+    def run(loop: ClosedLoop) -> Any:
+        return simulate_compiled(loop, clock, None, every)[0]
+
+    return jax.eval_shape(run, loop)

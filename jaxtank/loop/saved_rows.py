@@ -1,0 +1,69 @@
+"""A run that keeps every so many samples, compiled: what `simulate` and functions of a trajectory
+call. May import `loop.closed_loop`, `loop.step`, `loop.trajectory` and the folders below.
+"""
+# jax leaves the types of zeros, eval_shape, flatten and others partly open.
+# pyright: reportUnknownMemberType=false
+
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+
+from jaxtank.core.clock import Clock
+from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, zero_of
+from jaxtank.loop.step import step
+from jaxtank.loop.trajectory import COLUMNS, Trajectory
+from jaxtank.xla.hoist import scan
+from jaxtank.xla.jit import compiled
+
+
+@compiled("clock", "save_every", "checkpoint")
+def simulate_compiled(
+    loop: ClosedLoop, clock: Clock, key: jax.Array | None, save_every: int, checkpoint: bool = False
+) -> tuple[Trajectory, jax.Array]:
+    """Return (Trajectory, True if the run diverged), unchecked.
+
+    checkpoint: for reverse mode, each row is recomputed on the way back.
+    """
+    loop = keyed(loop, key)
+    rows = (clock.samples - 1) // save_every + 1
+    spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
+
+    def in_rows(a: Any) -> Any:
+        padded = jnp.pad(a, (0, max(spare, 0)), mode="edge")
+        return padded[: rows * save_every].reshape(rows, save_every)
+
+    def one(carry: Any, now: Any) -> Any:
+        state, spilled = carry
+        state, sample = step(loop, clock, state, now)
+        return (state, tuple(a + b for a, b in zip(spilled, sample.spilled))), sample
+
+    def unsaved(carry: Any, now: Any) -> Any:
+        return one(carry, now)[0], None
+
+    def row(carry: Any, now: Any) -> Any:
+        spilled = carry[1]
+        carry, sample = one(carry, jax.tree.map(_first, now))
+        if save_every > 1:
+            others = jax.tree.map(_but_first, now)
+            carry = scan(unsaved, carry, others, length=save_every - 1)[0]
+        return carry, sample._replace(spilled=spilled)
+
+    zero = zero_of(loop)
+    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key))
+    start = (initial(loop, clock), (zero,) * loop.plant.tanks)
+    kept = cast(Any, jax.checkpoint)(row) if checkpoint else row
+    (state, _), saved = scan(kept, start, xs, length=rows)
+    columns: dict[str, Any] = {}
+    for name in COLUMNS:
+        value: Any = getattr(saved, name)
+        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
+    return Trajectory(**columns, units=loop.units), is_broken(state)
+
+
+def _first(a: Any) -> Any:
+    return a[0]
+
+
+def _but_first(a: Any) -> Any:
+    return a[1:]

@@ -1,0 +1,180 @@
+"""The three-tank laboratory rig DTS200: two pumps, two pipes, leaks; PI.
+
+The derivation is in `notes/dts200.md`.
+"""
+
+import functools
+
+import numpy as np
+
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case, Free
+from jaxtank.controllers import PID
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.observers import Direct
+from jaxtank.plants.faults import faults
+from jaxtank.plants.network import network
+from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.signals.setpoints import ramps
+
+AREA, PIPE, HEIGHT, FLOW = 154.0, 0.5, 62.0, 150.0  # [cm^2], [cm^2], [cm], [cm^3/s]
+COEFFICIENTS = (0.46, 0.60, 0.45)  # of pipe 1 to 3, of the outlet of tank 2, of pipe 3 to 2
+POINT = (45.0, 15.0, 30.0)  # levels at which the printed model is linearised [cm]
+LINEAR = (-0.0085, 0.0, 0.0085, 0.0, -0.0195, 0.0084, 0.0085, 0.0084, -0.0169)  # A [1/s]
+
+KC, TI = 10.0, 100.0  # ours [cm^2/s], [s]
+DURATION = 2400.0
+STEPS = [(100.0, 0, 45.0), (900.0, 1, 20.0), (1700.0, 0, 38.0)]
+LEAK = 0.2  # area of a leak of tank 3, ours [cm^2]
+PLUGGED = 0.5  # share of the pipe from tank 1 to 3 that stays open, ours
+
+TUNABLE = {
+    "controller.Kc": Free(0.5, 100.0),
+    "controller.Ti": Free(5.0, 2000.0),
+    "controller.Tt": Free(5.0, 2000.0),
+}
+
+UNCERTAIN = {
+    "plant.pipe": (0.05, "coefficients printed to two digits"),
+    "plant.drain": (0.05, "likewise"),
+    "plant.pump_gain": (0.05, "pumps that are calibrated in flow"),
+}
+
+DEPARTURES = (
+    "Setpoints, gains, sampling period and faults are ours: the source is a benchmark (notes A1).",
+    (
+        "Inputs are flows in cm^3/s, pump_gain = 1: the rig's pumps are calibrated. Their lower"
+        " limit is 0 (notes A2)."
+    ),
+    (
+        "Around equal levels the flow through a pipe is proportional to the difference, within the"
+        " laminar threshold `plant.knee` of 0.01 cm; the printed root has an infinite slope there"
+        " (notes H1)."
+    ),
+)
+
+PUBLISHED = {
+    "plant.area": Published(AREA, "cm^2", "table of parameters"),
+    "plant.pipe": Published((0.46 * PIPE, 0.45 * PIPE), "cm^2", "table: coefficient x section"),
+    "plant.drain": Published((0.0, 0.60 * PIPE, 0.0), "cm^2", "table: coefficient x section"),
+    "plant.rim": Published(HEIGHT, "cm", "table of parameters"),
+    "actuator.high": Published(FLOW, "cm^3/s", "table of parameters"),
+    "linear model, A": Published(LINEAR, "1/s", "linear model at 45, 15 and 30 cm", 0.01),
+    "linear model, B": Published(0.0065, "1/cm^2", "linear model at 45, 15 and 30 cm", 0.01),
+    "rest at the operating point": Published(
+        "45, 15 and 30 cm are an operating point", "", "linear model"
+    ),
+}
+
+
+def rig():
+    """Return the three tanks: pumps into 1 and 2, pipes 1 to 3 and 3 to 2, outlet at tank 2."""
+    first, outlet, second = COEFFICIENTS
+    return network(
+        area=[AREA] * 3,
+        drain=[0.0, outlet * PIPE, 0.0],
+        pipes=[(0, 2), (2, 1)],
+        pipe=[first * PIPE, second * PIPE],
+        pump_gain=[1.0, 1.0],
+        feeds=[(0, None), (1, None)],
+        rim=HEIGHT,
+        outputs=(0, 1),
+        bottom=True,
+        units=("cm", "cm^3/s"),
+    )
+
+
+def loop(faulty=False):
+    """Return the closed loop, with a leak of tank 3 and a plugged pipe if `faulty`.
+
+    Examples
+    --------
+    >>> loop().plant.pipes
+    ((0, 2), (2, 1))
+    """
+    plant = rig()
+    x0, u0 = equilibrium(plant, np.array([40.0, 15.0]))
+    events = [("drain[2]", 500.0, 700.0, 1.0, LEAK), ("pipe[0]", 1300.0, 1500.0, PLUGGED, 0.0)]
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(
+            gain=number([1.0] * 3), noise=number([0.0] * 3), full_scale=number(70.0)
+        ),
+        observer=Direct(),
+        controller=PID(
+            model=plant,
+            Kc=number([KC, KC]),
+            Ti=number([TI, TI]),
+            Tt=number([TI, TI]),
+            bias=number(u0),
+        ),
+        actuator=PumpBank(
+            low=number([0.0, 0.0]),
+            high=number([FLOW, FLOW]),
+            stop=number([0.0, 0.0]),
+            pulse=number([FLOW, FLOW]),
+            initial=number(u0),
+        ),
+        reference=ramps([40.0, 15.0], STEPS, ramp=0.0),
+        x0=number(x0),
+        faults=faults(plant, events) if faulty else None,
+    )
+
+
+def measured(run):
+    """Return what is found of PUBLISHED (see `paper.Preset`)."""
+    plant = run("pi")[0].loop.plant
+    levels = np.array(POINT)
+    speed = np.sqrt(2 * 981.0)
+    through, out, back = (
+        c * PIPE * speed * np.sqrt(d) for c, d in zip(COEFFICIENTS, (15.0, 15.0, 15.0))
+    )
+    A, B, _ = linearise(plant, levels, np.array([through, out - back]))
+    own, flows = equilibrium(plant, levels[:2])
+    return {
+        "linear model, A": tuple(map(float, np.ravel(A))),
+        "linear model, B": float(B[0, 0]),
+        "rest at the operating point": Claim(
+            verdict(abs(float(own[2]) - POINT[2]) < 0.5),
+            f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests at {float(own[2]):.2f} cm, with pumps"
+            f" at {float(flows[0]):.1f} and {float(flows[1]):.1f} cm^3/s",
+        ),
+    }
+
+
+@functools.cache
+def preset():
+    """Return the Preset of this rig."""
+    cases = {
+        name: Case(
+            name=f"dts200/{name}",
+            title=f"three tanks in a row, two pumps, {title}",
+            loop=loop(faulty),
+            clock=Clock(dt=1.0, duration=DURATION),
+            limits={"max_level": "rim"},
+            free={p: TUNABLE[p] for p in ("controller.Kc", "controller.Ti")},
+            objective={"rms_error_total": 1.0},
+        )
+        for name, title, faulty in (
+            ("pi", "PI", False),
+            ("pi-faults", "PI; a leak of tank 3, then a half plugged pipe", True),
+        )
+    }
+    return Preset(
+        paper="dts200",
+        citation=(
+            "Three-tank laboratory rig DTS200, model and parameters as in S. X. Ding, Model-based"
+            " fault diagnosis techniques, 2nd ed., Springer, 2013, doi:10.1007/978-1-4471-4799-2"
+        ),
+        cases=cases,
+        published=PUBLISHED,
+        measured=measured,
+        tunable=TUNABLE,
+        uncertain=UNCERTAIN,
+        departures=DEPARTURES,
+    )

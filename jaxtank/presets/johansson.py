@@ -1,0 +1,225 @@
+"""Johansson (2000): the quadruple-tank process with an adjustable zero, decentralised PI.
+
+The derivation is in `notes/johansson.md`.
+"""
+
+import functools
+
+import numpy as np
+
+from jaxtank.analysis.linear_model import linearise, relative_gain_array, transmission_zeros
+from jaxtank.analysis.steady_state import steady_levels
+from jaxtank.case import Case, Free
+from jaxtank.controllers import PID
+from jaxtank.core.clock import Clock
+from jaxtank.core.tree import number
+from jaxtank.instruments.actuators import PumpBank
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.observers import Direct
+from jaxtank.plants.rigs import JOHANSSON, johansson
+from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.signals.setpoints import ramps
+
+VOLTS_PER_CM = 0.5  # kc, Table I: the gains are printed for levels in volts
+# (K [V/V], Ti [s]) of the two loops, sec. V
+PRINTED_GAINS = {
+    "minimum": ((3.0, 2.7), (30.0, 40.0)),
+    "non-minimum": ((1.5, -0.12), (110.0, 220.0)),
+}
+STEP = 2.0  # of each setpoint [cm], ours: notes A2
+# times of the step of each setpoint, and length of the run [s], ours: notes A2
+TIMES = {"minimum": (50.0, 650.0, 1250.0), "non-minimum": (100.0, 5100.0, 10100.0)}
+NAMES = {"minimum": "pi-minimum", "non-minimum": "pi-nonminimum"}
+
+TUNABLE = {
+    "controller.Kc[0]": Free(0.01, 20.0),
+    "controller.Kc[1]": Free(-0.6, 20.0, "linear"),  # of both signs: notes S4
+    "controller.Ti": Free(5.0, 3000.0),
+    "controller.Tt": Free(2.0, 3000.0),
+}
+# where each case is tuned: a gain keeps its sign
+FREE = {
+    "pi-minimum": {"controller.Kc": Free(0.05, 20.0), "controller.Ti": Free(5.0, 1000.0)},
+    "pi-nonminimum": {
+        "controller.Kc[0]": Free(0.01, 5.0),
+        "controller.Kc[1]": Free(-0.6, -0.002, "linear"),
+        "controller.Ti": Free(10.0, 3000.0),
+    },
+}
+
+# h0 [cm], T [s], zeros [1/s], relative gain: at P- and P+
+POINTS = {
+    "minimum": ((12.4, 12.7, 1.8, 1.4), (62.0, 90.0, 23.0, 30.0), (-0.060, -0.018), 1.40),
+    "non-minimum": ((12.6, 13.0, 4.8, 4.9), (63.0, 91.0, 39.0, 56.0), (-0.057, 0.013), -0.64),
+}
+_LEVELS = (
+    "measured on the rig; the model's own equilibrium at the printed voltages is up to 10 % off in"
+    " an upper tank"
+)
+
+
+def _published():
+    found = {
+        "plant.area": Published((28.0, 32.0, 28.0, 32.0), "cm^2", "Table I"),
+        "plant.drain": Published((0.071, 0.057, 0.0, 0.0), "cm^2", "Table I"),
+        "plant.orifice": Published((0.071, 0.057), "cm^2", "Table I"),
+        "sensor.gain": Published(1.0 / VOLTS_PER_CM, "cm/V", "Table I: 0.50 V/cm"),
+    }
+    for phase, (levels, times, zeros, gain) in POINTS.items():
+        pump, split, volts = JOHANSSON[phase]
+        K, Ti = PRINTED_GAINS[phase]
+        found |= {
+            f"pump gains, {phase} phase": Published(pump, "cm^3/(s V)", "sec. II"),
+            f"splits, {phase} phase": Published(split, "-", "sec. II"),
+            f"voltages, {phase} phase": Published(volts, "V", "sec. II"),
+            f"levels, {phase} phase": Published(levels, "cm", "sec. II", 0.10, _LEVELS),
+            f"time constants, {phase} phase": Published(times, "s", "sec. II", 0.05),
+            f"zeros, {phase} phase": Published(zeros, "1/s", "sec. III", 0.05),
+            f"relative gain, {phase} phase": Published(gain, "-", "sec. III", 0.01),
+            f"gains K, {phase} phase": Published(K, "V/V", "sec. V"),
+            f"integral times, {phase} phase": Published(Ti, "s", "sec. V"),
+        }
+    return {
+        **found,
+        "the zero's half-plane": Published("left or right, by changing a valve", "", "abstract"),
+    }
+
+
+PUBLISHED = _published()
+
+UNCERTAIN = {
+    "plant.pump_gain": (0.05, "measured, printed to three digits"),
+    "plant.split": (0.05, "set by a valve, printed to two digits"),
+    "plant.drain": (0.05, "outlets printed to two digits"),
+    "plant.orifice": (0.05, "likewise"),
+}
+
+DEPARTURES = (
+    "Rims: a height of 20 cm is taken for the tanks (notes A1).",
+    (
+        "Setpoints: steps of 2 cm (1 V of the sensor) in each output, one after the other, from"
+        " the steady state of the printed voltages; neither times nor sampling period are taken"
+        " from the paper (notes A2)."
+    ),
+    "Gains are printed for levels in volts, 0.5 V/cm: Kc = 0.5 K in V/cm.",
+    (
+        "Anti-windup: back-calculation with the integral time of each loop; the paper's is not"
+        " described (notes A3)."
+    ),
+    (
+        "The gain of loop 2 of the non-minimum phase is negative as printed: pump 2 acts on tank 2"
+        " mostly through the other loop, and the pairing of the paper is kept. Pairing the other"
+        " way is plant.outputs = [1, 0] in a rig file (notes S4)."
+    ),
+)
+
+
+def loop(phase):
+    """Return the closed loop at one of the two operating points.
+
+    Parameters
+    ----------
+    phase : "minimum" or "non-minimum"
+
+    Examples
+    --------
+    >>> loop("minimum").controller.Kc
+    array([1.5 , 1.35])
+    """
+    rig, volts = johansson(phase)
+    levels = np.asarray(steady_levels(rig, volts))
+    K, Ti = PRINTED_GAINS[phase]
+    first, second, _ = TIMES[phase]
+    start = [float(h) for h in levels[:2]]
+    steps = [(first, 0, start[0] + STEP), (second, 1, start[1] + STEP)]
+    return ClosedLoop(
+        plant=rig,
+        sensor=LevelSensor(
+            gain=number([1.0 / VOLTS_PER_CM] * 4), noise=number([0.0] * 4), full_scale=number(10.0)
+        ),
+        observer=Direct(),
+        controller=PID(
+            model=rig,
+            Kc=number([VOLTS_PER_CM * k for k in K]),
+            Ti=number(Ti),
+            Tt=number(Ti),
+            bias=number(volts),
+        ),
+        actuator=PumpBank(
+            low=number([0.0, 0.0]),
+            high=number([10.0, 10.0]),
+            stop=number([0.0, 0.0]),
+            pulse=number([10.0, 10.0]),
+            initial=number(volts),
+        ),
+        reference=ramps(start, steps, ramp=0.0),
+        x0=number(levels),
+    )
+
+
+def measured(run):
+    """Return what is found of PUBLISHED (see `paper.Preset`).
+
+    Time constants and relative gains are those at the printed levels; so are the zeros of the
+    minimum phase. The zeros of the non-minimum phase are those at the model's equilibrium.
+    """
+    found, slowest = {}, {}
+    for phase, (levels, *_) in POINTS.items():
+        plant, volts = run(NAMES[phase])[0].loop.plant, JOHANSSON[phase][2]
+        at = np.asarray(steady_levels(plant, volts))
+        A, B, C = linearise(plant, levels, volts)
+        point = levels if phase == "minimum" else at
+        zeros = sorted(float(z.real) for z in transmission_zeros(*linearise(plant, point, volts)))
+        slowest[phase] = zeros[-1]
+        controller = run(NAMES[phase])[0].loop.controller
+        found |= {
+            f"pump gains, {phase} phase": tuple(map(float, plant.pump_gain)),
+            f"splits, {phase} phase": tuple(map(float, plant.split)),
+            f"voltages, {phase} phase": tuple(map(float, controller.bias)),
+            f"gains K, {phase} phase": tuple(map(float, controller.Kc / VOLTS_PER_CM)),
+            f"integral times, {phase} phase": tuple(map(float, controller.Ti)),
+            f"levels, {phase} phase": tuple(map(float, at)),
+            f"time constants, {phase} phase": tuple(map(float, -1.0 / np.diag(A))),
+            f"zeros, {phase} phase": tuple(zeros),
+            f"relative gain, {phase} phase": float(relative_gain_array(A, B, C)[0, 0]),
+        }
+    return {
+        **found,
+        "the zero's half-plane": Claim(
+            verdict(slowest["minimum"] < 0.0 < slowest["non-minimum"]),
+            f"{slowest['minimum']:.3f} 1/s with splits of 0.70 and 0.60,"
+            f" {slowest['non-minimum']:+.3f} 1/s with 0.43 and 0.34",
+        ),
+    }
+
+
+@functools.cache
+def preset():
+    """Return the Preset of this paper."""
+    cases = {
+        name: Case(
+            name=f"johansson/{name}",
+            title=f"quadruple tank, {phase} phase, decentralised PI",
+            loop=loop(phase),
+            clock=Clock(dt=1.0, duration=TIMES[phase][2]),
+            limits={"max_level": "rim"},
+            free=FREE[name],
+            objective={"rms_error_total": 1.0},
+        )
+        for phase, name in NAMES.items()
+    }
+    return Preset(
+        paper="johansson",
+        citation=(
+            "K. H. Johansson, The quadruple-tank process: a multivariable laboratory process with"
+            " an adjustable zero, IEEE Transactions on Control Systems Technology 8(3), 456-465,"
+            " 2000, doi:10.1109/87.845876"
+        ),
+        cases=cases,
+        published=PUBLISHED,
+        measured=measured,
+        tunable=TUNABLE,
+        uncertain=UNCERTAIN,
+        departures=DEPARTURES,
+    )

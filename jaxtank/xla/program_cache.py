@@ -1,0 +1,298 @@
+"""Compiled programs kept between processes, by jax's own cache, in a folder of the user's own.
+
+Entries hold native code, so the folder is checked before it is used, and each entry by its digest.
+Imports the standard library (jax in `cache` alone); used by `jaxtank.cache` and the command line.
+"""
+
+import atexit
+import hashlib
+import os
+import platform
+import re
+import stat
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+SWITCH = "JAXTANK_CACHE"
+OFF = ("0", "off", "false", "no")
+
+LARGEST = 128 * 2**20
+"""Bytes of the programs of one version above which those compiled first are removed."""
+
+ENTRY, DIGEST = "-cache", ".sha256"
+"""Ends of the names of an entry, as jax writes it, and of the digest beside it."""
+
+VERSION_FOLDER = re.compile(r"\d[\w.+]*-[0-9a-f]{12}")
+"""Folder of the programs of one version of jaxtank on one sort of processor."""
+
+SETTINGS = {
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+
+def cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
+    """Keep what this process compiles from here on, and use what was kept before.
+
+    The command `jaxtank` does this by itself; in Python it is opt-in. Results are the same to the
+    last bit. A `jax_compilation_cache_dir` that is set already stays.
+
+    Parameters
+    ----------
+    folder : path, optional
+        Where left out: the environment variable JAXTANK_CACHE, else the user's cache folder.
+
+    Returns
+    -------
+    Path or None
+        Folder of the programs of this version and processor; None, with a warning that states why,
+        where programs cannot be kept safely, and without one where JAXTANK_CACHE=0 turns this off.
+
+    Examples
+    --------
+    >>> import jaxtank, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +SKIP
+    ...     jaxtank.cache(folder)
+    """
+    import jax
+
+    if jax.config.jax_compilation_cache_dir:
+        return Path(jax.config.jax_compilation_cache_dir)
+    found, why = prepare(folder)
+    if why:
+        warnings.warn(f"compiled programs are not kept: {why}", stacklevel=2)
+    if found is not None:
+        jax.config.update("jax_compilation_cache_dir", str(found))
+        for name, value in SETTINGS.items():
+            jax.config.update(name, value)
+    return found
+
+
+def keep_for_this_process() -> str:
+    """Do what `cache` does by environment variables, before jax is imported.
+
+    Returns
+    -------
+    str
+        Why programs are not kept; "" where they are, or where the user wants none.
+
+    Examples
+    --------
+    >>> keep_for_this_process()  # doctest: +SKIP
+    ''
+    """
+    if "jax" in sys.modules or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return ""
+    folder, why = prepare()
+    if folder is not None:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        for name, value in SETTINGS.items():
+            os.environ.setdefault(name.upper(), str(value))
+        # of an entry that another process has removed or is writing: it is compiled again
+        words = "Error (reading|writing) persistent compilation cache"
+        warnings.filterwarnings("ignore", message=words)
+    return why
+
+
+def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
+    """Return the folder of all versions; None where JAXTANK_CACHE=0, or there is no home.
+
+    Examples
+    --------
+    >>> base_folder("/tmp/kept")
+    PosixPath('/tmp/kept')
+    """
+    given = os.environ.get(SWITCH, "") if folder is None else os.fspath(folder)
+    if folder is None and given.lower() in OFF:
+        return None
+    try:
+        if given:
+            return Path(given).expanduser().absolute()
+        home, of = Path.home(), os.environ.get
+        if sys.platform == "darwin":
+            return home / "Library" / "Caches" / "jaxtank"
+        if sys.platform == "win32":
+            return Path(of("LOCALAPPDATA") or home / "AppData" / "Local") / "jaxtank" / "cache"
+        xdg = of("XDG_CACHE_HOME", "")  # a relative one does not count, by its specification
+        return (Path(xdg) if os.path.isabs(xdg) else home / ".cache") / "jaxtank"
+    except RuntimeError:  # no home
+        return None
+
+
+def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, str]:
+    """Return (folder of this version's programs, ""), made and checked, or (None, why not).
+
+    why not is "" where there is nothing that the user could mend, or would want to.
+
+    Entries without a digest, or with another one (a process was killed while it wrote, a disk is
+    damaged), are removed, and so are the oldest where all exceed LARGEST bytes.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     found, why = prepare(folder)
+    ...     found.parent == Path(folder).resolve(), why
+    (True, '')
+    """
+    base = base_folder(folder)
+    if base is None:
+        return None, ""
+    try:
+        if not base.exists():
+            if not _may_make(base):
+                return None, ""
+            base.parent.mkdir(parents=True, exist_ok=True)
+            base.mkdir(mode=0o700, exist_ok=True)
+        why = refused(base)
+        if why:
+            return None, why
+        mine = base.resolve() / f"{_version()}-{_processor()}"
+        mine.mkdir(mode=0o700, exist_ok=True)
+        if not os.access(mine, os.W_OK | os.X_OK):
+            return None, ""
+        _check_entries(mine)
+    except OSError:  # a disk that is full or can be read only
+        return None, ""
+    atexit.register(seal, mine, time.time() - 1.0)
+    return mine, ""
+
+
+def refused(folder: Path) -> str:
+    """Return why native code in a folder cannot be trusted; "" where it can.
+
+    Examples
+    --------
+    >>> refused(Path(__file__)).endswith("is no folder")
+    True
+    """
+    found, name = os.lstat(folder), repr(str(folder))
+    if stat.S_ISLNK(found.st_mode):
+        found = os.stat(folder)
+    if not stat.S_ISDIR(found.st_mode):
+        return f"{name} is no folder"
+    if sys.platform == "win32":  # the profile of a user is the user's alone
+        return ""
+    if found.st_uid != os.geteuid():
+        return f"{name} belongs to another user (JAXTANK_CACHE=DIR names a folder of your own)"
+    if stat.S_IMODE(found.st_mode) & 0o077:
+        mode = stat.S_IMODE(found.st_mode)
+        return f"{name} has mode {mode:o}, open to other users: must be 700 (chmod 700 {name})"
+    return ""
+
+
+def seal(folder: Path, since: float) -> None:
+    """Write the digest of each entry that was written after `since` [s since 1970]."""
+    for path in _entries(folder):
+        try:
+            if path.stat().st_mtime >= since:
+                _digest_of(path).write_text(hashlib.sha256(path.read_bytes()).hexdigest())
+        except OSError:  # another process has removed it
+            continue
+
+
+def contents(base: Path) -> dict[str, tuple[int, int]]:
+    """Return {folder of a version: (programs, their bytes)} below the folder of all versions.
+
+    Examples
+    --------
+    >>> contents(Path("/no/such/folder"))
+    {}
+    """
+    found: dict[str, tuple[int, int]] = {}
+    for folder in _versions(base):
+        sizes = [path.stat().st_size for path in _entries(folder)]
+        found[folder.name] = len(sizes), sum(sizes)
+    return found
+
+
+def clear(base: Path) -> int:
+    """Remove the programs of all versions, and nothing else; returns how many there were.
+
+    Examples
+    --------
+    >>> clear(Path("/no/such/folder"))
+    0
+    """
+    count = 0
+    for folder in _versions(base):
+        for path in _entries(folder):
+            _remove(path)
+            count += 1
+        if not any(folder.iterdir()):
+            folder.rmdir()
+    return count
+
+
+def _may_make(base: Path) -> bool:
+    """Return False where root would write into another user's home."""
+    if sys.platform == "win32" or os.geteuid() != 0:
+        return True
+    above = next(path for path in base.parents if path.exists())
+    return above.stat().st_uid == 0
+
+
+def _version() -> str:
+    return sys.modules["jaxtank"].__version__
+
+
+def _processor() -> str:
+    """Return what native code depends on, as 12 hexadecimal digits: programs for one processor may
+    end on another, which shares the home, by an illegal instruction.
+    """
+    words = [platform.machine(), sys.platform]
+    try:
+        with open("/proc/cpuinfo") as lines:
+            for line in lines:
+                if not line.strip():  # the end of the first core
+                    break
+                if line.split(":")[0].strip() in ("model name", "flags", "Features", "CPU part"):
+                    words.append(line)
+    except OSError:
+        words.append(platform.processor())
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()[:12]
+
+
+def _check_entries(folder: Path) -> None:
+    """Remove entries that are damaged, and the oldest ones of too many."""
+    sound: list[tuple[float, int, Path]] = []
+    for path in _entries(folder):
+        try:
+            digest = _digest_of(path).read_text()
+            good = digest == hashlib.sha256(path.read_bytes()).hexdigest()
+            found = path.stat()
+        except OSError:
+            good, found = False, None
+        if found is None or not good:
+            _remove(path)
+        else:
+            sound.append((found.st_mtime, found.st_size, path))
+    total = sum(size for _, size, _ in sound)
+    for _, size, path in sorted(sound):
+        if total <= LARGEST:
+            break
+        _remove(path)
+        total -= size
+
+
+def _versions(base: Path) -> list[Path]:
+    """Return the folders of versions, of a base that can be trusted."""
+    if not base.is_dir() or refused(base):
+        return []
+    return sorted(p for p in base.iterdir() if VERSION_FOLDER.fullmatch(p.name) and p.is_dir())
+
+
+def _entries(folder: Path) -> Iterator[Path]:
+    return iter(sorted(folder.glob(f"*{ENTRY}")))
+
+
+def _digest_of(path: Path) -> Path:
+    return path.with_name(path.name + DIGEST)
+
+
+def _remove(path: Path) -> None:
+    for one in (path, _digest_of(path)):
+        one.unlink(missing_ok=True)

@@ -1,0 +1,163 @@
+"""Compiled programs are kept between commands, safely, and change no bit of a result."""
+
+import json
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from jaxtank.xla import program_cache as kept
+from tuning.cli.main import main
+
+RUN = ["simulate", "cascaded/pi", "--json", "--dt", "8"]
+
+
+def command(folder, *words):
+    """Run the command in a process of its own with programs in `folder`; returns (out, err)."""
+    hidden = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
+    env = {n: v for n, v in os.environ.items() if n not in hidden}
+    env |= {"JAXTANK_CACHE": str(folder), "JAX_LOG_COMPILES": "0"}
+    done = subprocess.run(
+        [sys.executable, "-m", "jaxtank", *words], capture_output=True, text=True, env=env
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout, done.stderr
+
+
+def measures(out):
+    """What a run printed, without the time it took."""
+    return {n: v for n, v in json.loads(out).items() if n in ("measures", "parameters")}
+
+
+def entries(folder):
+    return sorted(folder.glob(f"*/*{kept.ENTRY}"))
+
+
+def test_kept_damaged_and_absent_programs_give_the_same_bits(tmp_path):
+    """A damaged entry is compiled again, and replaced, without a word."""
+    folder = tmp_path / "kept"
+    new, _ = command(folder, *RUN)
+    first = {path: path.read_bytes() for path in entries(folder)}
+    assert first and stat.S_IMODE(folder.stat().st_mode) == 0o700
+    written = {path: path.stat().st_mtime_ns for path in first}
+    again, _ = command(folder, *RUN)
+    assert {path: path.stat().st_mtime_ns for path in entries(folder)} == written
+    for path, data in first.items():
+        path.write_bytes(data[: len(data) // 2])
+    truncated, err = command(folder, *RUN)
+    assert "cache" not in err
+    for path, data in first.items():
+        assert len(path.read_bytes()) > 0.9 * len(data)
+    without, _ = command("0", *RUN)
+    assert measures(new) == measures(again) == measures(truncated) == measures(without)
+
+
+@pytest.fixture
+def entry(tmp_path, monkeypatch):
+    """A sealed entry in a folder that was prepared: (base, path)."""
+    monkeypatch.setattr(kept.atexit, "register", lambda *_: None)
+    base = tmp_path / "kept"
+    folder, why = kept.prepare(base)
+    assert folder is not None and why == ""
+    path = folder / f"jit_f-00{kept.ENTRY}"
+    path.write_bytes(b"native code")
+    kept.seal(folder, 0.0)
+    return base, path
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(b"native c0de"),
+        lambda path: path.write_bytes(b"native"),
+        lambda path: path.with_name(path.name + kept.DIGEST).unlink(),
+    ],
+    ids=["one bit", "truncated", "killed before its digest"],
+)
+def test_an_entry_that_is_not_as_it_was_written_is_removed(entry, damage):
+    base, path = entry
+    kept.prepare(base)
+    assert path.exists()
+    damage(path)
+    kept.prepare(base)
+    assert not path.exists()
+
+
+def test_the_oldest_entries_are_removed_where_all_are_too_large(entry, monkeypatch):
+    base, old = entry
+    os.utime(old, (1.0, 1.0))
+    new = old.with_name(f"jit_g-00{kept.ENTRY}")
+    new.write_bytes(b"more native code")
+    kept.seal(new.parent, 0.0)
+    monkeypatch.setattr(kept, "LARGEST", 20)
+    kept.prepare(base)
+    assert new.exists() and not old.exists()
+
+
+def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch):
+    base = tmp_path / "open"
+    base.mkdir(mode=0o755)
+    os.chmod(base, 0o755)
+    folder, why = kept.prepare(base)
+    assert folder is None and "mode 755" in why and list(base.iterdir()) == []
+    os.chmod(base, 0o700)
+    monkeypatch.setattr(kept.os, "geteuid", lambda: base.stat().st_uid + 1)
+    folder, why = kept.prepare(base)
+    assert folder is None and "another user" in why and list(base.iterdir()) == []
+
+
+def test_root_makes_no_folder_in_the_home_of_another(tmp_path, monkeypatch):
+    home = tmp_path / "home"
+    home.mkdir()
+    real = kept.Path.stat
+
+    def of_alice(path, **options):
+        found = real(path, **options)
+        return os.stat_result((*found[:4], 1234, *found[5:])) if path == home else found
+
+    monkeypatch.setattr(kept.Path, "stat", of_alice)
+    monkeypatch.setattr(kept.os, "geteuid", lambda: 0)
+    assert kept.prepare(home / ".cache" / "jaxtank") == (None, "")
+    assert list(home.iterdir()) == []
+
+
+def test_without_a_home_or_with_one_that_is_a_file_nothing_is_kept(tmp_path, monkeypatch):
+    monkeypatch.delenv(kept.SWITCH, raising=False)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert kept.prepare() == (None, "")
+    monkeypatch.setattr(kept.Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert kept.prepare() == (None, "")
+
+
+def test_the_command_prints_and_clears_what_is_kept(entry, monkeypatch, capsys):
+    base, path = entry
+    other = base / "mine.txt"
+    other.write_text("not a program")
+    monkeypatch.setenv(kept.SWITCH, str(base))
+    assert main(["cache", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["folder"], found["programs"], found["bytes"]) == (str(base), 1, 11)
+    assert main(["cache", "clear"]) == 0 and "1 programs removed" in capsys.readouterr().out
+    assert not path.exists() and other.exists()
+    assert main(["cache", "clera"]) == 2 and "nearest: clear" in capsys.readouterr().err
+    monkeypatch.setenv(kept.SWITCH, "0")
+    assert main(["cache"]) == 0 and capsys.readouterr().out == "off: JAXTANK_CACHE=0\n"
+
+
+def test_in_python_programs_are_kept_where_asked(tmp_path):
+    program = (
+        "import sys, jaxtank, jax\nfound = jaxtank.cache(sys.argv[1])\n"
+        "jax.jit(lambda a: a * 2.0)(3.0).block_until_ready()\n"
+        "print(len(list(found.glob('*-cache'))))"
+    )
+    env = {n: v for n, v in os.environ.items() if not n.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "kept")],
+        capture_output=True,
+        text=True,
+        env=env,
+    )
+    assert done.stdout == "1\n", done.stderr

@@ -1,0 +1,59 @@
+"""Deviates that are drawn by our own rounds of Threefry are those of jax, bit for bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtank.xla.normal import normal
+
+
+@pytest.mark.parametrize("shape", [(4, 1001), (1, 7), (3,)])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_deviates_are_those_of_jax(shape, compiled):
+    mine, theirs = normal, lambda key, shape: jax.random.normal(key, shape, jnp.float64)
+    if compiled:
+        mine, theirs = (jax.jit(f, static_argnums=1) for f in (mine, theirs))
+    for seed in (0, 2**31 - 1):
+        key = jax.random.fold_in(jax.random.key(seed), 3)
+        np.testing.assert_array_equal(mine(key, shape), theirs(key, shape))
+
+
+def test_a_batch_of_keys_has_the_deviates_of_each():
+    keys = jax.random.split(jax.random.key(5), 6)
+    many = jax.jit(jax.vmap(lambda key: normal(key, (2, 9))))(keys)
+    for key, row in zip(keys, many):
+        np.testing.assert_array_equal(row, jax.random.normal(key, (2, 9), jnp.float64))
+
+
+def test_other_generators_and_types_are_left_to_jax():
+    for key in (jax.random.PRNGKey(1), jax.random.key(1, impl="rbg")):
+        np.testing.assert_array_equal(
+            normal(key, (5,)), jax.random.normal(key, (5,), jnp.result_type(float))
+        )
+
+
+def test_its_program_holds_no_loop():
+    """The loops of jax's own generator are what it avoids."""
+    text = jax.jit(lambda key: normal(key, (4, 64))).lower(jax.random.key(0)).as_text()
+    assert "while" not in text and "threefry" not in text
+
+
+def test_the_noise_of_a_run_drawn_in_its_loop_is_that_drawn_before():
+    """Deviates that are given, as the tuner gives them, against those drawn sample by sample."""
+    import jaxtank
+    from jaxtank import presets, rig
+    from jaxtank.loop.run import evaluate_compiled
+
+    case = presets.find("cascaded/pi")
+    case = rig.set_values(case, {"clock.duration": 400.0, "sensor.noise": [0.1, 0.2]})
+    key = jax.random.key(3)
+    names = ("rms_error_total", "max_level")
+    given = jnp.stack(case.loop.sensor.draw(key, case.clock.samples))
+    before, there = (
+        evaluate_compiled(case.loop, case.clock, names, k, False)[0] for k in (given, key)
+    )
+    for name in names:
+        np.testing.assert_array_equal(before[name], there[name])
+    run = jaxtank.simulate(case.loop, case.clock, key=key)
+    np.testing.assert_array_equal(there["max_level"], run.x.max(axis=0))

@@ -1,0 +1,237 @@
+/* The driver of one case's printed functions: runs, noise, measures. No DOM: a page, a worker and
+node run the same text. `info` and `programs` stand above it. */
+
+/* The deviates of jax.random.normal: threefry2x32 (Salmon et al. 2011) in counter mode, and the
+inverse error function of Giles (2010). */
+function threefry(key, a, b) {
+  const keys = [key[0], key[1], key[0] ^ key[1] ^ 0x1bd11bda];
+  const turns = [13, 15, 26, 6, 17, 29, 16, 24];
+  a = (a + keys[0]) | 0;
+  b = (b + keys[1]) | 0;
+  for (let i = 0; i < 5; ++i) {
+    for (let j = 0; j < 4; ++j) {
+      const turn = turns[(i % 2) * 4 + j];
+      a = (a + b) | 0;
+      b = ((b << turn) | (b >>> (32 - turn))) ^ a;
+    }
+    a = (a + keys[(i + 1) % 3]) | 0;
+    b = (b + keys[(i + 2) % 3] + i + 1) | 0;
+  }
+  return [a >>> 0, b >>> 0];
+}
+
+const inverseErf = [
+  [1.6536545626831027356, 0.24015818242558961693, -0.0060336708714301490533,
+    -0.00074070253416626697512, 0.0001867342080340571352, -1.3882523362786468719e-05,
+    -1.3654692000834678645e-06, 4.2347877827932403518e-07, -2.9070369957882005086e-08,
+    -4.1126339803469836976e-09, 1.051212273321532285e-09, -5.4154120542946279317e-11,
+    -1.2975133253453532498e-11, 2.6335093153082322977e-12, -8.1519341976054721522e-14,
+    -4.0545662729752068639e-14, 6.6376381343583238325e-15, 2.0972767875968561637e-17,
+    -1.333171662854620906e-16, 1.115787767802518096e-17, 1.2858480715256400167e-18,
+    -1.685059138182016589e-19, -3.6444120640178196996e-21],
+  [3.0838856104922207635, 1.0052589676941592334, 0.005370914553590063617,
+    -0.0037512085075692412107, 0.0024914420961078508066, -0.0016882755560235047313,
+    0.00095328937973738049703, -0.0003550375203628474796, 2.4031110387097893999e-05,
+    6.8284851459573175448e-05, -4.7318229009055733981e-05, 1.2475304481671778723e-05,
+    2.9234449089955446044e-06, -4.013867526981545969e-06, 1.5027403968909827627e-06,
+    1.8239629214389227755e-08, -2.7517406297064545428e-07, 9.0756561938885390979e-08,
+    2.2137376921775787049e-09],
+  [4.8499064014085844221, 1.0103004648645343977, -0.00013871931833623122026,
+    -0.00021503011930044477347, 7.5995277030017761139e-05, -1.9681778105531670567e-05,
+    4.5260625972231537039e-06, -9.9298272942317002539e-07, 2.2900482228026654717e-07,
+    -6.7711997758452339498e-08, 2.9147953450901080826e-08, -1.4960026627149240478e-08,
+    7.6157012080783393804e-09, -3.7894654401267369937e-09, 1.5076572693500548083e-09,
+    -2.5556418169965252055e-10, -2.7109920616438573243e-11],
+];
+
+function normal(bits) {
+  const least = -1 + 2 ** -53;
+  const share = (bits[0] * 2 ** 20 + (bits[1] >>> 12)) * 2 ** -52;
+  const x = Math.max(least, share * 2 + least);
+  let w = -Math.log1p(-x * x);
+  const part = w < 6.25 ? 0 : w < 16 ? 1 : 2;
+  w = part === 0 ? w - 3.125 : Math.sqrt(w) - (part === 1 ? 3.25 : 5);
+  const from = inverseErf[part];
+  let p = from[from.length - 1];
+  for (let i = from.length - 2; i >= 0; --i) p = from[i] + p * w;
+  return Math.SQRT2 * p * x;
+}
+
+/* (tanks) arrays of `samples` deviates of a seed, as a run of jaxtank draws them. */
+function deviates(seed, tanks, samples) {
+  const key = [Math.floor(seed / 2 ** 32), seed >>> 0], chunk = 2 ** 18;
+  const out = Array.from({ length: tanks }, () => new Float64Array(samples));
+  const draw = (own, first, count) => {
+    for (let i = 0; i < tanks; ++i)
+      for (let j = 0; j < count; ++j) {
+        const at = i * count + j;
+        out[i][first + j] = normal(threefry(own, Math.floor(at / 2 ** 32), at >>> 0));
+      }
+  };
+  if (samples <= chunk) draw(key, 0, samples);
+  else
+    for (let first = 0, piece = 0; first < samples; first += chunk, ++piece)
+      draw(threefry(key, 0, piece), first, Math.min(chunk, samples - first));
+  return out;
+}
+
+info.leaves = info.leaves.flatMap(([unit, doc, group, entries]) =>
+  entries.map(([name, value, lower, upper]) => ({ name, unit, doc, value, lower, upper, group })));
+
+const PIECE = 500; // samples
+
+function makeEngine() {
+  const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.value]));
+  const noisy = info.leaves.filter((leaf) => leaf.name.startsWith("sensor.noise"));
+  const samples = info.samples, tanks = info.tanks.length;
+  const kept = new Map();
+  let drawn = { seed: null, noise: null }, still = null;
+
+  function numberOf(values, name) {
+    return values && name in values ? Number(values[name]) : defaults.get(name);
+  }
+
+  function numbers(program, values) {
+    for (const name of Object.keys(values || {}))
+      if (!defaults.has(name)) throw new Error(`${name}: no parameter of this loop has this name`);
+    return Float64Array.from(program.leaves, (name) => numberOf(values, name));
+  }
+
+  function chosen(filter) {
+    const on = filter === undefined ? info.filter.default_on : Boolean(filter);
+    return on && info.filter.present ? 1 % programs.length : 0;
+  }
+
+  function noise(values, seed) {
+    if (!noisy.some((leaf) => numberOf(values, leaf.name) > 0)) {
+      still = still || new Float64Array(samples);
+      return Array(tanks).fill(still);
+    }
+    if (drawn.seed !== seed) drawn = { seed, noise: deviates(seed, tanks, samples) };
+    return drawn.noise;
+  }
+
+  /* What is known of each sample, computed again where the numbers that it depends on changed. */
+  function signals(program, q) {
+    if (!kept.has(program)) kept.set(program, { signals: null, of: null });
+    const own = kept.get(program);
+    if (own.of !== null && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
+    own.signals = own.signals ||
+      Array.from({ length: program.streams }, () => new Float64Array(samples));
+    pieces((k, K) => program.signals(q, k, K, own.signals));
+    own.of = q;
+    return own.signals;
+  }
+
+  /* All samples in short calls: V8 compiles a function that is called often for good, and one that is
+  in a long loop for this call alone. */
+  function pieces(work) {
+    for (let k = 0; k < samples; k += PIECE) work(k, Math.min(k + PIECE, samples));
+  }
+
+  function measuresOf(program, values) {
+    const found = {};
+    let at = 0;
+    for (const { name, size } of program.along ? [] : info.measures)
+      found[name] = size === null ? NaN : Array(size).fill(NaN);
+    for (const [name, size] of program.measures) {
+      found[name] = size === null ? values[at++] : values.slice(at, at += size);
+    }
+    return found;
+  }
+
+  function run(values, options) {
+    const { every = info.save_every_default, seed = 0, filter, measures = true } = options || {};
+    const program = programs[chosen(filter)], p = numbers(program, values);
+    const [forSignals, forRun, forRead, state, lines] = program.lead(p);
+    const S = signals(program, forSignals), N = noise(values, seed);
+    const width = program.columns.reduce((sum, [, size]) => sum + size, 0);
+    const rows = Math.floor((samples - 1) / every) + 1, R = new Float64Array(rows * width);
+    let written = 0;
+    pieces((k, K) => {
+      written += program.run(forRun, state, lines, S, N, k, K, every, R.subarray(written));
+    });
+    const out = { t: Float64Array.from({ length: rows }, (_, i) => i * every * info.dt) };
+    let first = 0;
+    for (const [name, size] of program.columns) {
+      out[name] = Array.from({ length: size }, (_, j) => {
+        const column = new Float64Array(rows);
+        for (let i = 0, at = first + j; i < rows; ++i, at += width) column[i] = R[at];
+        return column;
+      });
+      first += size;
+    }
+    out.h = out.x;
+    delete out.x;
+    if (!out.d_hat.some((column) => column.some((v) => v !== 0))) out.d_hat = null;
+    if (measures) out.measures = measuresOf(program, program.read(forRead, state));
+    out.broken = diverged(state);
+    return out;
+  }
+
+  /* Measures, their derivatives by `names` and the Gauss-Newton matrix, of one run. */
+  function tangents(values, names, options) {
+    const { seed = 0, filter } = options || {};
+    const program = programs[chosen(filter)].tangents, p = numbers(program, values);
+    const [forSignals, forPush, forRead, forAim, forSlope, state, lines] = program.lead(p);
+    const P = names.length, aims = names.map((name) => {
+      const d = new Float64Array(program.along.length), i = program.along.indexOf(name);
+      if (i < 0) throw new Error(`${name}: this text has no derivatives by it`);
+      d[i] = 1;
+      return program.aim(forAim, d);
+    });
+    const S = signals(program, forSignals), N = noise(values, seed);
+    const D = joined(aims.map((a) => a[0])), T = joined(aims.map((a) => a[2]));
+    const M = aims.map((a) => a[3]), G = new Float64Array(P * P);
+    pieces((k, K) => program.push(forPush, state, lines, S, N, k, K, P, D, T, M, G));
+    for (let a = 0; a < P; ++a)
+      for (let b = 0; b <= a; ++b) G[b * P + a] = G[a * P + b] *= 2;
+    const width = P ? T.length / P : 0, jacobian = {};
+    const slopes = aims.map((a, j) =>
+      program.slope(forSlope, state, a[1], T.subarray(j * width, (j + 1) * width)));
+    let first = 0;
+    for (const [name, size] of program.measures) {
+      const n = size === null ? 1 : size, rows = new Float64Array(n * P);
+      for (let i = 0; i < n; ++i) for (let j = 0; j < P; ++j) rows[i * P + j] = slopes[j][first + i];
+      jacobian[name] = rows;
+      first += n;
+    }
+    const measures = measuresOf(program, program.read(forRead, state));
+    return { measures, jacobian, gauss_newton: G, broken: diverged(state) };
+  }
+
+  function diverged(state) {
+    let level = 0;
+    for (let i = 0; i < tanks; ++i) level += state[i];
+    return !Number.isFinite(level);
+  }
+
+  function joined(parts) {
+    const out = new Float64Array(parts.reduce((sum, part) => sum + part.length, 0));
+    let at = 0;
+    for (const part of parts) {
+      out.set(part, at);
+      at += part.length;
+    }
+    return out;
+  }
+
+  function command(values, options) {
+    const { filter, seed = 0, dt } = options || {};
+    const words = ["jaxtank", "simulate", quoted(info.case)];
+    for (const [name, value] of Object.entries(values || {}))
+      if (!Object.is(Number(value), defaults.get(name)))
+        words.push("--set", quoted(`${name}=${Number(value)}`));
+    if (dt !== undefined && dt !== info.dt) words.push("--dt", String(dt));
+    if (seed) words.push("--seed", String(seed));
+    if (info.filter.present && filter !== undefined && Boolean(filter) !== info.filter.default_on)
+      words.push(filter ? "--safety-filter" : "--no-safety-filter");
+    return words.join(" ");
+  }
+
+  return { info, run, tangents, command };
+}
+
+function quoted(text) {
+  return /^[\w@%+=:,.\/-]+$/.test(text) ? text : `'${text.replace(/'/g, `'\\''`)}'`;
+}

@@ -1,0 +1,272 @@
+"""The functions of one case as JavaScript: what depends on its numbers alone, signals, the run.
+
+Imported by `tuning.live.engine`.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from jaxtank.export.whole.compact import MATHS, Text, short_names
+from jaxtank.export.javascript import helpers
+from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
+from jaxtank.export.statements import (
+    TRUTH,
+    Array,
+    Define,
+    Matrix,
+    Ref,
+    Statement,
+    names,
+    used,
+)
+from jaxtank.export.whole.loop import SAVED, WholeLoop
+
+ALONE, TIMED, MOVING = 0, 1, 2
+"""Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
+FIXED = frozenset("p d k c e q j o S N L R K P D T M G E every".split())
+"""Names of arguments of the printed functions."""
+
+
+class Printed:
+    """The printed functions of a WholeLoop.
+
+    lead(p) -> [numbers for signals, run and read, state c, delay lines L]; signals(q, k, K, S)
+    fills S, arrays of what is known of each sample k to K - 1; run(q, c, L, S, N, k, K, every, R)
+    moves c and L over those samples, with the deviates N of the noise, writes a row to R of one
+    sample in `every`, and returns how many numbers it wrote; read(q, c) returns the measures.
+    """
+
+    def __init__(
+        self,
+        loop: WholeLoop,
+        statements: list[Statement] | None = None,
+        others: Iterable[Any] = (),
+        at_end: Iterable[Any] = (),
+    ):
+        """others: what else is read at each sample; at_end: what else is read after the last."""
+        self.loop, self.others, self.at_end = loop, list(others), list(at_end)
+        self.statements = hoisted(loop.statements) if statements is None else statements
+        lines = dict.fromkeys(loop.lines.values(), MOVING)
+        given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
+        self.rank = ranks(self.statements, given)
+        self.truths = {
+            s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH
+        }
+        self.state = self._live()
+        self.moving = self._moving()
+        self.measured = self._measured()
+        self.kept, self.again = self._kept()
+        self.crossing = {
+            "signals": self._alone(self._timed(), self.kept),
+            "run": self._alone([*self.again, *self.moving], self._outputs()),
+            "read": self._alone(self.measured, self._measures()),
+        }
+
+    def text(self) -> str:
+        """Return the four functions as an object, without the helpers that they call."""
+        functions = [self._lead(), self._signals(), self._run(), self._read()]
+        return "\n".join(functions)
+
+    def helpers(self) -> list[str]:
+        """Return the functions that the printed ones call."""
+        return helpers(self.statements)
+
+    def streams(self) -> list[Ref]:
+        """Return what is known of each sample, in the order of S."""
+        return sorted(self.kept)
+
+    def columns(self) -> dict[str, int]:
+        """Return {saved field: number of its entries}, in the order of a row of R."""
+        return {field: len(self.loop.saved[field]) for field in SAVED}
+
+    def _live(self):
+        """The entries of c, without delay lines, that what is saved or measured depends on."""
+        wanted = [e for f in SAVED for e in self.loop.saved[f]] + self._measures()
+        wanted += [*self.others, *(self.loop.after[i] for i in self._levels())]
+        lines = [self.loop.after[i] for i in self.loop.lines]
+        every, live = self._ranked(MOVING), []
+        while True:
+            after = [*wanted, *lines, *(self.loop.after[i] for i in live)]
+            found = refs(used(every, names(after)), after)
+            new = sorted(e.index for e in found if e.name == "c")
+            if new == live:
+                return live
+            live = new
+
+    def _outputs(self):
+        after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
+        return [*after, *self.others, *(e for f in SAVED for e in self.loop.saved[f])]
+
+    def _measures(self):
+        return [*self.at_end, *(e for found in self.loop.measures.values() for e in found)]
+
+    def _levels(self):
+        """The entries of c that are levels: those whose sum tells a run that diverged."""
+        return range(self.loop.case.loop.plant.tanks)
+
+    def _ranked(self, rank):
+        return of_rank(self.statements, self.rank, rank)
+
+    def _timed(self):
+        return used(self._ranked(TIMED), names(self.kept))
+
+    def _moving(self):
+        return used(self._ranked(MOVING), names(self._outputs()))
+
+    def _measured(self):
+        return used(self._ranked(MOVING), names(self._measures()))
+
+    def _kept(self):
+        """What is kept of every sample, and what is computed again of it."""
+        wanted = refs(self.moving, self._outputs())
+        wanted = {e for e in wanted if self.rank[e.name] == TIMED and e.name != "k"}
+        timed = self._ranked(TIMED)
+        kept, again = kept_in_time(timed, wanted, self.rank)
+        return kept, again
+
+    def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
+        """What of rank ALONE is read, entries of arrays in place of the arrays."""
+        inside = {s.name for s in statements if isinstance(s, Array)}
+        found = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
+        arrays = [s for s in self._arrays(statements) if s.name not in inside]
+        found |= {e for s in arrays for e in s.entries if isinstance(e, Ref)}
+        return sorted(found, key=lambda e: (e.name, -1 if e.index is None else e.index))
+
+    def _arrays(self, statements):
+        """Arrays of rank ALONE that matrix operations of a higher rank read."""
+        read = {o for s in statements if isinstance(s, Matrix) for o in s.operands}
+        return [s for s in self._ranked(ALONE) if isinstance(s, Array) and s.name in read]
+
+    def _lead(self):
+        outputs = [self.loop.first[i] for i in self.state]
+        outputs += [self.loop.first[i] for i in self.loop.lines]
+        for found in self.crossing.values():
+            outputs += found
+        alone = used(self._ranked(ALONE), names(outputs))
+        text = Text({"p": "p"}, short_names(FIXED))
+        lines = text.write(alone, outputs, hold=outputs)
+        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
+        parts = [f"Float64Array.of({','.join(map(text.of, group))})" for group in groups]
+        delays = [
+            f"new Float64Array({size}).fill({text.of(self.loop.first[i])})"
+            for i, size in self._line_sizes().items()
+        ]
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return function("lead", "p", lines)
+
+    def _line_sizes(self):
+        """{entry of c at which a line begins: its size}."""
+        ends = [*sorted(self.loop.lines), len(self.loop.first)]
+        root = {start: self.loop.after[start].name for start in self.loop.lines}
+        return {
+            start: sum(isinstance(e, Ref) and e.name == root[start] for e in self.loop.after)
+            for start in ends[:-1]
+        }
+
+    def _begin(self, name, extra):
+        """Return the first lines of a function, and its Text with the numbers it reads."""
+        text = Text(extra, short_names(FIXED))
+        found = self.crossing[name]
+        own = [next(text.names) for _ in found]
+        text.given.update(zip(found, own))
+        return text, [f"const[{','.join(own)}]=q;"] if own else []
+
+    def _signals(self):
+        text, lines = self._begin("signals", {Ref("k"): "k"})
+        streams = self.streams()
+        own = [next(text.names) for _ in streams]
+        if own:
+            lines.append(f"const[{','.join(own)}]=S;")
+        body = text.write(self._timed(), streams)
+        body += [f"{array}[k]=+{text.of(e)};" for array, e in zip(own, streams)]
+        lines += ["for(;k<K;++k){", *body, "}"] if own else []
+        return function("signals", "q,k,K,S", lines)
+
+    def _run(self):
+        text, lines, body, state = self._sample()
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for f in SAVED for e in self.loop.saved[f]]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={own};" for j, own in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
+
+    def _sample(self):
+        """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
+        text, lines = self._begin("run", {Ref("k"): "k"})
+        streams = self.streams()
+        kept = [next(text.names) for _ in streams]
+        noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
+        if kept:
+            lines.append(f"const[{','.join(kept)}]=S;")
+        lines.append(f"const[{','.join(noise)}]=N;")
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        delays = [next(text.names) for _ in self.loop.lines]
+        text.given |= dict(zip(self.loop.lines.values(), delays))
+        lines.append(f"let[{','.join(state)}]=c;")
+        lines += [f"const[{','.join(delays)}]=L;"] if delays else []
+        lines += text.write(self._arrays(self.moving), [])
+        body = [f"const {own}={array}[k];" for own, array in self._given(text, streams, kept)]
+        deviates = [Ref("n", i) for i in range(len(noise))]
+        body += [f"const {own}={array}[k];" for own, array in self._given(text, deviates, noise)]
+        outputs = self._outputs()
+        body += text.write([*self.again, *self.moving], outputs, hold=outputs)
+        return text, lines, body, state
+
+    def _given(self, text, found, arrays):
+        """Yield (variable, array) of what is read at each sample."""
+        for e, array in zip(found, arrays):
+            text.given[e] = next(text.names)
+            yield text.given[e], array
+
+    def _next(self, text):
+        """Lines that put the next state in the place of the last one."""
+        moved = []
+        for i in self.state:
+            e, name = self.loop.after[i], text.given[Ref("c", i)]
+            if e != Ref("c", i):
+                moved.append((name, text.of(e), self._real(e)))
+        old = {name for name, *_ in moved}
+        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
+        first = [f"const {new}={value};" for value, new in temporary.items()]
+        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
+
+    def _real(self, e):
+        """What makes a number of a value that may be true or false."""
+        return "+" if isinstance(e, Ref) and e.name in self.truths else ""
+
+    def _read(self):
+        text, lines = self._begin("read", {})
+        state = [next(text.names) for _ in self.state]
+        text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
+        lines.append(f"const[{','.join(state)}]=c;")
+        outputs = [e for found in self.loop.measures.values() for e in found]
+        lines += text.write(used(self.measured, names(outputs)), outputs, hold=outputs)
+        return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
+
+
+def function(name: str, arguments: str, lines: Iterable[str]) -> str:
+    """Return a function as text, with constants that follow each other in one statement.
+
+    Examples
+    --------
+    >>> print(function("f", "q", ["const[a]=q;", "const b=a+1;", "return b;"]))
+    function f(q){const[a]=q,
+    b=a+1;
+    return b;}
+    """
+    short: list[str] = []
+    constant = False
+    for line in lines:
+        now = line.startswith(("const ", "const[")) and line.endswith(";")
+        if now and constant:
+            short[-1] = short[-1][:-1] + ","
+            line = line.removeprefix("const").lstrip()
+        short.append(line)
+        constant = now
+    return f"function {name}({arguments}){{" + "\n".join(short) + "}"
+
+
+def maths(text: str) -> str:
+    """Return the line that gives the functions of Math in `text` their own names."""
+    return f"const{{{','.join(m for m in MATHS if f'{m}(' in text)}}}=Math;"
