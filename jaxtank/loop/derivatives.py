@@ -112,8 +112,9 @@ def sensitivities_compiled(
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        run = run_with(at(theta), clock, names)
-        return ms.read(run, carried.join(floats, rest)[1], names), None
+        return ms.read(
+            run_with(at(theta), clock, names), carried.join(floats, rest)[1], names
+        ), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
