@@ -108,6 +108,12 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             " and give the loop's leaves as float64"
         )
     held: Any = loop.reference.held()
+    if held is None:
+        kind = type(loop.reference).__name__
+        raise InputError(
+            f"stability margins need a reference that holds setpoints: a {kind} has none"
+            " (signals.Ramps and signals.Constant have)"
+        )
     r = jnp.stack([jnp.stack([jnp.asarray(v, jnp.float64) for v in row]) for row in held])
     bare = dataclasses.replace(
         loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None

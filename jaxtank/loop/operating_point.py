@@ -36,7 +36,7 @@ REASONS = (
     "",
     "a tank would be at its rim",
     "the controller or an instrument has no derivative there (a switch, a dead zone)",
-    "the loop has no steady state there, whatever the limits of the pumps",
+    "no steady state of the loop is found there (a switching controller has none)",
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
     "the controller or an instrument counts samples, and has no steady state",

@@ -26,7 +26,7 @@ def run_measures(
     """Return {measure: value} of everything that is reported of one run.
 
     key : of the sensor noise, None where there is none. besides : names, of which the functions of
-    the user's are reported too.
+    the user's and the margins of the linearised loop are reported too.
     """
     values = lp.evaluate(loop, clock, _names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
@@ -46,12 +46,10 @@ def margin_measures(loop: ClosedLoop, clock: Clock) -> dict[str, np.ndarray]:
 def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]:
     """Return {measure: value} of every scenario at {parameter: value}."""
     points = {n: np.array([v]) for n, v in values.items()}
-    linear = tuple(m for m in problem.needed if ms.MEASURES[m].linear)
     table: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
         loop = problem.runs[group.runs[0]].case.loop
-        names = (*_names(loop, problem.needed), *linear)
-        measures, _ = sc.values_of(group, names, points)
+        measures, _ = sc.values_of(group, _names(loop, problem.needed), points)
         for j, i in enumerate(group.runs):
             table[i] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
     return table
@@ -60,4 +58,6 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
 def _names(loop: ClosedLoop, besides: Iterable[str]) -> tuple[str, ...]:
     """Return the measures that are reported of a loop, and when levels were reached."""
     known = (m for m in ms.reported() if ms.serves(m, loop))
-    return (*known, *ms.times(), *ms.functions(besides))
+    besides = tuple(besides)
+    linear = (m for m in besides if ms.MEASURES[m].linear)
+    return (*known, *ms.times(), *ms.functions(besides), *linear)
