@@ -52,7 +52,9 @@ const options = () => ({ seed: state.seed, filter: state.filter === true });
 
 function run(values = effective(), every = data.drawn) {
   try {
-    return engine.run(values, { ...options(), every });
+    const found = engine.run(values, { ...options(), every });
+    if (!state.filter) delete found.measures.filter_active_fraction;
+    return found;
   } catch (error) {
     say(`This run is not possible: ${error.message}`);
     return null;
@@ -714,7 +716,7 @@ window.jaxtank = {
     refresh();
     const plain = (list) => list.map((one) => Array.from(one));
     const finite = (v) => (Number.isFinite(v) ? v : null);
-    const measures = Object.fromEntries(info.measures.map(({ name }) => {
+    const measures = Object.fromEntries(info.measures.filter(({ name }) => name in found.measures).map(({ name }) => {
       const value = found.measures[name];
       return [name, typeof value === "number" ? finite(value) : Array.from(value, finite)];
     }));
