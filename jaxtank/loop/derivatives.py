@@ -108,8 +108,7 @@ def sensitivities_compiled(
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    last = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
-    floats, dfloats, rest, matrix = last
+    floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
         return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None

@@ -533,8 +533,9 @@ def test_tune_takes_what_is_free_limited_and_wanted_from_its_options():
 def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
     printed = say(
         "tune",
-        CASE,
-        *SHORT,
+        "cascaded/pi",
+        "--set",
+        "clock.duration=1200",
         *SEARCH,
         "--limit",
         "none",

@@ -157,8 +157,8 @@ def _tightened(result, answer) -> Found:
     if answer.tightened and not all(answer.kept.values()):
         yield Message(
             "constraints-tightened",
-            f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that the"
-            " limits hold on validation plants",
+            f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
+            " hold on validation plants",
         )
 
 

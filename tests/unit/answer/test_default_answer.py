@@ -202,6 +202,9 @@ class Bowl:
             (2 * w * d)[None],
         )
 
+    def check_slopes(self, point):
+        assert np.isfinite(point.gradient).all()
+
     def screen(self, zs, coarse=False):
         return np.array([self.point(z).cost for z in zs]), np.zeros((len(zs), 0))
 
@@ -318,3 +321,27 @@ def test_an_interrupted_search_gives_its_best_gains(case):
     assert "not yet validated" in str(result)
     assert result.objective["after"] != result.objective["after"]  # NaN: not known
     assert result.to_json()["objective"]["after"] is None
+
+
+def test_an_interrupt_keeps_the_answer_of_an_earlier_search_that_was_judged(case, monkeypatch):
+    """Limits that are violated on validation plants are searched for again; this one is stopped."""
+    seen = []
+
+    def stop(event):
+        seen.append(event["evaluations"])
+        if len(seen) > 1 and seen[-1] < seen[-2]:  # a new search counts anew
+            raise KeyboardInterrupt
+
+    options = dict(safety_filter=False, validation=64, starts=2, limits={"max_level": 2.62})
+    result = tuning.tune(case, progress=stop, **options)
+    assert seen[-1] < seen[-2], "there was a second search"
+    monkeypatch.setattr("tuning.answer.recommend.ATTEMPTS", 1)
+    first = tuning.tune(case, **options)
+    assert result.status == "interrupted" and result.answer.after is not None
+    assert {n: result[n].after for n in result} == {n: first[n].after for n in first}
+    assert result.answer.tightened == first.answer.tightened == 0.0
+    np.testing.assert_array_equal(result.answer.after.cost, first.answer.after.cost)
+    assert not result.answer.held, "a limit was violated, which is why there was another search"
+    assert "these are the best gains so far, of the search before this one" in " ".join(
+        str(result).split()
+    )
