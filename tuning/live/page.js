@@ -647,7 +647,10 @@ function listen() {
   $("whole").addEventListener("click", () => zoom(0, info.duration));
   window.addEventListener("hashchange", open);
   for (const query of ["(prefers-color-scheme: dark)", "(resolution: 1dppx)"])
-    matchMedia(query).addEventListener("change", () => charts.forEach((chart) => chart.redraw()));
+    matchMedia(query).addEventListener("change", () => {
+      colours.clear();
+      charts.forEach((chart) => chart.redraw());
+    });
 }
 
 function preset(one) {
