@@ -18,6 +18,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.functions import needed_by, values_of
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
@@ -111,7 +112,9 @@ def sensitivities_compiled(
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None
+        return ms.read(
+            run_with(at(theta), clock, names), carried.join(floats, rest)[1], names
+        ), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
