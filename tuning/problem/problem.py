@@ -127,19 +127,6 @@ class Problem:
         check_functions(self.loop, self.clock, self.needed)
         self.cache = EvaluationCache()
 
-    def check_slopes(self, point: Point) -> None:
-        """Raise InputError for a function of the user's whose derivative at a Point is NaN."""
-        if not np.isfinite(point.cost):
-            return
-        bad = [*ms.functions(self.objective)] if np.isnan(point.gradient).any() else []
-        measured = zip(self.limits, point.margin_slopes)
-        bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
-        for name in ms.functions(bad):
-            raise InputError(
-                f"function {name}: its derivative by {', '.join(self.names)} is not a number at the"
-                " starting values, as of a root or a quotient at 0"
-            )
-
     @property
     def names(self) -> list[str]:
         """Dotted names of the P free scalars."""
