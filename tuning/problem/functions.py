@@ -7,6 +7,7 @@ Imported by `problem` and by what takes an objective or limits: `search`, `answe
 # pyright: reportUnknownMemberType=false
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
@@ -90,10 +91,11 @@ class Constraint:
     def __post_init__(self) -> None:
         if (self.upper is None) == (self.lower is None):
             raise InputError(f"constraint {self.name}: must have either upper or lower")
-        number = isinstance(self.limit, int | float | np.number) and not isinstance(
-            self.limit, bool
-        )
-        if not (number and np.isfinite(float(self.limit))):
+        try:
+            finite = not isinstance(self.limit, bool) and math.isfinite(self.limit)
+        except (TypeError, OverflowError):
+            finite = False
+        if not finite:
             raise InputError(
                 f"constraint {self.name}: limit {shortened(self.limit)} must be a finite number"
                 f" [{self.unit}]"
