@@ -23,6 +23,7 @@ from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.functions import needed_by, values_of
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import Trajectory
@@ -259,7 +260,7 @@ def evaluate_compiled(
     else:
         carry = scanned(carry, None, clock.samples)
     state, acc = carry
-    return ms.read(run, acc, names), is_broken(state)
+    return ms.read(run_with(loop, clock, names), acc, names), is_broken(state)
 
 
 def _report_broken(

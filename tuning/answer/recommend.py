@@ -24,7 +24,7 @@ from tuning.answer.setting import NEAR, limited_levels, plants_of, setting_of
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
-from tuning.problem.reported import run_measures
+from tuning.problem.reported import margin_measures, run_measures
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
@@ -146,8 +146,13 @@ def _lost(setting, problem, nominal, values):
 
 
 def _nominal(case, needed):
-    """Return the measures of the case's own run, without noise unless it has some."""
-    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None, needed)
+    """Return the measures of the case's own run, without noise unless it has some, and the
+    stability margins of its linearised loop.
+    """
+    key = jax.random.key(0) if noisy(case) else None
+    of_run = [m for m in needed if m not in ms.linear()]
+    found = run_measures(case.loop, case.clock, key, of_run)
+    return found | margin_measures(case.loop, case.clock)
 
 
 def _idle(setting, before, after):

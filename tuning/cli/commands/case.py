@@ -34,6 +34,11 @@ def add(commands, parents):
         action="store_true",
         help="with --out also run.gif, the tanks of the rig filling and emptying",
     )
+    one.add_argument(
+        "--margins",
+        action="store_true",
+        help="also the stability margins of the linearised loop at each plateau of the reference",
+    )
     _add_init(commands, [common, case])
     _add_export(commands, [common, case])
 
@@ -112,15 +117,18 @@ def simulate(args):
     import jax
 
     from jaxtank.loop import run, step_size
+    from jaxtank.loop.margins import stability_margins
     from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import artifacts, run_page, tables
+    from tuning.report import artifacts, margin_tables, run_page, tables
     from tuning.report import case as manual
 
     key = jax.random.key(seed) if noisy(case) else None
     if step_size.step_warnings(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = dict(reported.run_measures(case.loop, case.clock, key))
+    plateaus = stability_margins(case.loop, case.clock) if args.margins else ()
+    values |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),
@@ -130,6 +138,8 @@ def simulate(args):
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
+    if args.margins:
+        payload["margins"] = margin_tables.json_of(plateaus)
     written = []
     if args.out:
         trajectory = artifacts.run_for_people(case, key)
@@ -142,6 +152,8 @@ def simulate(args):
         print(f"{case.name}: {case.title}\n\n{tables.measure_table(values, case.loop.units)}")
         for line in tables.undefined(values):
             print(line)
+        if args.margins:
+            print(f"\n{margin_tables.text(case.loop, plateaus)}")
         if case.loop.safety_filter is not None:
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
     report_written(written, args)
