@@ -4,6 +4,8 @@ May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
+# pyright: reportConstantRedefinition=false
 
 import dataclasses
 import functools
@@ -112,7 +114,7 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
     actuator: Any = loop.actuator
     low, high = jnp.asarray(actuator.low), jnp.asarray(actuator.high)
     far = FAR * jnp.where(jnp.isfinite(high - low), high - low, 1.0)
-    changes = {"low": low - far, "high": high + far}
+    changes: dict[str, Any] = {"low": low - far, "high": high + far}
     dead = round(float(actuator.delay) / clock.dt)
     if dead:
         changes["delay"] = 0.0
