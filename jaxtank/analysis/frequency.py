@@ -200,7 +200,7 @@ def near(loop: OpenLoop, held: Held, w: Any) -> Any:
     >>> loop = lambda a: OpenLoop(a * one, one, one, 0, 1.0)
     >>> L = lambda a: near(loop(a), held(loop(a), w), w)[0, 0, 0].real
     >>> exact = (1.0 / (np.exp(0.5j) - 0.3) ** 2).real
-    >>> abs(float(jax.grad(L)(0.3)) - exact) < 1e-5
+    >>> bool(abs(float(jax.grad(L)(0.3)) - exact) < 1e-5)
     True
     """
     A, B, C, dead, dt = loop

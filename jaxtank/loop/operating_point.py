@@ -78,6 +78,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     Examples
     --------
     >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.find("cascaded/pi")
     >>> found = jax.jit(lambda r: linearised(case.loop, case.clock, r).why)(jnp.array([5.0]))
     >>> REASONS[int(found)]
