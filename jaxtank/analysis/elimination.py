@@ -5,7 +5,9 @@ its work among the threads on which it runs itself: as many such calls at once a
 wait for each other for ever. Imports jax only; imported by `qp`.
 """
 
+import contextlib
 import itertools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,24 @@ import numpy as np
 
 UNROLLED = 40  # variables up to which the elimination is written out
 STAGES = 4  # parts of a larger one: 1 takes twice the time of 4 at 100 variables, 8 as much as 4
+
+
+@contextlib.contextmanager
+def rolled() -> Iterator[None]:
+    """Trace eliminations of any size as loops: what is written out fills pages of exported code.
+
+    Examples
+    --------
+    >>> with rolled():
+    ...     isinstance(factor(jnp.eye(2)), list)
+    False
+    """
+    global UNROLLED
+    before, UNROLLED = UNROLLED, 0
+    try:
+        yield
+    finally:
+        UNROLLED = before
 
 
 def normal_matrix(H, G, weight):

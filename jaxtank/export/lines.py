@@ -12,6 +12,9 @@ from jaxtank.export.primitives import no_code
 from jaxtank.export.simplify import is_number
 from jaxtank.export.statements import REAL, Ref, Store
 
+SMALL = 64
+"""Number of entries up to which an array that is read at a computed index is a choice of values."""
+
 
 def written(jaxpr):
     """Return the inputs of a jaxpr that it writes to at an index that it computes.
@@ -21,7 +24,7 @@ def written(jaxpr):
     >>> import jax
     >>> line = jax.ShapeDtypeStruct((3,), np.float32)
     >>> whole = jax.ShapeDtypeStruct((), np.int32)
-    >>> put = lambda a, i: jax.lax.dynamic_update_index_in_dim(a, 1.0, i, 0)
+    >>> put = lambda a, i: jax.lax.dynamic_update_slice(a, a[:1], (i,))
     >>> len(written(jax.make_jaxpr(put)(line, whole).jaxpr))
     1
     """
@@ -62,10 +65,34 @@ def _read(writer, eqn, operands):
         return primitives.RULES["slice"](writer, eqn, operands)
     name = line_of(array)
     if name is None or eqn.params["slice_sizes"] != (1,):
-        raise no_code("it reads an array at an index that it computes")
+        return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
     out = np.empty(1, dtype=object)
     out[0] = writer.define(REAL, "item", Ref(name), index[0].item())
     return [out]
+
+
+def _chosen_slice(writer, eqn, array, index):
+    """A slice of a small array whose place along one axis is computed: one of all that there are."""
+    sizes = eqn.params["slice_sizes"]
+    moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
+    if len(moving) > 1 or array.size > SMALL:
+        raise no_code("it reads an array at an index that it computes")
+    starts = [0 if not is_number(i) else min(max(i, 0), n - m) for i, n, m in zip(
+        index, array.shape, sizes
+    )]
+    ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
+    if not moving:
+        return array[tuple(ranges)]
+    (d,) = moving
+    choices = []
+    for i in range(array.shape[d] - sizes[d] + 1):
+        ranges[d] = slice(i, i + sizes[d])
+        choices.append(array[tuple(ranges)])
+    at = np.empty(choices[0].shape, dtype=object)
+    for i in np.ndindex(at.shape):
+        at[i] = index[d]
+    kind = primitives.kind_of(eqn.outvars[0].aval.dtype)
+    return primitives.chosen(writer, at, choices, kind)
 
 
 def _write(writer, eqn, operands):

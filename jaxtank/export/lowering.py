@@ -75,13 +75,13 @@ class Writer:
             return elements(v.val) if isinstance(v, Literal) else values[v]
 
         for eqn in jaxpr.eqns:
-            out = self._equation(eqn, [read(v) for v in eqn.invars])
+            out = self.equation(eqn, [read(v) for v in eqn.invars])
             for v, value in zip(eqn.outvars, out):
                 values[v] = np.asarray(value, dtype=object).reshape(v.aval.shape)
         return [np.asarray(read(v), dtype=object) for v in jaxpr.outvars]
 
-    def _equation(self, eqn, operands):
-        """The outputs of one equation of a jaxpr."""
+    def equation(self, eqn, operands):
+        """Return the outputs of one equation of a jaxpr, arrays of elements."""
         name = eqn.primitive.name
         if name in ("jit", "pjit") and eqn.params["name"] in matrices.NAMED:
             return [matrices.NAMED[eqn.params["name"]](self, *operands)]
@@ -142,7 +142,7 @@ class Lowered(NamedTuple):
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 
 
-def lower_all(f, arguments):
+def lower_all(f, arguments, writer=None):
     """Return the Lowered form of a function: `lower`, with the outputs as the tree they are.
 
     An array of the arguments that the function writes to at an index that it computes is an input
@@ -155,7 +155,7 @@ def lower_all(f, arguments):
     {'twice': array(Ref(name='v1', index=None), dtype=object)}
     """
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
-    writer, moved = Writer(), lines.written(closed.jaxpr)
+    writer, moved = writer or Writer(), lines.written(closed.jaxpr)
     inputs, found = [], {}
     for name, tree in arguments.items():
         for start, array in _inputs(writer, name, tree):

@@ -268,6 +268,8 @@ RULES = {
     "clamp": _clamp,
     "convert_element_type": _convert,
     "div": _whole_or_real("quotient", "div"),
+    "le_to": _elementwise("le"),
+    "lt_to": _elementwise("lt"),
     "integer_pow": _integer_power,
     "rem": _whole_or_real("remainder", "rem"),
     "select_n": _select,

@@ -107,7 +107,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
     left to try.
     """
     coarse, limits, least = True, _searched_limits(setting, near), {}
-    last = None
+    last: Any = None
     for attempt in range(ATTEMPTS):
         case = setting.coarse() if coarse else setting.searched
         made = Outcome(setting, attempt=attempt)
@@ -130,7 +130,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
             filtered = setting.with_filter(matters(setting, made.after, NEAR))
             limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
             setting = filtered
-        elif checks and made.found.search.violation(made.found.point) == 0:
+        elif checks and _holds(made.found):
             least = _tighter(made.after, checks)
         else:
             break
@@ -146,7 +146,9 @@ def _search(task, made, case, limits, least):
 
     def search(found, checks=None, stays=False):
         problem = made.problem = task.problem(setting, case, checks)
-        if stays:  # a start that holds the limits as they are may stay where they are tighter
+        if (
+            checks and stays
+        ):  # a start that holds the limits as they are may stay where they are tighter
             found.slack = checks.slack(problem)
         search_from(problem, task.plan, task.report(problem, setting.cost_unit), found)
 
@@ -167,6 +169,10 @@ def _search(task, made, case, limits, least):
         if checks.hold() or found.kept.all():
             break
     return checks
+
+
+def _holds(found):
+    return found.search.violation(found.point) == 0
 
 
 def _tighter(after, checks):

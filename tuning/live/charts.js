@@ -2,8 +2,14 @@
 
 const PINS = 3;
 
+const colours = new Map(); // of the style sheet, until the scheme changes
+
 // a colour of the style sheet, as it is now (light or dark)
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+function colour(name) {
+  if (!colours.has(name))
+    colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+  return colours.get(name);
+}
 
 // One panel. spec: {title, name, unit, limits: [{value, words}], forbidden: above it, zero}
 // on: {cursor(time), zoom(from, to), whole()}; series: band low, band high, pins, setpoint, run

@@ -115,7 +115,7 @@ function makeEngine() {
   function signals(program, q) {
     if (!kept.has(program)) kept.set(program, { signals: null, of: null });
     const own = kept.get(program);
-    if (own.of !== null && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
+    if (own.of !== null && !q.A && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
     own.signals = own.signals ||
       Array.from({ length: program.streams }, () => new Float64Array(samples));
     pieces((k, K) => program.signals(q, k, K, own.signals));
@@ -181,7 +181,7 @@ function makeEngine() {
       return program.aim(forAim, d);
     });
     const S = signals(program, forSignals), N = noise(values, seed);
-    const D = joined(aims.map((a) => a[0])), T = joined(aims.map((a) => a[2]));
+    const D = Object.assign(joined(aims.map((a) => a[0])), { A: aims.map((a) => a[0].A) }), T = joined(aims.map((a) => a[2]));
     const M = aims.map((a) => a[3]), G = new Float64Array(P * P);
     pieces((k, K) => program.push(forPush, state, lines, S, N, k, K, P, D, T, M, G));
     for (let a = 0; a < P; ++a)

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.export.whole.arrays import called
 from jaxtank.export.whole.loop import WholeLoop, traced_leaves, whole_loop
 from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
 from tuning.live.printed import Printed, maths
@@ -138,6 +139,7 @@ def _program(loop: WholeLoop, tangents: TangentLoop) -> str:
 def _block(printed: Printed, functions: str, facts: str) -> str:
     """Functions in a scope of their own."""
     body = "\n".join([*printed.helpers(), printed.text()])
+    body = "\n".join([*called(body), body])
     measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
     leaves = data([_name(*leaf) for leaf in printed.loop.leaves])
     facts = f"streams:{len(printed.streams())},measures:{measures},leaves:{leaves},{facts}"

@@ -3,6 +3,7 @@
 Imported by `page`.
 """
 
+import contextlib
 import shlex
 from typing import Any, NamedTuple
 
@@ -53,12 +54,12 @@ def origin_of(case, source=None):
     ('cascaded/pi --set clock.dt=2.0', 10.0)
     """
     source = source or (case.name if case.name in presets.names() else None)
-    try:
-        known = None if source is None else rig.open_case(source)
-    except InputError:  # the file has gone
-        known = None
-    words = None if known is None else _static(case, known)
-    if words is None:
+    known, words = None, None
+    if source is not None:
+        with contextlib.suppress(InputError):  # the file has gone
+            known = rig.open_case(source)
+            words = _static(case, known)
+    if source is None or known is None or words is None:
         return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
     differing, own = {}, entries(case.loop, parameters(case.loop))
     for name, value in entries(known.loop, parameters(known.loop)).items():
@@ -73,7 +74,7 @@ def _guard(case, known):
     before: dict[str, Any] = dict(known.safety or {})
     found = []
     for key, value in (case.safety or {}).items():
-        if not np.array_equal(before.get(key), value):
+        if key not in before or not np.array_equal(before[key], value):
             text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
             found += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
     return " ".join(found)

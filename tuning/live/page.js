@@ -52,7 +52,9 @@ const options = () => ({ seed: state.seed, filter: state.filter === true });
 
 function run(values = effective(), every = data.drawn) {
   try {
-    return engine.run(values, { ...options(), every });
+    const found = engine.run(values, { ...options(), every });
+    if (!state.filter) delete found.measures.filter_active_fraction;
+    return found;
   } catch (error) {
     say(`This run is not possible: ${error.message}`);
     return null;
@@ -645,7 +647,10 @@ function listen() {
   $("whole").addEventListener("click", () => zoom(0, info.duration));
   window.addEventListener("hashchange", open);
   for (const query of ["(prefers-color-scheme: dark)", "(resolution: 1dppx)"])
-    matchMedia(query).addEventListener("change", () => charts.forEach((chart) => chart.redraw()));
+    matchMedia(query).addEventListener("change", () => {
+      colours.clear();
+      charts.forEach((chart) => chart.redraw());
+    });
 }
 
 function preset(one) {
@@ -714,7 +719,7 @@ window.jaxtank = {
     refresh();
     const plain = (list) => list.map((one) => Array.from(one));
     const finite = (v) => (Number.isFinite(v) ? v : null);
-    const measures = Object.fromEntries(info.measures.map(({ name }) => {
+    const measures = Object.fromEntries(info.measures.filter(({ name }) => name in found.measures).map(({ name }) => {
       const value = found.measures[name];
       return [name, typeof value === "number" ? finite(value) : Array.from(value, finite)];
     }));

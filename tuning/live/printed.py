@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import Any
 
 from jaxtank.export.whole.compact import MATHS, Text, short_names
-from jaxtank.export.javascript import helpers
 from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
 from jaxtank.export.statements import (
     TRUTH,
@@ -16,6 +15,7 @@ from jaxtank.export.statements import (
     Matrix,
     Ref,
     Statement,
+    every,
     names,
     used,
 )
@@ -52,6 +52,8 @@ class Printed:
         self.truths = {
             s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH
         }
+        both = every(loop.statements)
+        self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         self.state = self._live()
         self.moving = self._moving()
         self.measured = self._measured()
@@ -69,7 +71,12 @@ class Printed:
 
     def helpers(self) -> list[str]:
         """Return the functions that the printed ones call."""
-        return helpers(self.statements)
+        own = {s.op for s in every(self.used()) if isinstance(s, Matrix)}
+        return [f"function {name}{text}" for name, text in self.loop.functions.items() if name in own]
+
+    def used(self) -> list[Statement]:
+        """Return every statement that is printed."""
+        return self.statements
 
     def streams(self) -> list[Ref]:
         """Return what is known of each sample, in the order of S."""
@@ -125,17 +132,14 @@ class Printed:
         return kept, again
 
     def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
-        """What of rank ALONE is read, entries of arrays in place of the arrays."""
-        inside = {s.name for s in statements if isinstance(s, Array)}
+        """What of rank ALONE is read: numbers, then whole arrays as Refs without an index."""
         found = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
-        arrays = [s for s in self._arrays(statements) if s.name not in inside]
-        found |= {e for s in arrays for e in s.entries if isinstance(e, Ref)}
-        return sorted(found, key=lambda e: (e.name, -1 if e.index is None else e.index))
+        read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
+        whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
+        return [*sorted(found, key=place), *sorted(whole)]
 
-    def _arrays(self, statements):
-        """Arrays of rank ALONE that matrix operations of a higher rank read."""
-        read = {o for s in statements if isinstance(s, Matrix) for o in s.operands}
-        return [s for s in self._ranked(ALONE) if isinstance(s, Array) and s.name in read]
+    def _is_array(self, e):
+        return e.index is None and e.name in self.arrays
 
     def _lead(self):
         outputs = [self.loop.first[i] for i in self.state]
@@ -146,13 +150,20 @@ class Printed:
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
         groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
-        parts = [f"Float64Array.of({','.join(map(text.of, group))})" for group in groups]
+        parts = [self._numbers(text, group) for group in groups]
         delays = [
             f"new Float64Array({size}).fill({text.of(self.loop.first[i])})"
             for i, size in self._line_sizes().items()
         ]
         lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
         return function("lead", "p", lines)
+
+    def _numbers(self, text, group):
+        """Numbers as one array, with whole arrays, if any, as its property A."""
+        numbers = [e for e in group if not (isinstance(e, Ref) and self._is_array(e))]
+        whole = [text.given[e.name] for e in group if isinstance(e, Ref) and self._is_array(e)]
+        out = f"Float64Array.of({','.join(map(text.of, numbers))})"
+        return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
 
     def _line_sizes(self):
         """{entry of c at which a line begins: its size}."""
@@ -166,10 +177,16 @@ class Printed:
     def _begin(self, name, extra):
         """Return the first lines of a function, and its Text with the numbers it reads."""
         text = Text(extra, short_names(FIXED))
-        found = self.crossing[name]
-        own = [next(text.names) for _ in found]
-        text.given.update(zip(found, own))
-        return text, [f"const[{','.join(own)}]=q;"] if own else []
+        return text, self._unpacked(text, self.crossing[name], "q")
+
+    def _unpacked(self, text, group, source):
+        """Lines that give names to what `_numbers` has put together."""
+        lines, numbers = [], [e for e in group if not self._is_array(e)]
+        for found, where in ((numbers, source), ([e for e in group if self._is_array(e)], f"{source}.A")):
+            own = [next(text.names) for _ in found]
+            text.given.update(zip([e.name if self._is_array(e) else e for e in found], own))
+            lines += [f"const[{','.join(own)}]={where};"] if own else []
+        return lines
 
     def _signals(self):
         text, lines = self._begin("signals", {Ref("k"): "k"})
@@ -205,7 +222,6 @@ class Printed:
         text.given |= dict(zip(self.loop.lines.values(), delays))
         lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        lines += text.write(self._arrays(self.moving), [])
         body = [f"const {own}={array}[k];" for own, array in self._given(text, streams, kept)]
         deviates = [Ref("n", i) for i in range(len(noise))]
         body += [f"const {own}={array}[k];" for own, array in self._given(text, deviates, noise)]
@@ -243,6 +259,11 @@ class Printed:
         outputs = [e for found in self.loop.measures.values() for e in found]
         lines += text.write(used(self.measured, names(outputs)), outputs, hold=outputs)
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
+
+
+def place(e: Ref) -> tuple[str, int]:
+    """Return what Refs are sorted by."""
+    return e.name, -1 if e.index is None else e.index
 
 
 def function(name: str, arguments: str, lines: Iterable[str]) -> str:

@@ -1,12 +1,12 @@
 """The functions of the derivatives of one case as JavaScript. Imported by `tuning.live.engine`."""
 
-from typing import Any
-
-from jaxtank.export.statements import Array, Matrix, Ref, Statement, names, used
+from jaxtank.export.statements import Array, Matrix, Ref, Statement, every, names, used
 from jaxtank.export.whole.compact import Text, short_names
 from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs
 from jaxtank.export.whole.tangents import TangentLoop
-from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function
+from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function, place
+
+
 
 class PrintedTangents(Printed):
     """The printed functions of a TangentLoop: lead, signals and read, as those of `Printed`, and
@@ -19,6 +19,8 @@ class PrintedTangents(Printed):
 
     def __init__(self, tangents: TangentLoop):
         self.tangents = tangents
+        both = every(tangents.loop.statements)
+        self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         statements = hoisted(tangents.loop.statements)
         lines = [*tangents.lines.values(), *tangents.loop.lines.values()]
         given = {"p": ALONE, "d": ALONE, "k": TIMED, **dict.fromkeys("cen", MOVING)}
@@ -42,13 +44,15 @@ class PrintedTangents(Printed):
             others=self._plain(self.pushed, after),
             at_end=self._plain(self.sloped, slopes),
         )
-        self.crossing["aim"] = sorted(set(self._plain(self.aiming, tangents.first)), key=_place)
+        self.crossing["aim"] = sorted(set(self._plain(self.aiming, tangents.first)), key=place)
         at_end = [e for e in self._plain(self.sloped, slopes) if self.rank[e.name] == ALONE]
-        arrays = used(self._ranked(ALONE), names(self.at_end))
         self.crossing["slope"] = self._alone(
             used(self._ranked(MOVING), names(self.at_end)), [*self.at_end, *at_end]
         )
-        assert arrays is not None
+
+    def used(self) -> list[Statement]:
+        """Return every statement that is printed."""
+        return [*self.statements, *self.directed]
 
     def text(self) -> str:
         """Return the functions."""
@@ -56,42 +60,27 @@ class PrintedTangents(Printed):
         return "\n".join([*parts, self._aim(), self._push(), self._slope()])
 
     def _later(self, statements: list[Statement]) -> list[Statement]:
-        """Those that are not done before the run; arrays stay with what reads them."""
-        read = {o for s in statements if isinstance(s, Matrix) for o in s.operands}
-        return [
-            s
-            for s in statements
-            if s in of_rank([s], self.order, TIMED)
-            or s in of_rank([s], self.order, MOVING)
-            or (isinstance(s, Array) and s.name in read)
-        ]
+        """Those that are not done before the run."""
+        return [s for s in statements if s not in of_rank([s], self.order, ALONE)]
+
+    def _reads(self, statements, outputs):
+        """Every Ref that is read, whole arrays without an index."""
+        read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
+        own = {s.name for s in every(statements) if isinstance(s, Array | Matrix)}
+        return refs(statements, outputs) | {Ref(name) for name in read - own}
 
     def _aimed(self, statements, outputs):
         """What of the direction alone is read."""
-        own = {s.name for s in statements if isinstance(s, Array)}
-        found = refs(statements, outputs)
-        return sorted(
-            {
-                e
-                for e in found
-                if self.along[e.name] == 1
-                and self.order[e.name] == ALONE
-                and e.name not in own
-                and e.name != "d"
-            }
-            | {e for e in found if e.name == "d"},
-            key=_place,
-        )
+        found = self._reads(statements, outputs)
+        aimed = [e for e in found if self.along[e.name] and self.order[e.name] == ALONE]
+        return sorted(aimed, key=lambda e: (self._is_array(e), place(e)))
 
     def _plain(self, statements, outputs):
         """What does not depend on a direction and is read."""
-        found = refs(statements, outputs)
-        arrays = {s.name for s in statements if isinstance(s, Array)}
-        return [
-            e
-            for e in sorted(found, key=_place)
-            if self.along.get(e.name) == 0 and e.name not in ("k", *arrays)
-        ]
+        found = self._reads(statements, outputs)
+        own = {s.name for s in every(statements) if isinstance(s, Array | Matrix)}
+        plain = [e for e in found if self.along.get(e.name) == 0 and e.name not in ("k", *own)]
+        return sorted(plain, key=place)
 
     def _aim(self):
         text, lines = self._begin("aim", {"d": "d"})
@@ -102,7 +91,7 @@ class PrintedTangents(Printed):
         ]
         outputs = [e for group in groups for e in group]
         lines += text.write(self.aiming, outputs, hold=outputs)
-        parts = [f"Float64Array.of({','.join(map(text.of, group))})" for group in groups]
+        parts = [self._numbers(text, group) for group in groups]
         sizes = self._tangent_lines()
         delays = [f"new Float64Array({n}).fill({text.of(self.tangents.first[i])})" for i, n in sizes]
         return function("aim", "q,d", [*lines, f"return[{','.join(parts)},[{','.join(delays)}]];"])
@@ -134,6 +123,8 @@ class PrintedTangents(Printed):
         t, outer = self.tangents, dict(text.given)
         aimed = self._aimed(self.pushed, self.after)
         places = [i for i in range(len(t.first)) if i not in self._skipped()]
+        whole = [e for e in aimed if self._is_array(e)]
+        aimed = [e for e in aimed if not self._is_array(e)]
         loads = [*((e, "D", len(aimed)) for e in aimed)]
         loads += [(Ref("e", i), "T", len(places)) for i in places]
         lines = ["for(let j=0;j<P;++j){"]
@@ -142,6 +133,9 @@ class PrintedTangents(Printed):
             text.given[e] = next(text.names)
             lines.append(f"const {text.given[e]}={array}[j*{size}+{at[array]}];")
             at[array] += 1
+        for i, e in enumerate(whole):
+            text.given[e.name] = next(text.names)
+            lines.append(f"const {text.given[e.name]}=D.A[j][{i}];")
         for i, name in enumerate(t.lines.values()):
             text.given[name] = next(text.names)
             lines.append(f"const {text.given[name]}=M[j][{i}];")
@@ -160,18 +154,12 @@ class PrintedTangents(Printed):
         text.given |= {Ref("c", i): own for i, own in zip(self.state, state)}
         aimed = self._aimed(self.sloped, self.slopes)
         places = [i for i in range(len(self.tangents.first)) if i not in self._skipped()]
-        own: dict[Any, str] = {e: next(text.names) for e in aimed}
         moved = {Ref("e", i): next(text.names) for i in places}
-        text.given |= own | moved
+        text.given |= moved
         lines.append(f"const[{','.join(state)}]=c;")
-        lines += [f"const[{','.join(own.values())}]=D;"] if own else []
+        lines += self._unpacked(text, aimed, "D")
         lines += [f"const[{','.join(moved.values())}]=T;"] if moved else []
         plain = used(self._ranked(MOVING), names(self.at_end))
-        lines += text.write(self._arrays(plain), [])
         outputs = [*self.at_end, *self.slopes]
         lines += text.write([*plain, *self.sloped], outputs, hold=outputs)
         return function("slope", "q,c,D,T", [*lines, f"return[{','.join(map(text.of, self.slopes))}];"])
-
-
-def _place(e):
-    return e.name, -1 if e.index is None else e.index

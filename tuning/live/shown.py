@@ -101,9 +101,9 @@ def of_result(result: Any) -> LivePage:
     case, tuned = getattr(result, "case", None), getattr(result, "tuned", None)
     if case is None:
         raise InputError(f"{type(result).__name__} has no case of its own to explore")
-    guard = None if tuned is None else tuned.loop.safety_filter
-    if guard is not None:  # designed for the plant, which is the same
-        loop = dataclasses.replace(case.loop, safety_filter=guard)
+    if tuned is not None and tuned.loop.safety_filter is not None:
+        # designed for the plant, which is the same
+        loop = dataclasses.replace(case.loop, safety_filter=tuned.loop.safety_filter)
         case = case.replace(loop=loop, safety=tuned.safety)
     return of_case(case, states_of(result))
 

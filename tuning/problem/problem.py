@@ -9,7 +9,6 @@ Imported by `search`, and as `tuning.Problem`.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
@@ -20,6 +19,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
+from tuning.problem.blocks import Blocks, in_blocks
 from tuning.problem.bounds import bounds
 from tuning.problem.functions import as_measures
 from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
@@ -41,12 +41,6 @@ worst.
 
 TAIL = 0.05
 """Share of the scenarios that "cvar" is the mean of [-]."""
-
-LANES = 256
-"""Runs without derivatives that one program makes side by side: enough to fill the vector units."""
-
-IDLE = 2**23
-"""Samples of runs that are made in vain, at most, so as to use a program that is compiled."""
 
 Row = Mapping[str, Any]
 """Measures of one scenario, {name: value}."""
@@ -111,7 +105,7 @@ class Problem:
         self.limit(limits)
         self.cache = EvaluationCache() if cache is None else cache
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
-        self.points: dict[bool, int] = {}
+        self.blocks = Blocks(len(self.runs))
 
     def limit(self, limits: Any) -> None:
         """Replace the limits by `limits`, as in `resolve_limits`.
@@ -216,32 +210,17 @@ class Problem:
         """
         zs = np.asarray(zs, dtype=float)
         self.simulations += len(zs) * len(self.runs)
-        size = self._block(len(zs), coarse)
-        found = self.cache.recall("screen", [zs, coarse], lambda: self._blocks(zs, coarse, size))
+        samples = max(group.clock.samples for group in self.groups) // (sc.COARSE if coarse else 1)
+        size = self.blocks.size(len(zs), coarse, samples)
+        found = self.cache.recall(
+            "screen",
+            [zs, coarse],
+            lambda: in_blocks(lambda some: self._screen(some, coarse), zs, size),
+        )
         return found[0].copy(), found[1].copy()
 
-    def _block(self, count: int, coarse: bool) -> int:
-        """Return how many points one program runs: as many as in an earlier call where that serves,
-        so that the fewest programs are compiled. It follows from the calls alone, not from what is
-        known: a search that is continued gives the same bits.
-        """
-        size, wanted = self.points.get(coarse, 0), min(count, max(1, LANES // len(self.runs)))
-        if size < wanted:
-            self.points[coarse] = wanted
-            return wanted
-        samples = max(group.clock.samples for group in self.groups) // (sc.COARSE if coarse else 1)
-        idle = -count % size * len(self.runs) * samples
-        return size if idle <= IDLE else wanted
-
-    def _blocks(self, zs: Floats, coarse: bool, size: int) -> tuple[Floats, Floats]:
-        """Return `_screen` of all points, `size` at a time, the last one repeated to fill up."""
-        filled = np.concatenate([zs, np.repeat(zs[-1:], -len(zs) % size, axis=0)])
-        found = [self._screen(filled[i : i + size], coarse) for i in range(0, len(filled), size)]
-        costs, margins = (np.concatenate(parts)[: len(zs)] for parts in zip(*found))
-        return costs, margins
-
     def _screen(self, zs: Floats, coarse: bool) -> tuple[Floats, Floats]:
-        points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
+        points = {b.name: np.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
         tables, broken = [self._per_run() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
             clock = sc.screening_clock(group.clock) if coarse else group.clock
@@ -329,7 +308,7 @@ class Problem:
         table, slopes, matrices, diverged = *(self._per_run() for _ in range(3)), False
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
-            diverged = diverged or bool(np.any(broken))
+            diverged = diverged or bool(np.asarray(broken).any())
             for j, i in enumerate(group.runs):
                 table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
                 slopes[i] = {

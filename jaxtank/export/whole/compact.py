@@ -139,10 +139,13 @@ class Text:
             return text, 14 if text.startswith("-") else TIGHT
         if e in self.given:
             return self.given[e], TIGHT
-        if e.name in self.pending:
+        if e.index is None and e.name in self.pending:
             return self.pending.pop(e.name)
         name = self.given[e.name]
-        return (name if e.index is None else f"{name}[{e.index}]"), TIGHT
+        if e.index is None:
+            return name, TIGHT
+        at = self.of(e.index) if isinstance(e.index, Ref) else e.index
+        return f"{name}[{at}]", TIGHT
 
     def _bound(self, e, least):
         """The text of an operand that binds at least as tightly as `least`."""
@@ -218,21 +221,31 @@ class Text:
 
 def _uses(statements, outputs):
     """{name: how often it is read}; what a loop reads of outside counts as often."""
-    found = Counter(e.name for e in outputs if isinstance(e, Ref))
+    found: Counter = Counter()
+
+    def read(e, times=1):
+        if isinstance(e, Ref):
+            found[e.name] += times
+            read(e.index, 2)
+
+    for e in outputs:
+        read(e)
     for s in statements:
         if isinstance(s, Define):
             for i, e in enumerate(s.args):
-                if isinstance(e, Ref):
-                    found[e.name] += 2 if s.op == "square" or i >= LAZY.get(s.op, 9) else 1
+                read(e, 2 if s.op == "square" or i >= LAZY.get(s.op, 9) else 1)
         elif isinstance(s, Array):
-            found.update(e.name for e in s.entries if isinstance(e, Ref))
+            for e in s.entries:
+                read(e)
         elif isinstance(s, Store):
-            found.update(e.name for e in (s.index, s.value) if isinstance(e, Ref))
+            read(s.index)
+            read(s.value)
         elif isinstance(s, Until):
-            found.update([s.test.name] if isinstance(s.test, Ref) else [])
+            read(s.test)
         elif isinstance(s, Loop):
             inside = {one.name for one in s.body if isinstance(one, Define)}
             for name, count in _uses(s.body, s.new).items():
                 found[name] += count if name in inside else 2
-            found.update(start.name for *_, start in s.carried if isinstance(start, Ref))
+            for *_, start in s.carried:
+                read(start)
     return found

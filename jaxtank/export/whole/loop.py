@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.analysis.elimination import rolled
 from jaxtank.case import Case
 from jaxtank.core.clock import Chunk, is_pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.export.lowering import lower_all
 from jaxtank.export.statements import Statement
+from jaxtank.export.whole.arrays import ArrayWriter
 from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
@@ -47,6 +49,8 @@ class WholeLoop:
     """{field of `SAVED`: its entries at a sample}."""
     measures: dict[str, list[Any]]
     """{measure: its entries}, read of c after the last sample."""
+    functions: dict[str, str]
+    """{name of a function on arrays that statements call: its text}."""
     lines: dict[int, str]
     """{entry of c at which a Line begins: its name}."""
 
@@ -131,7 +135,9 @@ def whole_loop(case: Case, names: Sequence[str] | None = None) -> WholeLoop:
     check_pointwise(case)
     names = served(case) if names is None else tuple(names)
     whole, shapes = sample_of(case, names), arguments(case, names)
-    made = lower_all(whole, shapes)
+    writer = ArrayWriter()
+    with rolled():
+        made = lower_all(whole, shapes, writer)
     before, after, saved, found, _ = made.outputs
     return WholeLoop(
         case=case,
@@ -141,6 +147,7 @@ def whole_loop(case: Case, names: Sequence[str] | None = None) -> WholeLoop:
         after=flat(after),
         saved={f: flat(saved[f]) for f in SAVED},
         measures={m: flat(found[m]) for m in names},
+        functions=writer.functions,
         lines={start.index: name for start, name in made.lines.items()},
     )
 

@@ -4,6 +4,7 @@ Imported by the printers of whole loops.
 """
 
 from collections.abc import Iterable, Mapping
+from typing import cast
 
 from jaxtank.export.statements import (
     Array,
@@ -94,22 +95,30 @@ def of_rank(
 
 
 def refs(statements: Iterable[Statement], entries: Iterable = ()) -> set[Ref]:
-    """Return every Ref that statements and entries read, without those that a loop has inside."""
+    """Return every Ref that statements and entries read, without those that a loop has inside; of
+    an array that is read at a variable index, the array and the index.
+    """
     found = {e for e in entries if isinstance(e, Ref)}
     for s in statements:
         if isinstance(s, Loop):
             inside = refs(s.body, [*s.new, *(start for *_, start in s.carried)])
             own = local(s)
             found |= {e for e in inside if e.name not in own}
-        elif isinstance(s, Define):
-            found |= {e for e in s.args if isinstance(e, Ref)}
-        elif isinstance(s, Array):
-            found |= {e for e in s.entries if isinstance(e, Ref)}
-        elif isinstance(s, Store):
-            found |= {e for e in (s.index, s.value, Ref(s.array)) if isinstance(e, Ref)}
-        elif isinstance(s, Until):
-            found |= {s.test} if isinstance(s.test, Ref) else set()
-    return found
+        else:
+            found |= {e for e in entries_read(s) if isinstance(e, Ref)}
+    moving = {e for e in found if isinstance(e.index, Ref)}
+    return (found - moving) | {r for e in moving for r in (Ref(e.name), cast(Ref, e.index))}
+
+
+def entries_read(s: Statement) -> tuple:
+    """Return the numbers and Refs that a statement, not a loop, reads one by one."""
+    if isinstance(s, Define):
+        return s.args
+    if isinstance(s, Array):
+        return s.entries
+    if isinstance(s, Store):
+        return s.index, s.value, Ref(s.array)
+    return (s.test,) if isinstance(s, Until) else ()
 
 
 def kept_in_time(

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.analysis.elimination import rolled
 from jaxtank.case import Case
 from jaxtank.export.lowering import lower_all
 from jaxtank.export.simplify import is_number, simplified
 from jaxtank.export.statements import Array, Define, Matrix, Ref, Statement
+from jaxtank.export.whole.arrays import ArrayWriter
 from jaxtank.export.whole.loop import (
     SAVED,
     WholeLoop,
@@ -88,7 +90,9 @@ def tangent_loop(
         "e": tuple(leaves[i] for i in floats),
         "n": shapes["n"],
     }
-    made = lower_all(pushed, given)
+    writer = ArrayWriter()
+    with rolled():
+        made = lower_all(pushed, given, writer)
     (before, after, found), (dbefore, dafter, dfound, errors) = made.outputs
     sizes = np.cumsum([0, *(int(np.prod(v.shape)) for v in leaves)])
     places = [int(j) for i in floats for j in range(sizes[i], sizes[i + 1])]
@@ -101,6 +105,7 @@ def tangent_loop(
         after=flat(after),
         saved={f: [] for f in SAVED},
         measures={m: flat(found[m]) for m in names},
+        functions=writer.functions,
         lines={s.index: n for s, n in lines.items() if s.name == "c"},
     )
     all_tangents = TangentLoop(
@@ -235,12 +240,17 @@ def pruned(
         elif isinstance(s, Array):
             arrays[s.name] = entries = tuple(known.get(a, a) for a in s.entries)
             kept.append(s._replace(entries=entries))
-        elif isinstance(s, Matrix) and _is_nothing(arrays.get(s.operands[-1])):
+        elif _is_linear(s) and _is_nothing(arrays.get(s.operands[-1])):
             for i in range(s.sizes[0] * s.sizes[-1]):
                 known[Ref(s.name, i)] = 0.0
         else:
             kept.append(_put_in(s, known))
     return kept, known
+
+
+def _is_linear(s):
+    """Whether a statement is an operation that gives 0 for a last operand of 0."""
+    return isinstance(s, Matrix) and s.op in ("product", "forward", "backward", "solve")
 
 
 def _is_nothing(entries):

@@ -289,3 +289,55 @@ def test_a_result_without_a_case_has_no_page():
     live = presets.find("cascaded/pi").explore()
     assert isinstance(live, shown.LivePage) and "srcdoc=" in live._repr_html_()
     assert json.dumps(live.name) in repr(live).replace("'", '"')
+
+
+def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, written):
+    import tuning
+
+    case = presets.find("cascaded/pi")
+    wanted = tuning.tune(case, nominal=True, starts=1, screening=16).objective
+    with opened(browser, written) as live:
+        found = live("jaxtank.tune()")
+        assert found["violation"] == 0.0
+        assert "before tuning" in live.text("#legend") and "Tuned in" in live.text("#message")
+        assert live("jaxtank.state().values")["controller.Kc[0]"] == pytest.approx(
+            found["values"]["controller.Kc[0]"]
+        )
+        assert live.text("#verdict").startswith("Every limit holds")
+    assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
+
+
+def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
+    with opened(browser, written) as live:
+        live.page.click("#tune")
+        live.wait("document.querySelector('#message').textContent.startsWith('Tuning')")
+        live.page.click("#tune")
+        assert "Stopped" in live.text("#message") or "Tuned in" in live.text("#message")
+        assert live.text("#tune") == "Tune"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gouta2015/ngpc", "gouta2022/enmpc", "mirakhorli/hybrid"])
+def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
+    path = tmp_path / "page.html"
+    path.write_text(page(presets.find(name)), encoding="utf-8")
+    assert path.stat().st_size <= 150_000
+    rng = np.random.default_rng(0)
+    with opened(browser, path) as live:
+        names = live("jaxtank.names")
+        leaves = live("makeEngine().info.leaves")
+        own = [v for v in leaves if v["name"] in names and v["value"]]
+        chosen = {}
+        for leaf in rng.choice(own, 10, replace=False):
+            part = 0.1 * rng.uniform(-1.0, 1.0) * (leaf["upper"] - leaf["lower"])
+            chosen[leaf["name"]] = float(
+                np.clip(leaf["value"] + part, leaf["lower"], leaf["upper"])
+            )
+        live("(values) => void jaxtank.run(values)", chosen)
+        line, text = live("jaxtank.command()"), live("jaxtank.csv()")
+    done = command(*shlex.split(line)[1:], "--out", str(tmp_path / "out"), "--quiet")
+    assert done.code == 0, done.err
+    head, numbers = table(text)
+    wanted, expected = table((tmp_path / "out" / "trajectory.csv").read_text())
+    assert head == wanted
+    np.testing.assert_allclose(numbers, expected, rtol=2e-9, atol=2e-9)
