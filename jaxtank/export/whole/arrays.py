@@ -29,6 +29,8 @@ LARGEST = 16
 ALIASES = ("reshape", "squeeze", "expand_dims", "stop_gradient", "copy", "copy_p", "reduce_precision")
 CALLED = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 CONTROL = ("scan", "while", "cond")
+PARTED = ("scan", "cond")
+"""Those whose results are computed apart where they depend on different arguments."""
 ELEMENTWISE = {*FUNCTIONS, *OPERATORS, "add_any", "clamp", "integer_pow", "select_n", "xor"}
 ELEMENTWISE |= {"convert_element_type", "div", "rem"}
 NAMED = ("_cholesky", "_cholesky_solve", "_weighted")
@@ -58,7 +60,8 @@ class ArrayWriter(Writer):
         """The elements of the results of an equation as a function of arrays; of a loop, a function
         for each group of results that depend on the same arguments.
         """
-        groups = groups_of(eqn) if eqn.primitive.name == "scan" else [range(len(eqn.outvars))]
+        parts = eqn.primitive.name in PARTED
+        groups = groups_of(eqn) if parts else [range(len(eqn.outvars))]
         out = [None] * len(eqn.outvars)
         for group in groups:
             for i, found in zip(group, self._results(eqn, operands, list(group))):
@@ -75,8 +78,8 @@ class ArrayWriter(Writer):
             number = all(map(is_number, o.ravel()))
             array = np.array(o.ravel().tolist(), dtype=float) if number else None
             own.append(text.constant(array) if number else next(text.names))
-        if eqn.primitive.name == "scan":
-            found = _scan(text, eqn, own, wanted)
+        if eqn.primitive.name in PARTED:
+            found = RULES[eqn.primitive.name](text, eqn, own, wanted)
         else:
             found = text.equation(eqn, own)
         result = found[0] if len(found) == 1 else f"chain(1,{_list(sizes)},[{','.join(found)}])"
@@ -138,7 +141,9 @@ def groups_of(eqn):
     The tangents of a loop and the loop itself are one equation; the loop does not depend on them.
     """
     groups: dict[frozenset, list[int]] = {}
-    for i, found in enumerate(_scan_dependence(eqn, [{i} for i in range(len(eqn.invars))])):
+    alone = [{i} for i in range(len(eqn.invars))]
+    of = _scan_dependence if eqn.primitive.name == "scan" else _cond_dependence
+    for i, found in enumerate(of(eqn, alone)):
         groups.setdefault(frozenset(found), []).append(i)
     return list(groups.values())
 
@@ -156,6 +161,12 @@ def _scan_dependence(eqn, given):
         starts = new
 
 
+def _cond_dependence(eqn, given):
+    """What each result of a choice depends on."""
+    found = [_dependence(b.jaxpr, given[1:]) for b in eqn.params["branches"]]
+    return [given[0].union(*own) for own in zip(*found)]
+
+
 def _dependence(jaxpr, given):
     """What each result of a jaxpr depends on."""
     known = {v: set() for v in jaxpr.constvars} | dict(zip(jaxpr.invars, given))
@@ -169,8 +180,7 @@ def _dependence(jaxpr, given):
         if eqn.primitive.name == "scan":
             out = _scan_dependence(eqn, operands)
         elif eqn.primitive.name == "cond":
-            found = [_dependence(b.jaxpr, operands[1:]) for b in eqn.params["branches"]]
-            out = [operands[0].union(*own) for own in zip(*found)]
+            out = _cond_dependence(eqn, operands)
         elif inner is not None:
             out = _dependence(getattr(inner, "jaxpr", inner), operands)
         else:
@@ -665,13 +675,15 @@ def _while(text, eqn, operands):
     return own
 
 
-def _cond(text, eqn, operands):
-    sizes = [int(np.prod(v.aval.shape)) for v in eqn.outvars]
-    own = [next(text.names) for _ in eqn.outvars]
+def _cond(text, eqn, operands, wanted=None):
+    wanted = list(range(len(eqn.outvars))) if wanted is None else wanted
+    sizes = [int(np.prod(eqn.outvars[i].aval.shape)) for i in wanted]
+    own = [next(text.names) for _ in wanted]
     lines = [f"let {','.join(own)};"]
     branches = eqn.params["branches"]
     for i, branch in enumerate(branches):
         inner, results = _block_lines(text, branch.jaxpr, branch.consts, operands[1:])
+        results = [results[i] for i in wanted]
         last = i == len(branches) - 1
         at = f"flat(1,{operands[0]})[0]"
         head = ("" if i == 0 else "else") + ("{" if last else f" if({at}<={i}){{")
