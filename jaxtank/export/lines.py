@@ -54,7 +54,9 @@ def elements_of(name, size):
 
 def line_of(array):
     """Return the name of the line whose elements are those of an array; None of another array."""
-    whole = array.ndim == 1 and all(isinstance(e, Ref) and e.index == i for i, e in enumerate(array))
+    whole = array.ndim == 1 and all(
+        isinstance(e, Ref) and e.index == i for i, e in enumerate(array)
+    )
     same = {e.name for e in array.ravel()} if whole else set()
     return same.pop() if len(same) == 1 else None
 
@@ -77,9 +79,10 @@ def _chosen_slice(writer, eqn, array, index):
     moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
     if len(moving) > 1 or array.size > SMALL:
         raise no_code("it reads an array at an index that it computes")
-    starts = [0 if not is_number(i) else min(max(i, 0), n - m) for i, n, m in zip(
-        index, array.shape, sizes
-    )]
+    starts = [
+        0 if not is_number(i) else min(max(i, 0), n - m)
+        for i, n, m in zip(index, array.shape, sizes)
+    ]
     ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
     if not moving:
         return array[tuple(ranges)]

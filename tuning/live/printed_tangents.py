@@ -1,11 +1,10 @@
 """The functions of the derivatives of one case as JavaScript. Imported by `tuning.live.engine`."""
 
 from jaxtank.export.statements import Array, Matrix, Ref, Statement, every, names, used
-from jaxtank.export.whole.compact import Text, short_names
+from jaxtank.export.whole.compact import Text
 from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs, split
 from jaxtank.export.whole.tangents import TangentLoop
 from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function, place
-
 
 
 class PrintedTangents(Printed):
@@ -94,7 +93,9 @@ class PrintedTangents(Printed):
         lines += text.write(self.aiming, outputs, hold=outputs)
         parts = [self._numbers(text, group) for group in groups]
         sizes = self._tangent_lines()
-        delays = [f"new Float64Array({n}).fill({text.of(self.tangents.first[i])})" for i, n in sizes]
+        delays = [
+            f"new Float64Array({n}).fill({text.of(self.tangents.first[i])})" for i, n in sizes
+        ]
         return function("aim", "q,d", [*lines, f"return[{','.join(parts)},[{','.join(delays)}]];"])
 
     def _tangent_lines(self):
@@ -112,7 +113,9 @@ class PrintedTangents(Printed):
         body += self._inner(text)
         weights = self.tangents.weights
         count = len(weights)
-        products = "+".join(f"{w!r}*E[a*{count}+{i}]*E[b*{count}+{i}]" for i, w in enumerate(weights))
+        products = "+".join(
+            f"{w!r}*E[a*{count}+{i}]*E[b*{count}+{i}]" for i, w in enumerate(weights)
+        )
         body += [f"for(let a=0;a<P;++a)for(let b=0;b<=a;++b)G[a*P+b]+={products or 0};"]
         body += self._next(text)
         lines += [f"const E=new Float64Array(P*{max(1, count)});", "for(;k<K;++k){", *body, "}"]
@@ -163,4 +166,6 @@ class PrintedTangents(Printed):
         plain = used(self._ranked(MOVING), names(self.at_end))
         outputs = [*self.at_end, *self.slopes]
         lines += text.write([*plain, *self.sloped], outputs, hold=outputs)
-        return function("slope", "q,c,D,T", [*lines, f"return[{','.join(map(text.of, self.slopes))}];"])
+        return function(
+            "slope", "q,c,D,T", [*lines, f"return[{','.join(map(text.of, self.slopes))}];"]
+        )

@@ -20,7 +20,7 @@ from jaxtank.export.statements import (
 )
 
 CHEAP = frozenset(
-    "add sub mul neg abs max min lt le gt ge eq ne and or not select real square truth".split()
+    ["add", "sub", "mul", "neg", "abs", "max", "min", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "select", "real", "square", "truth"]
 )
 """Operations that cost less than a number that is kept for every sample."""
 
@@ -110,7 +110,9 @@ def split(statements: Iterable[Statement], given: Mapping[str, int]) -> list[Sta
 
 def _ranks_of(loop, rank):
     """{carried variable of a loop: its rank}."""
-    found = {name: max((rank[n] for n in names([start])), default=0) for _, name, start in loop.carried}
+    found = {
+        name: max((rank[n] for n in names([start])), default=0) for _, name, start in loop.carried
+    }
     while True:
         inside = ranks(loop.body, {**rank, **found})
         new = {
