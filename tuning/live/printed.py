@@ -23,7 +23,8 @@ from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, 
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
-FIXED = frozenset(["p", "d", "k", "c", "e", "q", "j", "o", "S", "N", "L", "R", "K", "P", "D", "T", "M", "G", "E", "every"])
+_FIXED = "p d k c e q j o S N L R K P D T M G E every"
+FIXED = frozenset(_FIXED.split())
 """Names of arguments of the printed functions."""
 
 

@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 
+from jaxtank.export import lines
 from jaxtank.export.lowering import Writer
 from jaxtank.export.simplify import is_number
 from jaxtank.export.statements import Matrix, Ref
@@ -34,6 +35,8 @@ class ArrayWriter(Writer):
     def equation(self, eqn, operands):
         """Return the outputs of one equation of a jaxpr."""
         name = eqn.primitive.name
+        if name in lines.RULES and lines.line_of(operands[0]) not in (None, *self.sizes):
+            return super().equation(eqn, operands)
         if name not in ("lu", *ALIASES) and _is_large(eqn, operands):
             if all(is_number(e) for o in operands for e in o.ravel()) and name not in CONTROL:
                 return super().equation(eqn, operands)
@@ -68,10 +71,10 @@ class ArrayWriter(Writer):
         else:
             found = text.equation(eqn, own)
         result = found[0] if len(found) == 1 else f"chain(1,{listed(sizes)},[{','.join(found)}])"
-        lines = [*text.live(found, top=True), f"return {result};"]
-        read = set(re.findall(r"\w+", " ".join(lines)))
+        body = [*text.live(found, top=True), f"return {result};"]
+        read = set(re.findall(r"\w+", " ".join(body)))
         used = [i for i, n in enumerate(own) if n in read and not is_known(text, n)]
-        body = f"({','.join(own[i] for i in used)}){{" + "\n".join(lines) + "}"
+        body = f"({','.join(own[i] for i in used)}){{" + "\n".join(body) + "}"
         names = {v: k for k, v in self.functions.items()}
         function = names.get(body) or f"f{len(self.functions)}"
         self.functions[function] = body
@@ -87,7 +90,7 @@ class ArrayWriter(Writer):
         return out
 
     def _array(self, operand):
-        """The name of an array with these elements: that of a result, a part of one, or a new one."""
+        """The name of an array with these elements: a result, a part of one, or a new one."""
         entries = tuple(operand.ravel())
         first = entries[0] if entries else None
         if isinstance(first, Ref) and first.index is not None and first.name in self.sizes:

@@ -33,12 +33,16 @@ BINARY = {
 """{operation: (operator, how tightly it binds)}."""
 
 LAZY = {"select": 1, "and": 1, "or": 1}
-"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8 throws
-compiled code away when a branch that it has never seen is taken.
+"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8
+throws compiled code away when a branch that it has never seen is taken.
 """
 
 UNARY = {"neg": "-", "not": "!", "real": "+"}
-MATHS = ["abs", "max", "min", "pow", "atan2", "sign", "sqrt", "exp", "log", "tanh", "sin", "cos", "floor", "ceil", "log1p", "expm1", "tan", "asin", "acos", "atan", "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "trunc"]
+_MATHS = """
+abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
+cosh asinh acosh atanh cbrt trunc
+"""
+MATHS = _MATHS.split()
 """Functions of Math that a text has by their own names."""
 
 FORMS = {
@@ -54,7 +58,8 @@ FORMS = {
 }
 """Operations on names and numbers alone, as formats."""
 
-TAKEN = frozenset(["do", "if", "in", "of", "as", "is", "for", "let", "new", "try", "var", "get", "set", "int", "Map", "Set"])
+_TAKEN = "do if in of as is for let new try var get set int Map Set"
+TAKEN = frozenset(_TAKEN.split())
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 

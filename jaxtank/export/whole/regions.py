@@ -19,9 +19,10 @@ from jaxtank.export.statements import (
     used,
 )
 
-CHEAP = frozenset(
-    ["add", "sub", "mul", "neg", "abs", "max", "min", "lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "select", "real", "square", "truth"]
-)
+_CHEAP = """
+add sub mul neg abs max min lt le gt ge eq ne and or not select real square truth
+"""
+CHEAP = frozenset(_CHEAP.split())
 """Operations that cost less than a number that is kept for every sample."""
 
 
