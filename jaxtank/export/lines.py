@@ -28,15 +28,16 @@ def written(jaxpr):
     >>> len(written(jax.make_jaxpr(put)(line, whole).jaxpr))
     1
     """
-    inputs = set(jaxpr.invars)
-    return {
-        eqn.invars[0]
-        for eqn in jaxpr.eqns
-        if eqn.primitive.name == "dynamic_update_slice"
-        and not isinstance(eqn.invars[0], Literal)
-        and eqn.invars[0] in inputs
-        and len(eqn.invars[0].aval.shape) == 1
-    }
+    inputs, found = set(jaxpr.invars), set()
+    for eqn in jaxpr.eqns:
+        operands = [None if isinstance(v, Literal) else v for v in eqn.invars]
+        if eqn.primitive.name == "dynamic_update_slice" and len(eqn.invars[0].aval.shape) == 1:
+            found.add(operands[0])
+        elif eqn.primitive.name in ("jit", "pjit"):
+            inner = eqn.params["jaxpr"].jaxpr
+            inside = written(inner)
+            found |= {v for v, own in zip(operands, inner.invars) if own in inside}
+    return found & inputs
 
 
 def elements_of(name, size):
@@ -54,7 +55,9 @@ def elements_of(name, size):
 
 def line_of(array):
     """Return the name of the line whose elements are those of an array; None of another array."""
-    whole = array.ndim == 1 and all(isinstance(e, Ref) and e.index == i for i, e in enumerate(array))
+    whole = array.ndim == 1 and all(
+        isinstance(e, Ref) and e.index == i for i, e in enumerate(array)
+    )
     same = {e.name for e in array.ravel()} if whole else set()
     return same.pop() if len(same) == 1 else None
 
@@ -72,14 +75,15 @@ def _read(writer, eqn, operands):
 
 
 def _chosen_slice(writer, eqn, array, index):
-    """A slice of a small array whose place along one axis is computed: one of all that there are."""
+    """A slice of a small array whose place along one axis is computed: one of all there are."""
     sizes = eqn.params["slice_sizes"]
     moving = [d for d, i in enumerate(index) if not is_number(i) and array.shape[d] > sizes[d]]
     if len(moving) > 1 or array.size > SMALL:
         raise no_code("it reads an array at an index that it computes")
-    starts = [0 if not is_number(i) else min(max(i, 0), n - m) for i, n, m in zip(
-        index, array.shape, sizes
-    )]
+    starts = [
+        0 if not is_number(i) else min(max(i, 0), n - m)
+        for i, n, m in zip(index, array.shape, sizes)
+    ]
     ranges = [slice(i, i + m) for i, m in zip(starts, sizes)]
     if not moving:
         return array[tuple(ranges)]

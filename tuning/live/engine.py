@@ -13,14 +13,14 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.export.whole.arrays import called
+from jaxtank.export.whole.array_values import called
 from jaxtank.export.whole.loop import WholeLoop, traced_leaves, whole_loop
 from jaxtank.export.whole.tangents import TangentLoop, tangent_loop
 from tuning.live.printed import Printed, maths
 from tuning.live.printed_tangents import PrintedTangents
 from tuning.live.sliders import leaf_of
-from tuning.problem.limits import limit_scale, resolve_limits
 from tuning.problem.bounds import bounds
+from tuning.problem.limits import limit_scale, resolve_limits
 from tuning.problem.problem import ROOT
 
 ROWS = 3000

@@ -6,8 +6,6 @@ Imported by `tuning.live.engine`.
 from collections.abc import Iterable
 from typing import Any
 
-from jaxtank.export.whole.compact import MATHS, Text, short_names
-from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
 from jaxtank.export.statements import (
     TRUTH,
     Array,
@@ -19,11 +17,14 @@ from jaxtank.export.statements import (
     names,
     used,
 )
+from jaxtank.export.whole.compact import MATHS, Text, short_names
 from jaxtank.export.whole.loop import SAVED, WholeLoop
+from jaxtank.export.whole.regions import hoisted, kept_in_time, of_rank, ranks, refs
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks: what depends on the numbers of the loop alone, on time too, on the state too."""
-FIXED = frozenset("p d k c e q j o S N L R K P D T M G E every".split())
+_FIXED = "p d k c e q j o S N L R K P D T M G E every"
+FIXED = frozenset(_FIXED.split())
 """Names of arguments of the printed functions."""
 
 
@@ -49,9 +50,7 @@ class Printed:
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ranks(self.statements, given)
-        self.truths = {
-            s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH
-        }
+        self.truths = {s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH}
         both = every(loop.statements)
         self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         self.state = self._live()
@@ -72,7 +71,9 @@ class Printed:
     def helpers(self) -> list[str]:
         """Return the functions that the printed ones call."""
         own = {s.op for s in every(self.used()) if isinstance(s, Matrix)}
-        return [f"function {name}{text}" for name, text in self.loop.functions.items() if name in own]
+        return [
+            f"function {name}{text}" for name, text in self.loop.functions.items() if name in own
+        ]
 
     def used(self) -> list[Statement]:
         """Return every statement that is printed."""
@@ -182,7 +183,10 @@ class Printed:
     def _unpacked(self, text, group, source):
         """Lines that give names to what `_numbers` has put together."""
         lines, numbers = [], [e for e in group if not self._is_array(e)]
-        for found, where in ((numbers, source), ([e for e in group if self._is_array(e)], f"{source}.A")):
+        for found, where in (
+            (numbers, source),
+            ([e for e in group if self._is_array(e)], f"{source}.A"),
+        ):
             own = [next(text.names) for _ in found]
             text.given.update(zip([e.name if self._is_array(e) else e for e in found], own))
             lines += [f"const[{','.join(own)}]={where};"] if own else []

@@ -1,18 +1,17 @@
 """The functions of the derivatives of one case as JavaScript. Imported by `tuning.live.engine`."""
 
 from jaxtank.export.statements import Array, Matrix, Ref, Statement, every, names, used
-from jaxtank.export.whole.compact import Text, short_names
-from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs
+from jaxtank.export.whole.compact import Text
+from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs, split
 from jaxtank.export.whole.tangents import TangentLoop
 from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function, place
 
 
-
 class PrintedTangents(Printed):
-    """The printed functions of a TangentLoop: lead, signals and read, as those of `Printed`, and
+    """The printed functions of a TangentLoop: lead, signals, read, as those of `Printed`, and
 
-    aim(q, d) -> [numbers for push, for slope, tangents of c, delay lines], of a direction d with the
-    fourth numbers of lead; push(q, c, L, S, N, k, K, P, D, T, M, G) moves the state and the tangents
+    aim(q, d) -> [numbers for push, for slope, tangents of c, delay lines], of a direction d with
+    the fourth numbers of lead; push(q, c, L, S, N, k, K, P, D, T, M, G) moves the state and the tangents
     T of P directions over samples k to K - 1 and adds to G, the Gauss-Newton matrix;
     slope(q, c, D, T) -> the measures' derivatives along one direction, with the fifth numbers.
     """
@@ -23,10 +22,11 @@ class PrintedTangents(Printed):
         self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         statements = hoisted(tangents.loop.statements)
         lines = [*tangents.lines.values(), *tangents.loop.lines.values()]
-        given = {"p": ALONE, "d": ALONE, "k": TIMED, **dict.fromkeys("cen", MOVING)}
-        self.order = ranks(statements, {**given, **dict.fromkeys(lines, MOVING)})
         along = {**dict.fromkeys("pkcn", 0), "d": 1, "e": 1}
         along |= {name: int(name in tangents.lines.values()) for name in lines}
+        statements = split(statements, along)
+        given = {"p": ALONE, "d": ALONE, "k": TIMED, **dict.fromkeys("cen", MOVING)}
+        self.order = ranks(statements, {**given, **dict.fromkeys(lines, MOVING)})
         self.along = ranks(statements, along)
         self.directed = of_rank(statements, self.along, 1)
         plain = [s for s in of_rank(statements, self.along, 0)]
@@ -93,7 +93,9 @@ class PrintedTangents(Printed):
         lines += text.write(self.aiming, outputs, hold=outputs)
         parts = [self._numbers(text, group) for group in groups]
         sizes = self._tangent_lines()
-        delays = [f"new Float64Array({n}).fill({text.of(self.tangents.first[i])})" for i, n in sizes]
+        delays = [
+            f"new Float64Array({n}).fill({text.of(self.tangents.first[i])})" for i, n in sizes
+        ]
         return function("aim", "q,d", [*lines, f"return[{','.join(parts)},[{','.join(delays)}]];"])
 
     def _tangent_lines(self):
@@ -111,7 +113,9 @@ class PrintedTangents(Printed):
         body += self._inner(text)
         weights = self.tangents.weights
         count = len(weights)
-        products = "+".join(f"{w!r}*E[a*{count}+{i}]*E[b*{count}+{i}]" for i, w in enumerate(weights))
+        products = "+".join(
+            f"{w!r}*E[a*{count}+{i}]*E[b*{count}+{i}]" for i, w in enumerate(weights)
+        )
         body += [f"for(let a=0;a<P;++a)for(let b=0;b<=a;++b)G[a*P+b]+={products or 0};"]
         body += self._next(text)
         lines += [f"const E=new Float64Array(P*{max(1, count)});", "for(;k<K;++k){", *body, "}"]
@@ -162,4 +166,6 @@ class PrintedTangents(Printed):
         plain = used(self._ranked(MOVING), names(self.at_end))
         outputs = [*self.at_end, *self.slopes]
         lines += text.write([*plain, *self.sloped], outputs, hold=outputs)
-        return function("slope", "q,c,D,T", [*lines, f"return[{','.join(map(text.of, self.slopes))}];"])
+        return function(
+            "slope", "q,c,D,T", [*lines, f"return[{','.join(map(text.of, self.slopes))}];"]
+        )

@@ -33,15 +33,16 @@ BINARY = {
 """{operation: (operator, how tightly it binds)}."""
 
 LAZY = {"select": 1, "and": 1, "or": 1}
-"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8 throws
-compiled code away when a branch that it has never seen is taken.
+"""{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8
+throws compiled code away when a branch that it has never seen is taken.
 """
 
 UNARY = {"neg": "-", "not": "!", "real": "+"}
-MATHS = """
+_MATHS = """
 abs max min pow atan2 sign sqrt exp log tanh sin cos floor ceil log1p expm1 tan asin acos atan sinh
 cosh asinh acosh atanh cbrt trunc
-""".split()
+"""
+MATHS = _MATHS.split()
 """Functions of Math that a text has by their own names."""
 
 FORMS = {
@@ -57,7 +58,8 @@ FORMS = {
 }
 """Operations on names and numbers alone, as formats."""
 
-TAKEN = frozenset("do if in of as is for let new try var get set int Map Set".split())
+_TAKEN = "do if in of as is for let new try var get set int Map Set"
+TAKEN = frozenset(_TAKEN.split())
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
@@ -210,10 +212,16 @@ class Text:
         lines = [f"let {n}={v};" for n, v in zip(own, starts)]
         counter = next(self.names)
         lines.append(
-            "for(;;){" if s.count is None else f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
+            "for(;;){"
+            if s.count is None
+            else f"for(let {counter}=0;{counter}<{s.count};++{counter}){{"
         )
         lines += self._block(s.body)
-        new = [(n, self.of(e)) for n, e in zip(own, s.new) if self.given.get(getattr(e, "name", "")) != n]
+        new = [
+            (n, self.of(e))
+            for n, e in zip(own, s.new)
+            if self.given.get(getattr(e, "name", "")) != n
+        ]
         temporary = [next(self.names) for _ in new]
         lines += [f"const {t}={e};" for t, (_, e) in zip(temporary, new)]
         return [*lines, *(f"{n}={t};" for t, (n, _) in zip(temporary, new)), "}"]

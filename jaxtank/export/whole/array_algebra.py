@@ -1,0 +1,119 @@
+"""Sums, products and linear systems of arrays. RULES holds the primitives of jax.
+
+Imported by `jaxtank.export.whole.array_text`.
+"""
+
+import jax
+import numpy as np
+
+from jaxtank.export.primitives import REDUCTIONS, no_code
+from jaxtank.export.whole.array_moves import view
+from jaxtank.export.whole.array_values import strides_of
+
+FOLDS = {
+    "add": "(x,y)=>x+y",
+    "mul": "(x,y)=>x*y",
+    "max": "max",
+    "min": "min",
+    "and": "(x,y)=>x&&y",
+    "or": "(x,y)=>x||y",
+}
+
+
+def _rows(text, eqn, operand, axes):
+    """(array with `axes` last, number of rows, width of one)."""
+    shape = eqn.invars[0].aval.shape
+    own, kept = strides_of(shape), [d for d in range(len(shape)) if d not in axes]
+    order = [*kept, *axes]
+    width = int(np.prod([shape[d] for d in axes]))
+    rows = int(np.prod([shape[d] for d in kept]))
+    if order != list(range(len(shape))):
+        operand = view(text, operand, [shape[d] for d in order], [own[d] for d in order])
+    return operand, rows, width
+
+
+def _reduce(op):
+    def rule(text, eqn, operands):
+        moved, rows, width = _rows(text, eqn, operands[0], list(eqn.params["axes"]))
+        return text.let(f"fold({FOLDS[op]},{rows},{width},{moved})")
+
+    return rule
+
+
+def _cumulate(op):
+    def rule(text, eqn, operands):
+        axis, shape = eqn.params["axis"], eqn.invars[0].aval.shape
+        if eqn.params["reverse"]:
+            raise no_code("it sums an array from its end")
+        moved, rows, width = _rows(text, eqn, operands[0], [axis])
+        done = text.let(f"running({FOLDS[op]},{rows},{width},{moved})")
+        order = [*(d for d in range(len(shape)) if d != axis), axis]
+        if order == list(range(len(shape))):
+            return done
+        own = strides_of([shape[d] for d in order])
+        return view(text, done, shape, [own[order.index(d)] for d in range(len(shape))])
+
+    return rule
+
+
+def _dot(text, eqn, operands):
+    (left, right), (batch_a, batch_b) = eqn.params["dimension_numbers"]
+    sides, sizes = [], []
+    for v, operand, own, batch, last in zip(
+        eqn.invars, operands, (left, right), (batch_a, batch_b), (True, False)
+    ):
+        shape = v.aval.shape
+        free = [d for d in range(len(shape)) if d not in own and d not in batch]
+        order = [*batch, *free, *own] if last else [*batch, *own, *free]
+        strides = strides_of(shape)
+        if order != list(range(len(shape))):
+            operand = view(text, operand, [shape[d] for d in order], [strides[d] for d in order])
+        sides.append(operand)
+        sizes.append([int(np.prod([shape[d] for d in part])) for part in (batch, free, own)])
+    (b, m, k), (_, n, _) = sizes
+    return text.let(f"matmul({b},{m},{k},{n},{sides[0]},{sides[1]})")
+
+
+def _solve(text, eqn, operands):
+    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
+    closed, consts = jaxprs.matvec, operands[: lengths.matvec]
+    shape = eqn.outvars[0].aval.shape
+    n, k, across = _block(closed, shape)
+    inner = text.inner()
+    z = next(text.names)
+    (out,) = inner.run(closed.jaxpr, closed.consts, [*consts, z])
+    body = "\n".join([*inner.live([out]), f"return {out};"])
+    right = operands[sum(lengths)]
+    return text.let(f"solved({n},{k},{str(across).lower()},{z}=>{{{body}}},{right})")
+
+
+def _block(closed, shape):
+    """(n, k, whether the vectors are rows) of k solves with one matrix (n, n)."""
+    if len(shape) == 1:
+        return shape[0], 1, False
+    if len(shape) != 2:
+        raise no_code("it solves for a stack of matrices")
+    rng = np.random.default_rng(0)
+    consts = [rng.random(v.aval.shape) for v in closed.jaxpr.invars[:-1]]
+
+    def matvec(z):
+        return np.array(jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *consts, z)[0])
+
+    for across in (False, True):
+        z = np.zeros(shape)
+        one = (0, slice(None)) if across else (slice(None), 0)
+        z[one] = rng.random(z[one].shape)
+        other = matvec(z)
+        other[one] = 0.0
+        if not np.any(other):
+            return (shape[1], shape[0], True) if across else (shape[0], shape[1], False)
+    return int(np.prod(shape)), 1, False
+
+
+RULES = {
+    **{f"reduce_{name}": _reduce(op) for name, op in REDUCTIONS.items()},
+    **{f"cum{name}": _cumulate(REDUCTIONS[name]) for name in ("sum", "prod", "max", "min")},
+    "dot_general": _dot,
+    "custom_linear_solve": _solve,
+}
+"""{primitive of jax: function (text, equation, operands) -> text of the result}."""

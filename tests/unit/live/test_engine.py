@@ -1,0 +1,178 @@
+"""The engine of a live page, run by node, against the library: runs, noise, derivatives, searches."""
+
+import json
+import shutil
+import subprocess
+from importlib import resources
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.tree import get_value
+from jaxtank.export.whole.loop import served
+from tuning.live.engine import data, describe, engine, squares_of
+
+NODE = shutil.which("node")
+pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
+# {case: what makes it short}
+SHORT = {
+    "cascaded/pi": {},
+    "gouta2015/backstepping": {"clock.dt": 0.5, "clock.duration": 300.0},
+    "gouta2022/pi": {"clock.dt": 0.2, "actuator.delay": 1.0, "actuator.lag": 0.9},
+}
+LONG = [n for n in presets.names() if n not in ("cascaded/pi", "gouta2015/backstepping")]
+
+RUN = """
+const text = (m) => Object.fromEntries(Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]));
+const d = JSON.parse(require("fs").readFileSync(0)), e = makeEngine();
+console.log(JSON.stringify(d.settings.map((s) => {
+  const r = e.run(s, { every: d.every, seed: d.seed, filter: d.filter });
+  const part = (a) => a.map((column) => Array.from(column, String));
+  return { h: part(r.h), u: part(r.u), measures: text(r.measures) };
+})));
+"""
+SLOPES = """
+const d = JSON.parse(require("fs").readFileSync(0)), e = makeEngine();
+const r = e.tangents(d.values, e.info.free, { seed: d.seed });
+const jacobian = Object.entries(r.jacobian).map(([k, v]) => [k, Array.from(v)]);
+console.log(JSON.stringify([e.info.free, jacobian, Array.from(r.gauss_newton)]));
+"""
+SEARCH = """
+const e = makeEngine();
+console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 1 })));
+"""
+
+
+def node(script, given=None):
+    """What a script prints, as JSON; it reads `given` as JSON."""
+    done = subprocess.run(
+        [NODE, "-"] if given is None else [NODE, "-e", script],
+        input=script if given is None else json.dumps(given),
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def short(name):
+    return rig.set_values(presets.find(name), SHORT.get(name, {}))
+
+
+def settings_of(case, count=1, leaves=10, seed=0):
+    """Random settings: `leaves` sliders each, within 5 % of what they are and their ends."""
+    rng, found = np.random.default_rng(seed), []
+    sliders = [s for s in describe(case)["leaves"] if s["value"] and np.isfinite(s["value"])]
+    for _ in range(count):
+        chosen = rng.choice(len(sliders), min(leaves, len(sliders)), replace=False)
+        found.append({})
+        for s in (sliders[i] for i in chosen):
+            value = s["value"] * (1.0 + 0.05 * rng.uniform(-1.0, 1.0))
+            found[-1][s["name"]] = float(np.clip(value, s["lower"], s["upper"]))
+    return found
+
+
+def agrees(case, settings, tolerance, seed=0, filtered=None):
+    """Assert that levels, inputs and measures of the engine are those of the library."""
+    every = max(1, case.clock.samples // 100)
+    given = {"settings": settings, "every": every, "seed": seed, "filter": filtered is not None}
+    found = node(engine(case, filtered) + RUN, given)
+    for values, got in zip(settings, found, strict=True):
+        one = rig.set_values(filtered or case, values) if values else filtered or case
+        key = jax.random.key(seed) if np.any(np.asarray(one.loop.sensor.noise) > 0) else None
+        run = jaxtank.simulate(one.loop, one.clock, key, every)
+        names = [m for m in served(one) if not m.startswith("time_of")]
+        measures = jaxtank.evaluate(one.loop, one.clock, names, key)
+        pairs = [(got["h"], np.asarray(run.x).T), (got["u"], np.asarray(run.u).T)]
+        pairs += [(got["measures"][m], np.ravel(measures[m])) for m in names]
+        for mine, theirs in pairs:
+            mine = np.array(mine, dtype=float)
+            size = np.max(np.abs(theirs[np.isfinite(theirs)]), initial=0.0)
+            np.testing.assert_allclose(mine, theirs, rtol=0, atol=tolerance * max(size, 1e-12))
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_runs_are_those_of_the_library(name):
+    case = short(name)
+    agrees(case, [{}, *settings_of(case)], 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LONG)
+def test_every_case_runs_as_in_the_library(name):
+    case = presets.find(name)
+    agrees(case, settings_of(case, count=5), 1e-6 if "constrained" in name else 1e-9)
+
+
+def test_noise_is_that_of_a_seed():
+    agrees(short("cascaded/pi"), [{"sensor.noise[0]": 0.05, "sensor.noise[1]": 0.02}], 1e-9, 7)
+
+
+def test_deviates_are_those_of_jax():
+    text = resources.files("tuning.live").joinpath("engine.js").read_text("utf-8")
+    script = "const info = {leaves: []}, programs = [];\n" + text
+    found = node(script + "console.log(JSON.stringify(deviates(5, 2, 400).map((v) => [...v])))")
+    expected = jax.random.normal(jax.random.key(5), (2, 400), dtype=float)
+    np.testing.assert_allclose(np.array(found), expected, rtol=1e-12, atol=1e-14)
+
+
+def test_the_safety_filter_is_switched_on():
+    case = short("gouta2015/backstepping")
+    agrees(case, [{}], 1e-9, filtered=rig.filtered(case, True))
+
+
+@pytest.mark.parametrize(
+    "name", ["cascaded/pi", "gouta2022/pi", pytest.param("khalid/gpc", marks=pytest.mark.slow)]
+)
+def test_derivatives_are_those_of_the_library(name):
+    case = short(name)
+    given = {"values": {}, "seed": 0}
+    names, jacobian, matrix = node(engine(case) + SLOPES, given)
+    point = {n: np.float64(get_value(case.loop, n)) for n in names}
+    key = jax.random.key(0) if np.any(np.asarray(case.loop.sensor.noise) > 0) else None
+    squares = dict(squares_of(case.objective))
+    measures = [m for m, _ in jacobian]
+    found = jaxtank.sensitivities(case.loop, case.clock, measures, point, key, squares)
+    for m, slopes in jacobian:
+        expected = np.ravel(found[1][m])
+        size = np.max(np.abs(expected))
+        np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-9 * max(size, 1e-9))
+    np.testing.assert_allclose(matrix, np.ravel(found[2]), rtol=1e-8, atol=1e-12)
+
+
+def test_a_search_ends_where_a_scan_has_its_minimum():
+    """Of one gain, within 0.5 % of the cost of the best of 60 values."""
+    case = presets.find("cascaded/pi").replace(limits={})
+    case = case.replace(free={"controller.Kc": case.free["controller.Kc"]})
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    scan = []
+    for gain in np.geomspace(0.01, 5.0, 60):
+        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
+        scan.append(float(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]))
+    assert found["status"] == "converged" and found["violation"] == 0
+    assert found["objective"] <= 1.005 * min(scan)
+
+
+def test_a_search_keeps_the_limits():
+    """The answer, run by the library: no limit is passed."""
+    case = short("gouta2015/backstepping")
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    loop = jaxtank.with_values(case.loop, found["values"])
+    levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
+    start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
+    assert np.max(start) > 30.0 >= np.max(levels) > 29.9
+
+
+def test_names_of_a_rig_stay_text():
+    hostile = "</script><script>alert(1)//\u2028"
+    case = presets.find("cascaded/pi").replace(name=hostile, title=hostile, limits={})
+    text = engine(case)
+    assert "</" not in text and "<!--" not in text and "\u2028" not in text
+    script = text + "console.log(JSON.stringify(makeEngine().info.case))"
+    assert node(script) == hostile and "</" not in data({"a": hostile})
