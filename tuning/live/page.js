@@ -524,7 +524,7 @@ function command() {
   const now = effective(), { origin } = data, words = ["jaxtank simulate", origin.words];
   for (const leaf of leaves) {
     const value = now[leaf.name] ?? leaf.value;
-    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name}=${value}`);
+    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name.includes("[") ? `'${leaf.name}=${value}'` : `${leaf.name}=${value}`}`);
   }
   if (state.filter && origin.guard) words.push(origin.guard);
   if (state.filter !== null && state.filter !== origin.filtered)
