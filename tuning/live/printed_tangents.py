@@ -2,7 +2,7 @@
 
 from jaxtank.export.statements import Array, Matrix, Ref, Statement, every, names, used
 from jaxtank.export.whole.compact import Text, short_names
-from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs
+from jaxtank.export.whole.regions import hoisted, of_rank, ranks, refs, split
 from jaxtank.export.whole.tangents import TangentLoop
 from tuning.live.printed import ALONE, MOVING, TIMED, Printed, function, place
 
@@ -23,10 +23,11 @@ class PrintedTangents(Printed):
         self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
         statements = hoisted(tangents.loop.statements)
         lines = [*tangents.lines.values(), *tangents.loop.lines.values()]
-        given = {"p": ALONE, "d": ALONE, "k": TIMED, **dict.fromkeys("cen", MOVING)}
-        self.order = ranks(statements, {**given, **dict.fromkeys(lines, MOVING)})
         along = {**dict.fromkeys("pkcn", 0), "d": 1, "e": 1}
         along |= {name: int(name in tangents.lines.values()) for name in lines}
+        statements = split(statements, along)
+        given = {"p": ALONE, "d": ALONE, "k": TIMED, **dict.fromkeys("cen", MOVING)}
+        self.order = ranks(statements, {**given, **dict.fromkeys(lines, MOVING)})
         self.along = ranks(statements, along)
         self.directed = of_rank(statements, self.along, 1)
         plain = [s for s in of_rank(statements, self.along, 0)]

@@ -17,7 +17,8 @@ from jax.extend.core import Literal
 
 from jaxtank.export.javascript import MATRICES, ROUND
 from jaxtank.export.lowering import Writer
-from jaxtank.export.primitives import REDUCTIONS, no_code
+from jaxtank.export.primitives import REDUCTIONS, elements, no_code
+from jaxtank.export.primitives import constant as folded
 from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number
 from jaxtank.export.statements import Matrix, Ref
 from jaxtank.export.whole.compact import Text, literal, short_names
@@ -53,26 +54,40 @@ class ArrayWriter(Writer):
         return super().equation(eqn, operands)
 
     def _call(self, eqn, operands):
-        """The elements of the results of an equation as a function of arrays."""
-        shapes = [v.aval.shape for v in eqn.outvars]
+        """The elements of the results of an equation as a function of arrays; of a loop, a function
+        for each group of results that depend on the same arguments.
+        """
+        groups = groups_of(eqn) if eqn.primitive.name == "scan" else [range(len(eqn.outvars))]
+        out = [None] * len(eqn.outvars)
+        for group in groups:
+            for i, found in zip(group, self._results(eqn, operands, list(group))):
+                out[i] = found
+        return out
+
+    def _results(self, eqn, operands, wanted):
+        """The elements of some results of an equation."""
+        shapes = [eqn.outvars[i].aval.shape for i in wanted]
         sizes = [int(np.prod(s)) for s in shapes]
-        given = [all(map(is_number, o.ravel())) for o in operands]
         text = ArrayText(short_names(["F"]))
-        own = [
-            text.constant(np.array(o.ravel().tolist(), dtype=float)) if number else next(text.names)
-            for o, number in zip(operands, given)
-        ]
-        results = text.equation(eqn, own)
-        arguments = ",".join(n for n, number in zip(own, given) if not number)
-        result = results[0] if len(results) == 1 else f"chain(1,{_list(sizes)},[{','.join(results)}])"
-        body = f"({arguments}){{" + "\n".join([*text.live(results, top=True), f"return {result};"]) + "}"
-        known = {v: k for k, v in self.functions.items()}
-        if body not in known:
-            self.functions[f"f{len(self.functions)}"] = body
-            known = {v: k for k, v in self.functions.items()}
-        name = self.fresh("m")
-        names = tuple(self._array(o) for o, number in zip(operands, given) if not number)
-        self.scopes[-1].append(Matrix(name, known[body], names, ()))
+        own = []
+        for o in operands:
+            number = all(map(is_number, o.ravel()))
+            array = np.array(o.ravel().tolist(), dtype=float) if number else None
+            own.append(text.constant(array) if number else next(text.names))
+        if eqn.primitive.name == "scan":
+            found = _scan(text, eqn, own, wanted)
+        else:
+            found = text.equation(eqn, own)
+        result = found[0] if len(found) == 1 else f"chain(1,{_list(sizes)},[{','.join(found)}])"
+        lines = [*text.live(found, top=True), f"return {result};"]
+        read = set(re.findall(r"\w+", " ".join(lines)))
+        used = [i for i, n in enumerate(own) if n in read and not _known(text, n)]
+        body = f"({','.join(own[i] for i in used)}){{" + "\n".join(lines) + "}"
+        names = {v: k for k, v in self.functions.items()}
+        function = names.get(body) or f"f{len(self.functions)}"
+        self.functions[function] = body
+        key = (function, tuple(self._array(operands[i]) for i in used))
+        name = self._once(key, lambda: self._added(function, key[1], ()))
         self.sizes[name] = sum(sizes)
         out, at = [], 0
         for shape, size in zip(shapes, sizes):
@@ -92,10 +107,75 @@ class ArrayWriter(Writer):
                 if first.index == 0 and len(entries) == self.sizes[first.name]:
                     return first.name
                 ends = (first.index, first.index + len(entries))
-                name = self.fresh("m")
-                self.scopes[-1].append(Matrix(name, "part", (first.name,), ends))
-                return name
-        return self.array(operand)
+                key = ("part", first.name, ends)
+                return self._once(key, lambda: self._added("part", (first.name,), ends))
+        return self._once(("array", entries), lambda: self.array(operand))
+
+    def _added(self, op, operands, sizes):
+        """The name of the result of a new operation on arrays."""
+        name = self.fresh("m")
+        self.scopes[-1].append(Matrix(name, op, operands, sizes))
+        return name
+
+    def _once(self, key, make):
+        """The name of an array that is made once, unless in a loop, where it may change."""
+        if len(self.scopes) > 1:
+            return make()
+        if key not in self.whole:
+            self.whole[key] = make()
+        return self.whole[key]
+
+
+def _known(text, name):
+    """Whether a value of a text is a constant."""
+    return _is_literal(name) or name in text.numbers
+
+
+def groups_of(eqn):
+    """Return the results of a loop in groups that depend on the same arguments: lists of numbers.
+
+    The tangents of a loop and the loop itself are one equation; the loop does not depend on them.
+    """
+    groups: dict[frozenset, list[int]] = {}
+    for i, found in enumerate(_scan_dependence(eqn, [{i} for i in range(len(eqn.invars))])):
+        groups.setdefault(frozenset(found), []).append(i)
+    return list(groups.values())
+
+
+def _scan_dependence(eqn, given):
+    """What each result of a loop depends on, for what its operands depend on."""
+    p = eqn.params
+    consts, carry = p["num_consts"], p["num_carry"]
+    starts = [set(v) for v in given[consts : consts + carry]]
+    while True:
+        out = _dependence(p["jaxpr"].jaxpr, [*given[:consts], *starts, *given[consts + carry :]])
+        new = [a | b for a, b in zip(starts, out)]
+        if new == starts:
+            return [*new, *out[carry:]]
+        starts = new
+
+
+def _dependence(jaxpr, given):
+    """What each result of a jaxpr depends on."""
+    known = {v: set() for v in jaxpr.constvars} | dict(zip(jaxpr.invars, given))
+
+    def read(v):
+        return set() if isinstance(v, Literal) else known[v]
+
+    for eqn in jaxpr.eqns:
+        operands = [read(v) for v in eqn.invars]
+        inner = _called(eqn) if eqn.primitive.name not in CONTROL else None
+        if eqn.primitive.name == "scan":
+            out = _scan_dependence(eqn, operands)
+        elif eqn.primitive.name == "cond":
+            found = [_dependence(b.jaxpr, operands[1:]) for b in eqn.params["branches"]]
+            out = [operands[0].union(*own) for own in zip(*found)]
+        elif inner is not None:
+            out = _dependence(getattr(inner, "jaxpr", inner), operands)
+        else:
+            out = [set().union(*operands)] * len(eqn.outvars)
+        known.update(zip(eqn.outvars, out))
+    return [read(v) for v in jaxpr.outvars]
 
 
 def _is_large(eqn, operands):
@@ -169,6 +249,8 @@ class ArrayText:
     def equation(self, eqn, operands):
         """Return the texts of the outputs of an equation."""
         name = eqn.primitive.name
+        if all(_known(self, o) for o in operands) and _called(eqn) is None and name not in CONTROL:
+            return self._folded(eqn, operands)
         if name in ALIASES:
             return operands[:1] if len(eqn.outvars) == 1 else operands
         if name in ("lu", "lu_pivots_to_permutation", "sort"):
@@ -184,6 +266,16 @@ class ArrayText:
                 return [self._named(eqn, operands)]
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
         return [self._elementwise(eqn, operands)]
+
+    def _folded(self, eqn, operands):
+        """The results of an operation on numbers, computed by jax."""
+        values = []
+        for v, o in zip(eqn.invars, operands):
+            found = self.numbers.get(o)
+            found = np.full(v.aval.shape, float(o)) if found is None else found
+            found = np.broadcast_to(found, (int(np.prod(v.aval.shape)),)) if found.size == 1 else found
+            values.append(elements(found.reshape(v.aval.shape)))
+        return [self.constant(np.array(e.tolist(), dtype=float)) for e in folded(eqn, values)]
 
     def _named(self, eqn, operands):
         """The matrix operations of `jaxtank.analysis.elimination`."""
@@ -505,34 +597,57 @@ def _loop(text, own, lines):
         text.lines.append((name, whole if i == 0 else "", reads | set(own)))
 
 
-def _scan(text, eqn, operands):
+def _scan(text, eqn, operands, wanted=None):
     p = eqn.params
-    first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+    consts, carry = p["num_consts"], p["num_carry"]
     closed, count = p["jaxpr"], p["length"]
-    sizes = [int(np.prod(v.aval.shape)) for v in eqn.outvars[: p["num_carry"]]]
-    own, lines = _state(text, eqn, operands[first:last], sizes)
-    i, reverse = next(text.names), p["reverse"]
-    outs = [next(text.names) for _ in eqn.outvars[p["num_carry"] :]]
-    totals = [int(np.prod(v.aval.shape)) for v in eqn.outvars[p["num_carry"] :]]
+    wanted = list(range(len(eqn.outvars))) if wanted is None else wanted
+    state = _needed(closed.jaxpr, consts, carry, wanted)
+    sequences = [i for i in wanted if i >= carry]
+    sizes = [int(np.prod(eqn.outvars[i].aval.shape)) for i in state]
+    own, lines = _state(text, eqn, [operands[consts + i] for i in state], sizes)
+    counter, outs = next(text.names), [next(text.names) for _ in sequences]
+    totals = [int(np.prod(eqn.outvars[i].aval.shape)) for i in sequences]
     lines += [f"const {n}=new Float64Array({s});" for n, s in zip(outs, totals)]
-    start = f"let {i}={count - 1};{i}>=0;--{i}" if reverse else f"let {i}=0;{i}<{count};++{i}"
-    lines.append(f"for({start}){{")
-    slices = []
-    for v, x in zip(eqn.invars[last:], operands[last:]):
-        each = int(np.prod(v.aval.shape)) // count
-        name = next(text.names)
-        lines.append(f"const {name}=flat({each * count},{x}).slice({i}*{each},{i}*{each}+{each});")
+    first, up = (count - 1, "--") if p["reverse"] else (0, "++")
+    end = f"{counter}>=0" if p["reverse"] else f"{counter}<{count}"
+    lines.append(f"for(let {counter}={first};{end};{up}{counter}){{")
+    slices, reading = [], []
+    for v, x in zip(eqn.invars[consts + carry :], operands[consts + carry :]):
+        each, name = int(np.prod(v.aval.shape)) // count, next(text.names)
+        part = f"flat({each * count},{x}).slice({counter}*{each},{counter}*{each}+{each})"
+        reading.append((name, f"const {name}={part};"))
         slices.append(name)
+    inside = ["0"] * carry
+    for i, name in zip(state, own):
+        inside[i] = name
     inner, results = _block_lines(
-        text, closed.jaxpr, closed.consts, [*operands[:first], *own, *slices]
+        text, closed.jaxpr, closed.consts, [*operands[:consts], *inside, *slices]
     )
-    lines += inner.live(results)
-    for name, total, e in zip(outs, totals, results[p["num_carry"] :]):
+    results = [results[i] for i in (*state, *sequences)]
+    body = inner.live(results)
+    read = set(re.findall(r"\w+", " ".join([*body, *results])))
+    lines += [line for name, line in reading if name in read] + body
+    for name, total, e in zip(outs, totals, results[len(state) :]):
         each = total // count
-        lines.append(f"{name}.set(flat({each},{e}),{i}*{each});")
-    lines += [*_moved(text, own, results[: p["num_carry"]], sizes), "}"]
+        lines.append(f"{name}.set(flat({each},{e}),{counter}*{each});")
+    lines += [*_moved(text, own, results[: len(state)], sizes), "}"]
     _loop(text, [*own, *outs], lines)
-    return [*own, *outs]
+    found = dict(zip([*state, *sequences], [*own, *outs]))
+    return [found[i] for i in wanted]
+
+
+def _needed(jaxpr, consts, carry, wanted):
+    """The carried variables that some results of a loop need, themselves among them."""
+    alone = [set() for _ in range(consts)] + [{i} for i in range(carry)]
+    alone += [set() for _ in jaxpr.invars[consts + carry :]]
+    out = _dependence(jaxpr, alone)
+    need = {i for i in wanted if i < carry}
+    while True:
+        new = need.union(*(out[i] for i in [*need, *wanted]))
+        if new == need:
+            return sorted(need)
+        need = new
 
 
 def _while(text, eqn, operands):

@@ -10,6 +10,7 @@ from jaxtank.export.statements import (
     Array,
     Define,
     Loop,
+    Matrix,
     Ref,
     Statement,
     Store,
@@ -77,6 +78,76 @@ def ranks(statements: Iterable[Statement], given: Mapping[str, int]) -> dict[str
             rank = max(rank, found[s.array])
         found.update(dict.fromkeys(defined(s), rank))
     return found
+
+
+def split(statements: Iterable[Statement], given: Mapping[str, int]) -> list[Statement]:
+    """Return statements with each loop of mixed ranks, 0 and 1, as two: one of what has rank 0, and
+    one of all, of which only the rest is read.
+
+    Examples
+    --------
+    >>> carried = (("real", "c1", 1.0), ("real", "c2", Ref("d")))
+    >>> double = [Define("real", f"v{i}", "mul", (Ref(f"c{i}"), 2.0)) for i in (1, 2)]
+    >>> found = split([Loop(3, carried, double, (Ref("v1"), Ref("v2")))], {"d": 1})
+    >>> [[name for _, name, _ in loop.carried] for loop in found]
+    [['c1'], ['c1_', 'c2']]
+    """
+    rank, out = dict(given), []
+    for s in statements:
+        if isinstance(s, Loop):
+            mixed = _ranks_of(s, rank)
+            low = [i for i, (_, name, _) in enumerate(s.carried) if not mixed[name]]
+            if low and len(low) < len(s.carried):
+                carried, new = (tuple(part[i] for i in low) for part in (s.carried, s.new))
+                plain = s._replace(carried=carried, new=new, body=used(s.body, names(new)))
+                s = _renamed(s, {s.carried[i][1] for i in low} | (local(s) - defined(s)))
+                out.append(plain)
+                rank.update(ranks([plain], rank))
+        out.append(s)
+        rank.update(ranks([s], rank))
+    return out
+
+
+def _ranks_of(loop, rank):
+    """{carried variable of a loop: its rank}."""
+    found = {name: max((rank[n] for n in names([start])), default=0) for _, name, start in loop.carried}
+    while True:
+        inside = ranks(loop.body, {**rank, **found})
+        new = {
+            name: max([found[name], *(inside[n] for n in names([e]))])
+            for (_, name, _), e in zip(loop.carried, loop.new)
+        }
+        if new == found:
+            return found
+        found = new
+
+
+def _renamed(s, own):
+    """A statement with other names of the variables `own`."""
+
+    def other(e):
+        if not isinstance(e, Ref):
+            return e
+        return Ref(f"{e.name}_" if e.name in own else e.name, other(e.index))
+
+    def name(n):
+        return f"{n}_" if n in own else n
+
+    if isinstance(s, Loop):
+        return s._replace(
+            carried=tuple((kind, name(n), other(start)) for kind, n, start in s.carried),
+            body=[_renamed(one, own) for one in s.body],
+            new=tuple(map(other, s.new)),
+        )
+    if isinstance(s, Define):
+        return s._replace(name=name(s.name), args=tuple(map(other, s.args)))
+    if isinstance(s, Array):
+        return s._replace(name=name(s.name), entries=tuple(map(other, s.entries)))
+    if isinstance(s, Until):
+        return s._replace(test=other(s.test))
+    if isinstance(s, Matrix):
+        return s._replace(name=name(s.name), operands=tuple(map(name, s.operands)))
+    return s
 
 
 def local(loop: Loop) -> set[str]:
