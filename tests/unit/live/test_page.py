@@ -215,6 +215,19 @@ def test_runs_are_pinned_zoomed_and_played_by_keyboard(browser, written):
         assert "run 1" not in live.text("#legend")
 
 
+def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(browser, written):
+    with opened(browser, written) as live:
+        box = live.page.locator(".u-over").first.bounding_box()
+        x, y, width = box["x"], box["y"] + 20, box["width"]
+        live.page.mouse.move(x + 0.25 * width, y)
+        live.page.mouse.down()
+        live.page.mouse.move(x + 0.5 * width, y, steps=4)
+        live.page.mouse.up()
+        np.testing.assert_allclose(live("jaxtank.state().shown"), [700.0, 1400.0], rtol=0.02)
+        live.page.mouse.dblclick(x + 0.5 * width, y)
+        assert live("jaxtank.state().shown") == [0, 2800]
+
+
 def test_states_of_a_result_are_compared(browser, tmp_path):
     case = presets.find("cascaded/pi")
     states = [("before", {}, False), ("after", {"controller.Kc": 0.4}, False)]
