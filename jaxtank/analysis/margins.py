@@ -64,6 +64,7 @@ def margins(loop: OpenLoop) -> Margins:
     --------
     A sampled integrator L = 0.5/(z - 1): 1 + k L is zero at z = -1 for k = 4.
 
+    >>> jax.config.update("jax_enable_x64", True)
     >>> one = jnp.eye(1)
     >>> found = margins(OpenLoop(one, 0.5 * one, one, 0, 1.0))
     >>> bool(found.stable), round(float(found.gain_margin[0]), 4)

@@ -26,14 +26,7 @@ from jaxtank.xla.jit import compiled
 
 
 class Plateau(NamedTuple):
-    """Margins at the steady state of one plateau; made by `stability_margins`.
-
-    Examples
-    --------
-    >>> plateau = stability_margins.__annotations__["return"]
-    >>> plateau
-    tuple[jaxtank.loop.margins.Plateau, ...]
-    """
+    """Margins at the steady state of one plateau; made by `stability_margins`."""
 
     setpoints: np.ndarray[Any, Any]  # (outputs,) [unit of length]
     x: np.ndarray[Any, Any]  # (n,) levels of the steady state [unit of length]
@@ -114,7 +107,7 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             f"stability margins need a reference that holds setpoints: a {kind} has none"
             " (signals.Ramps and signals.Constant have)"
         )
-    r = jnp.stack([jnp.stack([jnp.asarray(v, jnp.float64) for v in row]) for row in held])
+    r: Any = jnp.stack([jnp.stack([jnp.asarray(v, jnp.float64) for v in row]) for row in held])
     bare = dataclasses.replace(
         loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None
     )

@@ -4,6 +4,8 @@ May import `loop.closed_loop`, `loop.step` and the folders below `jaxtank.loop`.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
+# pyright: reportConstantRedefinition=false
 
 import dataclasses
 import functools
@@ -76,6 +78,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     Examples
     --------
     >>> from jaxtank import presets
+    >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.find("cascaded/pi")
     >>> found = jax.jit(lambda r: linearised(case.loop, case.clock, r).why)(jnp.array([5.0]))
     >>> REASONS[int(found)]
@@ -112,7 +115,7 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, int]:
     actuator: Any = loop.actuator
     low, high = jnp.asarray(actuator.low), jnp.asarray(actuator.high)
     far = FAR * jnp.where(jnp.isfinite(high - low), high - low, 1.0)
-    changes = {"low": low - far, "high": high + far}
+    changes: dict[str, Any] = {"low": low - far, "high": high + far}
     dead = round(float(actuator.delay) / clock.dt)
     if dead:
         changes["delay"] = 0.0

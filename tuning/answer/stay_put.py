@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import Search
@@ -126,7 +127,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     """
     first = problem.start()
     reference = problem.point(first)
-    problem.check_slopes(reference)
+    check_slopes(problem, reference)
     search = found.search = Search(problem, reference, report, TOLERANCE)
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])

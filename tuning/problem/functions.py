@@ -7,6 +7,7 @@ Imported by `problem` and by what takes an objective or limits: `search`, `answe
 # pyright: reportUnknownMemberType=false
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
@@ -17,6 +18,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import program_of
+from tuning.problem.point import Point
 from tuning.storage.fingerprint import digest
 
 UNNAMED = "own_objective"
@@ -89,10 +91,11 @@ class Constraint:
     def __post_init__(self) -> None:
         if (self.upper is None) == (self.lower is None):
             raise InputError(f"constraint {self.name}: must have either upper or lower")
-        number = isinstance(self.limit, int | float | np.number) and not isinstance(
-            self.limit, bool
-        )
-        if not (number and np.isfinite(float(self.limit))):
+        try:
+            finite = not isinstance(self.limit, bool) and math.isfinite(self.limit)
+        except (TypeError, OverflowError):
+            finite = False
+        if not finite:
             raise InputError(
                 f"constraint {self.name}: limit {shortened(self.limit)} must be a finite number"
                 f" [{self.unit}]"
@@ -216,3 +219,20 @@ def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any
     own = ms.functions(names)
     found = {name: digest(program_of(loop, clock, name)) for name in own}
     return {"functions": found} if found else {}
+
+
+def check_slopes(problem: Any, point: Point) -> None:
+    """Raise InputError for a function of the user's whose derivative at the start is NaN.
+
+    problem : the Problem. point : its Point at the starting values.
+    """
+    if not np.isfinite(point.cost):
+        return
+    bad = [*ms.functions(problem.objective)] if np.isnan(point.gradient).any() else []
+    measured = zip(problem.limits, point.margin_slopes)
+    bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
+    for name in ms.functions(bad):
+        raise InputError(
+            f"function {name}: its derivative by {', '.join(problem.names)} is not a number at the"
+            " starting values, as of a root or a quotient at 0"
+        )

@@ -55,10 +55,9 @@ class Problem:
     ----------
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
-    objective : {measure: weight}; a measure with several entries counts with their sum. A function
-        of one's own may stand in the place of a measure, or alone (`tuning.Objective`).
-    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario. With
-        functions of one's own a list: [{measure: value}, tuning.Constraint(...)].
+    objective : {measure: weight}; a measure with several entries counts with their sum. Also a
+        function of one's own, or a `tuning.Objective`, alone or in the place of a measure.
+    limits : as in `resolve_limits`, or a list with `tuning.Constraint`s; of every scenario.
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     cache : an EvaluationCache of what was evaluated before.
@@ -112,27 +111,14 @@ class Problem:
 
         The evaluation cache holds margins of the former limits, and is emptied."""
         self.given["limits"] = limits
-        limits = as_measures(None, limits, self.objective)[1]
-        self.limits: list[Limit] = resolve_in(self.runs, limits)
+        _, named = as_measures(None, limits, self.objective)
+        self.limits: list[Limit] = resolve_in(self.runs, named)
         self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
         check_functions(self.loop, self.clock, self.needed)
         self.cache = EvaluationCache()
-
-    def check_slopes(self, point: Point) -> None:
-        """Raise InputError for a function of the user's whose derivative at a Point is NaN."""
-        if not np.isfinite(point.cost):
-            return
-        bad = [*ms.functions(self.objective)] if np.isnan(point.gradient).any() else []
-        measured = zip(self.limits, point.margin_slopes)
-        bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
-        for name in ms.functions(bad):
-            raise InputError(
-                f"function {name}: its derivative by {', '.join(self.names)} is not a number at the"
-                " starting values, as of a root or a quotient at 0"
-            )
 
     @property
     def names(self) -> list[str]:
