@@ -5,6 +5,7 @@ Designs of gains, quadratic programmes and their derivatives: whatever has an ar
 """
 
 import functools
+import itertools
 import re
 from collections.abc import Callable
 from importlib import resources
@@ -68,7 +69,7 @@ class ArrayWriter(Writer):
         """The elements of some results of an equation."""
         shapes = [eqn.outvars[i].aval.shape for i in wanted]
         sizes = [int(np.prod(s)) for s in shapes]
-        text = ArrayText(short_names(["F"]))
+        text = ArrayText(short_names(["F", "x", "y", "z"]))
         own = []
         for o in operands:
             number = all(map(is_number, o.ravel()))
@@ -304,7 +305,7 @@ class ArrayText:
             invars=[_scalar(v) for v in eqn.invars], outvars=[_scalar(v) for v in eqn.outvars]
         )
         (out,) = writer.equation(scalar, inputs)
-        text = Text({Ref(x): x for x in "xyz"}, short_names("xyz"))
+        text = Text({Ref(x): x for x in "xyz"}, (f"x{i}" for i in itertools.count()))
         e = np.asarray(out, dtype=object).item()
         lines = text.write(writer.scopes[0], [e])
         body = text.of(e)
