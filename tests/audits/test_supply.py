@@ -92,6 +92,7 @@ READ = {
     ("tuning.report.html", "style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
+    ("jaxtank.export.whole.arrays", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",

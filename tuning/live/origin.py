@@ -14,6 +14,9 @@ from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, walk
 
+GUARD = "safety_filter."
+"""What the names of a safety filter begin with."""
+
 NEW = "rig.toml"
 """Name of the rig file that a case without a name of its own is copied to."""
 
@@ -83,7 +86,10 @@ def _guard(case, known):
 def _static(case, known):
     """--set of the static fields and the clock that differ; None where the structure does."""
     found = []
-    shapes = [{n: np.shape(v) for n, v in parameters(c.loop).items()} for c in (case, known)]
+    shapes = [
+        {n: np.shape(v) for n, v in parameters(c.loop).items() if not n.startswith(GUARD)}
+        for c in (case, known)
+    ]
     mine, theirs = (dict(_fields(c.loop)) for c in (case, known))
     if shapes[0] != shapes[1] or mine.keys() != theirs.keys():
         return None
@@ -100,7 +106,7 @@ def _static(case, known):
 
 def _fields(loop):
     for name, value, _ in walk(loop, kind="static"):
-        if not name.startswith("safety_filter."):
+        if not name.startswith(GUARD):
             yield name, value
 
 
@@ -114,7 +120,7 @@ def entries(loop, values):
     """
     found, own = {}, parameters(loop)
     for name, value in values.items():
-        if name.startswith("safety_filter."):
+        if name.startswith(GUARD):
             continue
         shape = np.shape(own[name]) if name in own else ()
         if not shape:

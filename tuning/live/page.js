@@ -396,7 +396,7 @@ function makeLegend() {
 }
 
 function newWorker() {
-  const text = [unpacked.engine, unpacked.worker];
+  const text = [unpacked.engine, unpacked.core, unpacked.worker];
   const url = URL.createObjectURL(new Blob([text.join("\n")], { type: "text/javascript" }));
   const made = new Worker(url);
   URL.revokeObjectURL(url);
@@ -524,7 +524,7 @@ function command() {
   const now = effective(), { origin } = data, words = ["jaxtank simulate", origin.words];
   for (const leaf of leaves) {
     const value = now[leaf.name] ?? leaf.value;
-    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name}=${value}`);
+    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name.includes("[") ? `'${leaf.name}=${value}'` : `${leaf.name}=${value}`}`);
   }
   if (state.filter && origin.guard) words.push(origin.guard);
   if (state.filter !== null && state.filter !== origin.filtered)
@@ -577,7 +577,14 @@ function moveCursor(time) {
 // --- start ------------------------------------------------------------------------------------
 
 function makeCharts() {
-  const on = { cursor: atTime, zoom, whole: () => zoom(0, info.duration) };
+  let drawn = false; // the charts that share the cursor report the same selection
+  const once = (from, to) => {
+    if (drawn) return;
+    drawn = true;
+    zoom(from, to);
+    setTimeout(() => (drawn = false));
+  };
+  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration) };
   const { length, drive } = info.units;
   info.tanks.forEach((tank, i) => {
     const rim = tank.rim === null || tank.rim === undefined ? [] : [{ value: tank.rim, words: `rim ${shown(tank.rim)} ${length}` }];
@@ -729,7 +736,9 @@ window.jaxtank = {
   csv,
   command,
   toml,
-  state: () => ({ values: effective(), filter: state.filter, seed: state.seed }),
+  state: () => ({
+    values: effective(), filter: state.filter, seed: state.seed, shown: [view.from, view.to],
+  }),
 };
 
 start();

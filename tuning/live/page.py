@@ -26,7 +26,10 @@ from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
 
 HERE = Path(__file__).parent
-SCRIPTS = ("core", "charts", "rig", "page")
+SCRIPTS = ("charts", "rig", "page")
+LARGEST = 150_000
+"""Characters of a page, above which the safety filter that a case has not is left out."""
+
 KEPT = 8
 """Engines that are kept in memory."""
 
@@ -64,17 +67,24 @@ def page(case, presets=(), source=None):
     >>> text[:15], "http-equiv" in text
     ('<!DOCTYPE html>', True)
     """
-    return assemble(_engine(case), case.name, data_of(case, presets, source))
+    off, on, filtered = both(case)
+    data = data_of(case, presets, source)
+    text = assemble(_engine(off, on), case.name, data)
+    if len(text) > LARGEST and not filtered:  # then without a safety filter to switch on
+        text = assemble(_engine(off, None), case.name, data)
+    return text
 
 
-def _engine(case):
-    """The engine of a case, kept for the next page of the same one: two seconds of work."""
-    off, on, _ = both(case)
+def _engine(off, on):
+    """The engine of a case and of the same with a safety filter or None.
+
+    It is kept for the next page of the same case: two seconds of work.
+    """
     try:
         texts = [rig.dump(one) for one in (off, on) if one is not None]
     except InputError:  # a class of the user's own
         return engine(off, on)
-    key = repr((texts, case.title, case.names))
+    key = repr((texts, off.title, off.names))
     if key not in _KEPT:
         if len(_KEPT) >= KEPT:
             _KEPT.pop(next(iter(_KEPT)))
@@ -194,10 +204,11 @@ def assemble(engine_text, name, data):
     --------
     >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
     >>> "a &lt;b&gt;" in text, text.count("</script>")
-    (True, 6)
+    (True, 7)
     """
-    packed = {"engine": engine_text, "uplot": _read("vendor/uPlot.iife.min.js"), "page": _whole()}
-    run = [*packed.values(), _loader()]
+    uplot, core, own = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
+    # the scripts of the page are one function, as loader.js joins them
+    run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{own}\n}})();', _loader()]
     policy = "; ".join(
         [
             "default-src 'none'",
@@ -210,8 +221,14 @@ def assemble(engine_text, name, data):
         ]
     )
     search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
-    packed["worker"] = "\n".join([search, _script("core"), _script("worker")])
-    packed["data"] = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    packed = {
+        "engine": engine_text,
+        "uplot": uplot,
+        "core": core,
+        "page": own,
+        "worker": f"{search}\n{_script('worker')}",
+        "data": json.dumps(data, allow_nan=False, separators=(",", ":")),
+    }
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -268,9 +285,9 @@ def _script(name):
 
 
 @cache
-def _whole():
-    """The scripts of the page as one function, so that they define nothing global."""
-    return "\n".join(['(() => {"use strict";', *map(_script, SCRIPTS), "})();"])
+def _own():
+    """The scripts of the page but core.js."""
+    return "\n".join(map(_script, SCRIPTS))
 
 
 @cache

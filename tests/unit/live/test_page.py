@@ -175,7 +175,7 @@ def test_what_is_broken_changes_the_plant_alone(browser, written):
         values = live("jaxtank.state().values")
         gain = float(presets.find("cascaded/pi").loop.plant.pump_gain[0])
         assert values == {"plant.pump_gain[0]": pytest.approx(0.7 * gain)}
-        assert "--set plant.pump_gain[0]=" in live("jaxtank.command()")
+        assert "--set 'plant.pump_gain[0]=" in live("jaxtank.command()")
         live.page.click("#reset")
         assert live("jaxtank.state().values") == {}
 
@@ -213,6 +213,19 @@ def test_runs_are_pinned_zoomed_and_played_by_keyboard(browser, written):
         live.page.keyboard.press("Enter")
         live.page.get_by_label("remove run 1").click()
         assert "run 1" not in live.text("#legend")
+
+
+def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(browser, written):
+    with opened(browser, written) as live:
+        box = live.page.locator(".u-over").first.bounding_box()
+        x, y, width = box["x"], box["y"] + 20, box["width"]
+        live.page.mouse.move(x + 0.25 * width, y)
+        live.page.mouse.down()
+        live.page.mouse.move(x + 0.5 * width, y, steps=4)
+        live.page.mouse.up()
+        np.testing.assert_allclose(live("jaxtank.state().shown"), [700.0, 1400.0], rtol=0.02)
+        live.page.mouse.dblclick(x + 0.5 * width, y)
+        assert live("jaxtank.state().shown") == [0, 2800]
 
 
 def test_states_of_a_result_are_compared(browser, tmp_path):
@@ -270,9 +283,25 @@ def test_a_changed_case_keeps_the_words_that_make_it(browser, tmp_path):
         ]
 
 
+def test_a_filtered_case_is_repeated_with_its_settings(browser, tmp_path):
+    path = tmp_path / "page.html"
+    words = ["--safety-filter", "--set", "safety_filter.rate=0.1", "--set", "clock.duration=800"]
+    assert command("explore", "cascaded/pi", *words, "--out", str(path), "--quiet").code == 0
+    with opened(browser, path) as live:
+        assert live("jaxtank.state().filter") is True
+        line, found = live("jaxtank.command()"), live("jaxtank.run({}).measures")
+        live.page.click("#filter-row")
+        without = live("jaxtank.command()")
+    assert "--safety-filter" in line and "safety_filter" not in without
+    done = command(*shlex.split(line)[1:], "--json", "--quiet")
+    for name in ("rms_error_total", "max_level", "filter_active_fraction"):
+        assert found[name] == pytest.approx(done.json["measures"][name], rel=1e-9), name
+    assert np.max(found["filter_active_fraction"]) > 0.0
+
+
 def test_the_gallery_lists_what_it_has(browser, tmp_path):
-    paths = gallery(tmp_path, ["cascaded/pi", "cascaded/open-loop"])
-    assert sorted(p.name for p in paths)[-1] == "index.html"
+    paths = gallery(tmp_path, ["cascaded/pi"])
+    assert [p.name for p in paths] == ["index.html", "cascaded-pi.html"]
     context = browser.new_context(offline=True)
     try:
         tab = context.new_page()
