@@ -116,7 +116,8 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
         # one after the other: a program for one of them is compiled in half the time
         return r, *jax.lax.map(one, r)
     rows = [one(v) for v in r]  # by one program, however many there are
-    return r, *jax.tree.map(_stacked, *rows)
+    stacked: Any = jax.tree.map(_stacked, *rows)
+    return r, *stacked
 
 
 def _stacked(*values: Any) -> Any:

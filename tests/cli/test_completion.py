@@ -15,7 +15,7 @@ from tuning.cli.parser import parser
 
 COMMANDS = {
     *("list", "show", "simulate", "tune", "uncertainty", "merge", "sensitivity", "identify"),
-    "attack",
+    *("attack", "explore"),
     *("init", "export", "compare", "completion", "bench", "cache"),
 }
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}
