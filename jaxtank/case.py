@@ -4,6 +4,7 @@ May import `jaxtank.loop` and below; rig files and pictures are opened when they
 """
 
 import dataclasses
+import importlib
 import json
 import warnings
 from collections.abc import Callable, Mapping
@@ -199,6 +200,14 @@ class Case:
         from jaxtank.plots.run import rig
 
         return rig(self.loop.plant, title=self.name)
+
+    def explore(self) -> Any:
+        """Return the live page, in which the loop runs while sliders move: a notebook shows it, and
+        `.save(path)` writes it. Opens `tuning.live`.
+
+        Raises InputError for a case that cannot be run in a browser.
+        """
+        return importlib.import_module("tuning.live.shown").of_case(self)
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return

@@ -24,7 +24,7 @@ def written(jaxpr):
     >>> import jax
     >>> line = jax.ShapeDtypeStruct((3,), np.float32)
     >>> whole = jax.ShapeDtypeStruct((), np.int32)
-    >>> put = lambda a, i: jax.lax.dynamic_update_index_in_dim(a, a[0], i, 0)
+    >>> put = lambda a, i: jax.lax.dynamic_update_slice(a, a[:1], (i,))
     >>> len(written(jax.make_jaxpr(put)(line, whole).jaxpr))
     1
     """

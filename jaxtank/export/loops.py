@@ -25,17 +25,17 @@ def _scan(writer, eqn, operands):
     if len(eqn.outvars) > p["num_carry"]:
         raise no_code("a loop in it writes a sequence")
     closed, sequences = p["jaxpr"], operands[last:]
-    starts, read = operands[first:last], lambda counter: []
+    starts, read = operands[first:last], lambda *counter: []
     if sequences:
         starts = [*starts, np.array(0, dtype=object)]
         read = _reader(writer, sequences, eqn.invars[last:], p["reverse"])
 
     def body(carried):
-        *own, counter = carried if sequences else (*carried, None)
-        out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *own, *read(counter)])
+        own, counter = (carried[:-1], carried[-1:]) if sequences else (carried, [])
+        out = writer.run(closed.jaxpr, closed.consts, [*operands[:first], *own, *read(*counter)])
         if sequences:
             after = np.empty((), dtype=object)
-            after[()] = writer.define(WHOLE, "add", counter.item(), 1)
+            after[()] = writer.define(WHOLE, "add", counter[0].item(), 1)
             out = [*out, after]
         return out
 

@@ -15,7 +15,8 @@ from jax.typing import ArrayLike
 
 from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.numerics import clip
-from jaxtank.xla.normal import normal
+from jaxtank.xla.barrier import materialised
+from jaxtank.xla.normal import is_fast, normal, normal_at
 
 
 class Sensor(abc.ABC):
@@ -106,6 +107,20 @@ class Sensor(abc.ABC):
                 [jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1
             )
         return tuple(deviates[i] for i in range(tanks))
+
+    def draws_in_loop(self, key: Any) -> bool:
+        """Return whether `draw_sample` gives the deviates of `draw`, for a key of a run."""
+        own = type(self).draw is not Sensor.draw
+        return key is not None and np.ndim(self.noise) > 0 and not own and is_fast(key)
+
+    def draw_sample(self, key: Any, samples: int, k: Any) -> tuple[Any, ...]:
+        """Return the (n,) deviates that `draw` gives sample k of `samples`, and those alone.
+
+        A batch of long runs then holds no noise in memory, which costs more time than to draw it.
+        """
+        tanks = np.shape(self.noise)[-1]
+        places = [jnp.asarray(k, jnp.uint64) + np.uint64(i * samples) for i in range(tanks)]
+        return materialised(tuple(normal_at(key, place) for place in places))
 
     def without_noise(self) -> Self:
         """Return the same sensor with all `noise` 0."""

@@ -18,6 +18,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.functions import needed_by, values_of
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.hoist import scan
@@ -70,7 +71,6 @@ def sensitivities_compiled(
     flat, unflatten = ravel_pytree(values)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
-    push = _pushed_stored if batched else _pushed
 
     def at(theta: Any) -> ClosedLoop:
         return with_values(loop, dict(zip(order, unflatten(theta))))
@@ -78,8 +78,8 @@ def sensitivities_compiled(
     def sampled(theta: Any) -> Any:
         return inputs(at(theta), clock, kept, key)
 
-    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept)))
     known = _dependent(sampled, flat)
+    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept)))
 
     def begin(theta: Any) -> Any:
         floats, rest = carried.split(_start(keyed(at(theta), key), clock, kept))
@@ -102,17 +102,16 @@ def sensitivities_compiled(
             floats, others = carried.split((state, ms.update(run, acc, sample, now.context)))
             return (floats, errors), others
 
-        (floats, _), (dfloats, derrors), rest = push(
-            advance, (floats, flat, moving), dfloats, basis, dmoving
-        )
+        push, point = _pushed_stored if batched else _pushed, (floats, flat, moving)
+        (floats, _), (dfloats, derrors), rest = push(advance, point, dfloats, basis, dmoving)
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
-    carry = (floats, dfloats, rest, jnp.zeros((flat.size, flat.size), flat.dtype))
-    last = scan(body, carry, (moving, dmoving, fixed), length=clock.samples)[0]
-    floats, dfloats, rest, matrix = last
+    carry = (floats, dfloats, rest, jnp.zeros_like(basis))
+    floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        return ms.read(run_of(at(theta), clock), carried.join(floats, rest)[1], names), None
+        run, (_, acc) = run_with(at(theta), clock, names), carried.join(floats, rest)
+        return ms.read(run, acc, names), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])

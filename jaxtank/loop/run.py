@@ -8,7 +8,7 @@ other modules of `loop` and the folders below.
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.functions import needed_by, values_of
+from jaxtank.loop.margins import run_with
 from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import Trajectory
@@ -229,26 +230,37 @@ def evaluate_compiled(
         return values_of(loop, clock, names, key, values, checkpoint), broken
     loop = keyed(loop, key)
     run = run_of(loop, clock)
+    pointwise = clock.samples > CHUNK and is_pointwise(loop)
+    drawn = not checkpoint and (clock.samples <= CHUNK or pointwise)
+    drawn = drawn and loop.sensor.draws_in_loop(key)  # else before the loop
 
-    def body(carry: Any, now: Inputs) -> Any:
-        state, acc = carry
-        state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.context)), None
+    def scanned(carry: Any, number: Any, samples: int, first: Any = 0) -> Any:
+        here = jax.random.fold_in(cast(Any, key), number) if drawn and pointwise else key
+
+        def body(carry: Any, now: Inputs) -> Any:
+            state, acc = carry
+            if drawn:
+                now = now._replace(xi=loop.sensor.draw_sample(here, samples, state.k - first))
+            state, sample = step(loop, clock, state, now)
+            return (state, ms.update(run, acc, sample, now.context)), None
+
+        xs = inputs(loop, clock, names, None if drawn else key, number, samples)
+        if checkpoint:
+            return checkpointed_scan(body, carry, xs, samples)
+        return scan(body, carry, xs, samples)[0]
 
     def batch(carry: Any, number: Any, samples: int = CHUNK) -> Any:
-        return scan(body, carry, inputs(loop, clock, names, key, number, samples), samples)[0], None
+        return scanned(carry, number, samples, number * CHUNK), None
 
     carry: Any = (initial(loop, clock), ms.start(run, names))
-    if checkpoint:
-        carry = checkpointed_scan(body, carry, inputs(loop, clock, names, key), clock.samples)
-    elif clock.samples > CHUNK and is_pointwise(loop):
+    if pointwise and not checkpoint:
         whole, left = divmod(clock.samples, CHUNK)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
         carry = batch(carry, whole, left)[0] if left else carry
     else:
-        carry = scan(body, carry, inputs(loop, clock, names, key), clock.samples)[0]
+        carry = scanned(carry, None, clock.samples)
     state, acc = carry
-    return ms.read(run, acc, names), is_broken(state)
+    return ms.read(run_with(loop, clock, names), acc, names), is_broken(state)
 
 
 def _report_broken(

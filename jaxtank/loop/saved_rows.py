@@ -67,11 +67,3 @@ def _first(a: Any) -> Any:
 
 def _but_first(a: Any) -> Any:
     return a[1:]
-
-
-def _first(a: Any) -> Any:
-    return a[0]
-
-
-def _but_first(a: Any) -> Any:
-    return a[1:]

@@ -197,6 +197,22 @@ def columns(
     }
 
 
+def stride(samples: int, rows: int = 3000) -> int:
+    """Return the distance of saved samples that leaves about `rows` of them.
+
+    It is odd, so that a pump that chatters from sample to sample is not drawn as one that is
+    constant, and ends at the end where it can.
+
+    Examples
+    --------
+    >>> stride(120_001), stride(701)
+    (75, 1)
+    """
+    steps = samples - 1
+    least = max(1, steps // rows)
+    return next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
+
+
 def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     """Return a trajectory as CSV with units in the header; estimates of disturbances where there
     are any.

@@ -5,12 +5,14 @@ known of them by name, `running` what the loop calls, `functions` those that are
 whole run. May import `jaxtank.core` only.
 """
 
-from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run
-from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run, Worst
+from jaxtank.measures.catalogue import MEASURES
 from jaxtank.measures.functions import RunFunction, from_function, functions, name_of
+from jaxtank.measures.measure import Measure
 from jaxtank.measures.registry import (
     check_names,
     entries,
+    linear,
     of_loop,
     placed,
     refers_to,
@@ -32,10 +34,12 @@ __all__ = [
     "Measure",
     "Run",
     "RunFunction",
+    "Worst",
     "check_names",
     "entries",
     "from_function",
     "functions",
+    "linear",
     "name_of",
     "needs",
     "of_loop",

@@ -28,6 +28,16 @@ class Run(NamedTuple):
     high: tuple[Any, ...]  # upper limit of each pump [V]
     rim: tuple[Any, ...]  # rim of each tank [cm]
     zero: Any  # 0.0 of the run's type
+    margins: Any = None  # Worst margins of the linearised loop, where a measure reads them
+
+
+class Worst(NamedTuple):
+    """The worst stability margins of all steady states of a loop."""
+
+    sensitivity_peak: Any  # Ms [-]
+    gain_margin: Any  # (m,) [-]
+    phase_margin: Any  # (m,) [deg]
+    delay_margin: Any  # (m,) [s]
 
 
 class Context(NamedTuple):

@@ -1,50 +1,17 @@
 """The measures: numbers that describe a run, each with all that is known of it.
 
-A measure reads accumulators at the end of a run. May import `jaxtank.core` and
-`measures.accumulators` only.
+A measure reads accumulators at the end of a run. May import `jaxtank.core` and the
+modules of `measures` that it imports only.
 """
-
-from collections.abc import Callable
-from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
-from jaxtank.measures.accumulators import Run, settled
+from jaxtank.measures.accumulators import settled
+from jaxtank.measures.margins import MARGINS
+from jaxtank.measures.measure import Measure
 
 NO_CHANGES = "the reference has no changes that end"
-
-
-class Measure(NamedTuple):
-    """A named number or list, and all that reports, limits and searches need to know of it.
-
-    `jaxtank.measures.register` adds one of a user's own.
-
-    Examples
-    --------
-    >>> from jaxtank.measures import MEASURES
-    >>> MEASURES["max_level"].unit, MEASURES["max_level"].per, MEASURES["min_level"].sense
-    ('cm', 'tank', -1.0)
-    """
-
-    unit: str  # with "cm" standing for the rig's length unit and "V" for that of its inputs
-    per: str  # "run", "output", "tank" or "pump"
-    needs: tuple[str, ...]  # names of accumulators
-    read: Callable[[Run, dict[str, Any]], Any]  # (run, {accumulator: state}) -> scalar or array
-    doc: str
-    residual: str = ""  # the accumulator of squares that it is a multiple of, if it is one
-    scale: Callable[[Run], Any] | None = None  # run -> factor of that sum
-    low: float | None = 0.0  # least and largest value that it can have, None where there is none
-    high: float | None = None
-    sense: float = 1.0  # +1 where a larger value is worse (limits are upper ones), -1 a smaller
-    counts: bool = False  # counts whole samples: a step function of the parameters, no derivative
-    by_input: bool = False  # a sum over the run with a slope in every input: `bound` minimises it
-    shown: int = 0  # its place in the table of a tuning result; 0: not in it
-    summary: int = 0  # its place in an ensemble's summary unless others are named; 0: not in it
-    reached: str = ""  # the measure that holds the time at which this one was reached
-    undefined: str = "the value is not a finite number"  # why a run has no value of it
-    unserved: str = ""  # why a case has none, reported where it is not computed
-    nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
 
 
 def _stacked(values):
@@ -346,5 +313,6 @@ MEASURES: dict[str, Measure] = {
         "when the lowest level was reached",
         counts=True,
     ),
+    **MARGINS,
 }
 """{name: Measure}; `register` adds those of a user's own."""

@@ -14,8 +14,9 @@ from jaxtank.core.installed import imported, installed
 from jaxtank.core.tree import shortened
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
-from jaxtank.measures.catalogue import MEASURES, Measure
+from jaxtank.measures.catalogue import MEASURES
 from jaxtank.measures.functions import from_function, functions
+from jaxtank.measures.measure import Measure
 
 BUILT_IN = frozenset(MEASURES)
 GROUP = "jaxtank.measures"
@@ -182,11 +183,16 @@ def times() -> tuple[str, ...]:
 
 
 def reported() -> tuple[str, ...]:
-    """Return the names of the measures in every result: all but `times()` and functions of a whole
-    run, which are computed where they are named.
+    """Return the names of the measures in every result: all but `times()`, functions of a whole
+    run and those of the linearised loop, which are computed where they are named.
     """
-    left_out = {*times(), *functions(MEASURES)}
+    left_out = {*times(), *functions(MEASURES), *linear()}
     return tuple(m for m in MEASURES if m not in left_out)
+
+
+def linear() -> tuple[str, ...]:
+    """Return the names of the measures of the linearised loop: computed where they are named."""
+    return tuple(m for m, spec in MEASURES.items() if spec.linear)
 
 
 def placed(field: str) -> tuple[str, ...]:
@@ -227,15 +233,18 @@ def of_loop(loop: Any) -> tuple[str, ...]:
     has: those that a file of it may name. `serves` asks for more.
     """
     missing = _missing(loop)
-    return tuple(m for m in reported() if not missing & refers_to([m]))
+    of_run = (m for m in reported() if not missing & refers_to([m]))
+    return (*of_run, *(m for m in linear() if serves(m, loop)))
 
 
 def serves(name: str, loop: Any) -> bool:
     """Return whether the measure `name` means something for this loop: its reference changes, its
-    tanks have inflow pulses, its steady inputs are known in closed form, its levels have a lower
-    clip, it has a safety filter.
+    holds setpoints, its tanks have inflow pulses, its steady inputs are known in closed form, its
+    levels have a lower clip, it has a safety filter.
     """
     wanted, plant = refers_to([name]), loop.plant
+    if MEASURES[name].linear and loop.reference.held() is None:
+        return False
     if "steady" in wanted and (
         getattr(plant, "pipes", None) != () or plant.pumps != len(plant.outputs)
     ):

@@ -111,6 +111,87 @@ def place(plant):
     return _with_pumps(plant, boxes, rows, wide * PITCH)
 
 
+def jets(plant, where):
+    """Return [(tank, path ((x, y), ...))] of the free jets from the floors of the tanks: into the
+    tanks below, and into the basin. A closed orifice (area 0) has none.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> plant = presets.find("cascaded/pi").loop.plant
+    >>> [(tank, len(path)) for tank, path in jets(plant, place(plant))]
+    [(0, 3), (1, 2)]
+    """
+    found = []
+    for i, box in enumerate(where.boxes):
+        sinks = [
+            where.boxes[sink]
+            for k, (source, sink) in enumerate(plant.links)
+            if source == i and float(np.asarray(plant.orifice)[k]) > 0
+        ]
+        sinks.sort(key=lambda below: below.middle)
+        for k, below in enumerate(sinks):
+            x = box.x + box.width * (k + 1) / (len(sinks) + 1)
+            end = min(max(x, below.x + 0.35 * below.width), below.x + 0.65 * below.width)
+            path = ((x, box.y - 0.06), (x, box.y - 0.12), (end, below.y + 0.97 * below.height))
+            found.append((i, path))
+        if float(np.asarray(plant.drain)[i]) <= 0:
+            continue
+        if sinks:  # past the tanks below
+            side = box.x + box.width
+            x = side + 0.16
+            found.append((i, ((side, box.y + 0.05), (x, box.y + 0.05), (x, -0.93))))
+        else:
+            found.append((i, ((box.middle, box.y - 0.06), (box.middle, -0.93))))
+    return found
+
+
+def pipes(plant, where):
+    """Return [(left end, right end, height)] of the pipes that are open, below the surface.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> plant = presets.find("gouta2022/enmpc").loop.plant
+    >>> len(pipes(plant, place(plant)))
+    1
+    """
+    found = []
+    for k, (one, other) in enumerate(plant.pipes):
+        if float(np.asarray(plant.pipe)[k]) > 0:
+            left, right = sorted((where.boxes[one], where.boxes[other]), key=lambda b: b.x)
+            found.append((left.x + left.width, right.x, max(left.y, right.y) + 0.08))
+    return found
+
+
+def overflows(plant, where):
+    """Return [(tank, path ((x, y), ...))] of what runs over a rim into another tank.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> plant = presets.find("cascaded/pi").loop.plant
+    >>> [tank for tank, _ in overflows(plant, place(plant))]
+    [0]
+    """
+    found = []
+    for tank, into in plant.spills:
+        source, sink = where.boxes[tank], where.boxes[into]
+        x, rim = source.x - 0.13, source.y + source.height
+        found.append(
+            (
+                tank,
+                (
+                    (source.x, rim),
+                    (x, rim - 0.05),
+                    (x, sink.y + sink.height + 0.25),
+                    (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97),
+                ),
+            )
+        )
+    return found
+
+
 def _with_pumps(plant, boxes, rows, width):
     """The Layout with pumps in the basin, at the nearer side of the first tank that they fill.
 

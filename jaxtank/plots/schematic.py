@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
-from jaxtank.plots.layout import place
+from jaxtank.plots.layout import jets, overflows, pipes, place
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -49,12 +49,11 @@ def schematic(ax, plant, levels=None, setpoints=None):
             *np.array(path).T, color=_colour(pump), linewidth=1.6, solid_joinstyle="round", zorder=1
         )
         ax.plot(*path[-1], marker="v", color=_colour(pump), markersize=5, zorder=4)
-    for k, (one, other) in enumerate(plant.pipes):
-        if float(np.asarray(plant.pipe)[k]) > 0:
-            _pipe(ax, where.boxes[one], where.boxes[other])
+    for pipe in pipes(plant, where):
+        _pipe(ax, *pipe)
     _jets(ax, plant, where)
-    for source, sink in plant.spills:
-        _overflow(ax, where.boxes[source], where.boxes[sink])
+    for _, path in overflows(plant, where):
+        _overflow(ax, path)
     for i, box in enumerate(where.boxes):
         controlled = i in plant.outputs
         ax.add_patch(
@@ -244,25 +243,10 @@ def _label(ax, plant, tank, box, level, unit):
 
 def _jets(ax, plant, where):
     """Free jets from the floor of each tank: into the tanks below it, and into the basin."""
-    for i, box in enumerate(where.boxes):
-        sinks = [
-            (where.boxes[sink].middle, where.boxes[sink])
-            for k, (source, sink) in enumerate(plant.links)
-            if source == i and float(np.asarray(plant.orifice)[k]) > 0
-        ]
-        sinks.sort(key=lambda s: s[0])
-        drained = float(np.asarray(plant.drain)[i]) > 0
-        for k, (_, below) in enumerate(sinks):
-            x = box.x + box.width * (k + 1) / (len(sinks) + 1)
-            end = min(max(x, below.x + 0.35 * below.width), below.x + 0.65 * below.width)
-            _spout(ax, x, box.y)
-            ax.plot([x, x, end], [box.y - 0.06, box.y - 0.12, below.y + 0.97 * below.height], **JET)
-        if drained and not sinks:
-            _spout(ax, box.middle, box.y)
-            ax.plot([box.middle, box.middle], [box.y - 0.06, -0.93], **JET)
-        elif drained:  # past the tanks below
-            x = box.x + box.width + 0.16
-            ax.plot([box.x + box.width, x, x], [box.y + 0.05, box.y + 0.05, -0.93], **JET)
+    for tank, path in jets(plant, where):
+        ax.plot(*np.array(path).T, **JET)
+        if path[0][1] < where.boxes[tank].y:  # from an orifice in the floor
+            _spout(ax, path[0][0], where.boxes[tank].y)
 
 
 def _spout(ax, x, y):
@@ -275,31 +259,17 @@ def _spout(ax, x, y):
     )
 
 
-def _pipe(ax, one, other):
-    left, right = sorted((one, other), key=lambda b: b.x)
-    y = max(left.y, right.y) + 0.08
+def _pipe(ax, left, right, y):
     for wide, colour, layer in ((6.5, GLASS, 1.7), (3.5, WATER, 1.8)):
         ax.plot(
-            [left.x + left.width, right.x],
-            [y, y],
-            color=colour,
-            linewidth=wide,
-            solid_capstyle="butt",
-            zorder=layer,
+            [left, right], [y, y], color=colour, linewidth=wide, solid_capstyle="butt", zorder=layer
         )
 
 
-def _overflow(ax, source, sink):
-    x = source.x - 0.13
-    path = [
-        (source.x, source.y + source.height),
-        (x, source.y + source.height - 0.05),
-        (x, sink.y + sink.height + 0.25),
-        (sink.x + 0.12 * sink.width, sink.y + sink.height * 0.97),
-    ]
+def _overflow(ax, path):
     ax.plot(*np.array(path).T, color=AFTER, linewidth=1.3, linestyle=(0, (1, 1.2)), zorder=2)
     ax.text(
-        x - 0.04,
+        path[1][0] - 0.04,
         (path[1][1] + path[2][1]) / 2,
         "overflow",
         fontsize=6.5,

@@ -88,15 +88,15 @@ def free(case):
         part, _, rest = name.partition(".")
         if part not in ("controller", "observer") or "model." in rest or name in taken:
             continue
-        span = None if value is None or meta.get("rows") else _around(value, meta)
+        span = None if value is None or meta.get("rows") else around(value, meta)
         if span is not None:
             found.append(Line(toml(name), list(span), of_free(case, name), False))
     return found
 
 
-def _around(value, meta):
+def around(value, meta):
     """Free of a tenth to ten times a value within its range, or either side of 0 where it is not
-    positive; None of a range that is empty.
+    positive; None of a range that is empty. meta: its description, as of `describe`.
     """
     value = np.asarray(value, dtype=float)
     if value.size == 0:

@@ -20,6 +20,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.floors import floor_rows, floors_of, lowest, raised
 from jaxtank.safety.prediction import brackets
 from jaxtank.safety.worst_case import rates_of, rise
+from jaxtank.xla.barrier import materialised
 
 FLOOR = 0.05
 """a0 as a share of s(H): below it the root of a feeding tank's level counts as constant."""
@@ -120,19 +121,22 @@ class SafetyFilter:
         line : (m) arrays (predicted,) of the inputs under way, the oldest first [V]; needed where
             `predicted` is above 0
         """
+        y, command = materialised((tuple(y), tuple(command)))
         pumps = range(actuator.pumps)
         low, dead = [actuator.low[j] for j in pumps], [self.offset[j] for j in pumps]
         high = [actuator.high[j] - dead[j] for j in pumps]
-        caps, shared = self.limits(y, hold, low, high, line)
+        caps, shared = materialised(self.limits(y, hold, low, high, line))
         floors, together = self.floors(y, hold, low, caps)
         least = tuple(low)
         if self.kept:
             least = tuple(jnp.where(f > v, f + z, v) for f, v, z in zip(floors, low, dead))
         most = tuple(cap + zone for cap, zone in zip(caps, dead))
+        least, most = materialised((least, most))
         if self.allocate and actuator.pumps == 2:
-            u = allocate(command, metric or self._metric(y), least, most)
+            u = allocate(command, materialised(metric or self._metric(y)), least, most)
         else:
             u = tuple(clip(command[j], least[j], most[j]) for j in pumps)
+        u = materialised(u)
         free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
         acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
         if not shared and not together:
@@ -180,6 +184,7 @@ class SafetyFilter:
             )
             for i in range(n)
         ]
+        above = materialised(above)
         rows, below = [], lowest(self, r, y, hold, low) if self.predicted else []
         for i in self.held:
             if r.pumps[i]:

@@ -70,6 +70,12 @@ class Signal(abc.ABC):
         """Return (plateaus, channels) values held between `changes` before `until` [s], or None."""
         return None
 
+    def held(self) -> tuple[tuple[Any, ...], ...] | None:
+        """Return the values of the channels at the start and after the changes of each time, or
+        None where nothing is held; derivatives pass through.
+        """
+        return None
+
 
 @component
 class Constant(Signal):
@@ -97,6 +103,9 @@ class Constant(Signal):
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
         return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
+
+    def held(self) -> tuple[tuple[Any, ...], ...]:
+        return (tuple(self.level[i] for i in range(self.channels)),)
 
 
 @component
@@ -181,3 +190,7 @@ class Sum(Signal):
         still = t < sine.start - 1e-7 * clock.dt
         found[sine.channel] = tuple(jnp.where(still, a, 0.0) for a in found[sine.channel])
         return tuple(found)
+
+    def held(self) -> tuple[tuple[Any, ...], ...] | None:
+        """Return those of the first signal, about which the second one moves."""
+        return self.first.held()

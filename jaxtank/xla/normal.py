@@ -25,10 +25,36 @@ def normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     >>> bool(jnp.all(normal(key, (2, 3)) == jax.random.normal(key, (2, 3), float)))
     True
     """
-    dtype = jnp.result_type(float)
-    if dtype != jnp.float64 or not _is_threefry(key) or jax.default_backend() != "cpu":
-        return jax.random.normal(key, shape, dtype)
-    first, second = _blocks(jax.random.key_data(key), shape)
+    if not is_fast(key):
+        return jax.random.normal(key, shape, jnp.result_type(float))
+    return normal_at(key, jax.lax.iota(np.uint64, math.prod(shape)).reshape(shape))
+
+
+def is_fast(key: Any) -> bool:
+    """Return whether `normal_at` serves: a key of jax's default generator, float64, a CPU.
+
+    Examples
+    --------
+    >>> is_fast(jax.random.key(0, impl="rbg"))
+    False
+    """
+    here = jax.default_backend() == "cpu" and jnp.result_type(float) == jnp.float64
+    return here and _is_threefry(key)
+
+
+def normal_at(key: Any, index: jax.Array) -> jax.Array:
+    """Return the numbers of jax.random.normal(key, shape).ravel() at the places `index` (uint64).
+
+    Any of them without those before: a run can draw the noise of a sample when it comes to it.
+
+    Examples
+    --------
+    >>> key = jax.random.key(0)
+    >>> some = normal_at(key, jnp.array([5], "uint64")) if is_fast(key) else normal(key, (6,))[5:]
+    >>> bool(some[0] == normal(key, (6,))[5])
+    True
+    """
+    first, second = _blocks(jax.random.key_data(key), index)
     bits = first.astype(jnp.uint64) << 32 | second.astype(jnp.uint64)
     # 52 random bits after the point of a number in [1, 2)
     numbers: Any = jax.lax.bitcast_convert_type(
@@ -47,9 +73,8 @@ def _is_threefry(key: Any) -> bool:
     return typed and partitionable and str(jax.random.key_impl(key)) == "threefry2x32"
 
 
-def _blocks(key: Any, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+def _blocks(key: Any, index: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the two words of Threefry-2x32 of each number's index, under a key of two words."""
-    index = jax.lax.iota(np.uint64, math.prod(shape)).reshape(shape)
     schedule = key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(PARITY)
     a = (index >> 32).astype(jnp.uint32) + schedule[0]
     b = index.astype(jnp.uint32) + schedule[1]

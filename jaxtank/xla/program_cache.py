@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 SWITCH = "JAXTANK_CACHE"
 OFF = ("0", "off", "false", "no")
@@ -59,15 +60,16 @@ def cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """
     import jax
 
-    if jax.config.jax_compilation_cache_dir:
-        return Path(jax.config.jax_compilation_cache_dir)
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir:
+        return Path(config.jax_compilation_cache_dir)
     found, why = prepare(folder)
     if why:
         warnings.warn(f"compiled programs are not kept: {why}", stacklevel=2)
     if found is not None:
-        jax.config.update("jax_compilation_cache_dir", str(found))
+        config.update("jax_compilation_cache_dir", str(found))
         for name, value in SETTINGS.items():
-            jax.config.update(name, value)
+            config.update(name, value)
     return found
 
 

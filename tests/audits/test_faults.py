@@ -497,6 +497,32 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(number):
     assert (done.returncode, done.stdout, done.stderr) == (0, "went on\n", "")
 
 
+def test_a_search_in_the_background_ignores_ctrl_c_and_ends_with_sigterm():
+    """A script that runs it with & has its SIGINT ignored, from before the search to its end."""
+    code = (
+        "import os, signal, sys, time; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "from tuning.cli import interrupts; interrupts.listen(); search = interrupts.Interrupts()\n"
+        "search.check(); os.kill(os.getpid(), signal.SIGINT); time.sleep(0.5); search.check()\n"
+        "os.kill(os.getpid(), signal.SIGTERM)\nwhile not search.stop: time.sleep(0.01)\n"
+        "try: search.check()\n"
+        "except KeyboardInterrupt: print('reports'); sys.exit(search.code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (143, "reports\n")
+    assert done.stderr.startswith("jaxtank: terminated, finishing with the best point so far")
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_sigterm_gives_the_best_point_so_far(tmp_path):
+    words = [*LONG, "--starts", "40", "--quiet"]
+    printed, code = interrupted(words, tmp_path / "out", 6, signal.SIGTERM)
+    assert code == 143 and "terminated" in printed and "Traceback" not in printed, printed
+    found = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert found["status"] == "interrupted" and "best point so far" in found["message"]
+    assert not (tmp_path / "out" / files.LOCK).exists()
+
+
 def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     """The first is answered while an evaluation is compiled that takes for ever."""
     code = (

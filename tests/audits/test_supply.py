@@ -41,6 +41,7 @@ IMPORTED = {
         "subprocess",
     ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
     ("tuning.bench.bench", "ctypes"): "and calls it",
+    ("tuning.cli.commands.explore", "webbrowser"): "`explore --open` shows the file it has written",
 }
 
 # Calls that run text, and those that open a file to read it.
@@ -76,6 +77,8 @@ MADE = {
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
+    ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
+    ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -87,6 +90,9 @@ READ = {
     ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.report.html", "style", "read_text"): "page.css of the package",
+    ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
+    ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
+    ("jaxtank.export.whole.arrays", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
@@ -330,7 +336,9 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
         "jaxtank/README.md",
         "tuning/README.md",
     } <= packed
-    assert {n.rsplit(".", 1)[1] for n in packed} == {"py", "c", "css", "md", "txt", "typed"}
+    assert {n.rsplit(".", 1)[1] for n in packed} == {
+        *("py", "c", "css", "html", "js", "md", "txt", "typed")
+    }
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry
 
 

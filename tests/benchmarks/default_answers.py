@@ -27,8 +27,10 @@ from jaxtank.case import Scenario
 from jaxtank.core.tree import get_value, with_values
 from tuning.answer.judged import judge
 from tuning.answer.setting import limited_levels
+from tuning.feasible.offset import least_offsets
 from tuning.problem.scenarios import groups_of, runs_of, values_of
 from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.needs import Needs
 from tuning.uncertainty.plateaus import plateaus_of
 from tuning.uncertainty.sampling import probabilities
 
@@ -44,7 +46,7 @@ ROWS = {
     "mirakhorli/sfc": {},
 }
 
-CORNERS, OFFSETS = 256, 64
+CORNERS, OFFSETS = 256, 256
 
 
 def main():
@@ -99,13 +101,13 @@ def _side(setting, one, asked):
 
 
 def _offsets(setting, case):
-    """How far plants that cannot follow rest from their setpoints, and the least that algebra
-    allows: rms over outputs and plateaus, mean of the plants.
+    """How far from its setpoints a plant stays that cannot hold a plateau, and the least that
+    algebra allows, for each such plateau: Euclidean over the outputs, mean of these plants.
     """
     here = _coarse(setting.replace(searched=case))
     draws = Draws(here.loop, setting.distributions)
     values = draws.values(probabilities("random", draws.dimensions, OFFSETS, 81))
-    least = tuning.least_offset(case, values, setting.case.limits)
+    least = least_offsets(Needs(case, values, setting.case.limits))
     plateaus = plateaus_of(case)
     ramp = float(case.loop.reference.ramp)
     ends = [p.time_s - ramp for p in plateaus[1:]] + [case.clock.duration]
@@ -117,13 +119,17 @@ def _offsets(setting, case):
         return jnp.stack([run.x[row] for row in rows])[:, jnp.array(outputs)]
 
     levels = np.asarray(jax.jit(jax.vmap(one))(values))
-    found = np.sqrt(np.mean((levels - np.array([p.values for p in plateaus])) ** 2, axis=(1, 2)))
+    found = np.linalg.norm(levels - np.array([p.values for p in plateaus]), axis=2)
     cannot = least > 1e-6
-    print(
-        f"    {int(cannot.sum())} of {OFFSETS} plants cannot follow: they rest"
-        f" {found[cannot].mean():.3g} off, at least {least[cannot].mean():.3g}; the others"
-        f" {found[~cannot].mean():.3g}"
-    )
+    for k, plateau in enumerate(plateaus):
+        few = cannot[:, k]
+        if few.sum() > OFFSETS // 10:
+            text = ", ".join(f"{v:g}" for v in plateau.values)
+            print(
+                f"    setpoints {text}: {int(few.sum())} of {OFFSETS} plants cannot hold them and"
+                f" stay {found[few, k].mean():.3g} off, at least {least[few, k].mean():.3g}; the"
+                f" others {found[~few, k].mean():.3g}"
+            )
 
 
 def _coarse(setting):

@@ -270,9 +270,11 @@ def test_simulate_prints_a_table_of_the_same_numbers():
 def test_simulate_writes_the_run(here, gouta):
     printed = done("simulate", CASE, *SHORT, "--out", "deep/out", "--json")
     folder = here / "deep" / "out"
-    assert {p.name for p in folder.iterdir()} == {"result.json", "trajectory.csv", "responses.png"}
+    assert {p.name for p in folder.iterdir()} == {
+        *("result.json", "trajectory.csv", "responses.png", "report.html")
+    }
     assert json.loads((folder / "result.json").read_text(encoding="utf-8")) == printed.json
-    assert all(name in printed.err for name in ("trajectory.csv", "responses.png"))
+    assert all(name in printed.err for name in ("trajectory.csv", "responses.png", "report.html"))
     # writing again is no error
     assert done("simulate", CASE, *SHORT, "--out", "deep/out", "--quiet").err == ""
     assert_picture(folder / "responses.png")
@@ -531,8 +533,9 @@ def test_tune_takes_what_is_free_limited_and_wanted_from_its_options():
 def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
     printed = say(
         "tune",
-        CASE,
-        *SHORT,
+        "cascaded/pi",
+        "--set",
+        "clock.duration=1200",
         *SEARCH,
         "--limit",
         "none",

@@ -45,7 +45,7 @@ def cases():
                 yield pytest.param(full, marks=() if full in QUICK else pytest.mark.slow)
 
 
-@pytest.mark.slow_for("calofir/backstepping", "mirakhorli/sfc")
+@pytest.mark.slow_for("calofir/backstepping", "gouta2022/pi", "mirakhorli/sfc")
 @pytest.mark.parametrize("name", list(cases()))
 def test_slopes_of_the_default_cost(name):
     paper = presets.load(name.split("/")[0])

@@ -373,6 +373,7 @@ J_OF_NOISE = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow_for("pi-ff-values1-0.6635-0.001", "pid-values2-0.8057-0.001")
 @pytest.mark.parametrize(("name", "values", "cost", "share"), J_OF_NOISE)
 def test_cost_with_noise(name, values, cost, share):
     """One draw of 90,000 samples for another: the spread of the noise's mean square is 0.3 % of a

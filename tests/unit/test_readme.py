@@ -13,9 +13,11 @@ import jaxtank
 import tuning as package
 from jaxtank import rig
 from jaxtank.core.errors import InputError
+from jaxtank.measures import MEASURES
 from tuning.cli import main
 from tuning.cli.commands import identification, tuning
 from tuning.cli.parser import parser
+from tuning.problem.problem import Problem
 
 RIG = RIGS / "watertank.toml"
 PAGES = {
@@ -127,10 +129,10 @@ def test_the_python_example_is_tuned(capsys):
 
 def own_controller():
     """The front page's example of a controller of one's own; there are no other examples in Python
-    than its two.
+    than its two, and that of `tuning`.
     """
     _, example = blocks("python", "README.md")
-    assert len(blocks("python")) == 2
+    assert len(blocks("python")) == 3
     return compile(example, "README", "exec")
 
 
@@ -140,6 +142,24 @@ def test_the_controller_of_ones_own_runs(capsys, monkeypatch):
     monkeypatch.setattr(package, "tune", run)
     exec(own_controller(), {"__name__": "README"})
     assert "0.809" in capsys.readouterr().out
+
+
+def test_the_objective_of_ones_own_runs(monkeypatch):
+    """Its last line evaluates the problem once, at a longer step, in place of a search."""
+    (example,) = blocks("python", "tuning/README.md")
+
+    def once(case, **stated):
+        problem = Problem(rig.set_values(case, {"clock.dt": 0.2}), **stated)
+        return problem, problem.point(problem.start())
+
+    monkeypatch.setattr(package, "tune", once)
+    known, here = set(MEASURES), {}
+    exec(compile(example, "tuning/README", "exec"), here)
+    problem, point = here["result"]
+    assert list(problem.objective) == ["absolute_error"] and point.finite
+    assert [limit.label for limit in problem.limits][-1] == "fastest_change"
+    for name in set(MEASURES) - known:
+        del MEASURES[name]
 
 
 @pytest.mark.slow

@@ -88,7 +88,9 @@ def tune(
         tune.
     scenarios : tuple of Scenario, () for the case's own run alone.
     risk : "mean", "cvar" (the mean of the worst 5 %) or "worst" of the costs of the scenarios.
-    choices : {static name: [values]}, each combination of which is tuned, the best taken.
+    choices : {static name: [values]}, each combination of which is tuned, the best taken;
+        {"controller.kind": ["pid", "lqi"]} tunes each of these controllers with gains and ranges of
+        its own.
     starts : local searches, 8 if nominal; else at most 4, until two agree.
     seed : of the Sobol points, the plants and the sensor noise.
     screening : number of Sobol points (64); nominal only.

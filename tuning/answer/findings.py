@@ -12,6 +12,7 @@ limit-not-certified              the safety filter is on, and a limit is not pro
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
 input-total-variation            the inputs change much more per sample than before
+sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
 constraints-tightened            limits were tightened for the search, to hold on other plants
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
@@ -30,6 +31,9 @@ from tuning.problem.wording import numbered
 from tuning.search.result import Message, TuningResult
 
 Found = Iterator[Message]
+
+PEAK = 2.0
+"""Sensitivity peak above which a loop that became less robust is reported [-]."""
 
 BUSIER = 20.0
 """Growth of the rms change of the inputs per sample above which it is reported [-]."""
@@ -136,6 +140,17 @@ def _busier(result, answer) -> Found:
         )
 
 
+def _less_robust(result, answer) -> Found:
+    peaks = [float(m.get("sensitivity_peak", np.nan)) for m in answer.measures.values()]
+    if len(peaks) == 2 and peaks[1] > max(PEAK, 1.05 * peaks[0]):
+        words = "unstable" if np.isinf(peaks[1]) else f"{peaks[1]:.3g}, {peaks[0]:.3g} before"
+        yield Message(
+            "sensitivity-peak",
+            f"the sensitivity peak of the linearised loop is {words}: --limit"
+            f" sensitivity_peak={PEAK:g} bounds it",
+        )
+
+
 def _assumed(result, answer) -> Found:
     setting = answer.setting
     if setting.assumed:
@@ -157,8 +172,8 @@ def _tightened(result, answer) -> Found:
     if answer.tightened and not all(answer.kept.values()):
         yield Message(
             "constraints-tightened",
-            f"the search tightened every limit by {100 * answer.tightened:.2g} %, so that the"
-            " limits hold on validation plants",
+            f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
+            " hold on validation plants",
         )
 
 
@@ -170,6 +185,7 @@ RULES: tuple[Callable[..., Found], ...] = (
     _certificates,
     _bounds,
     _busier,
+    _less_robust,
     _tightened,
     _assumed,
     _idle,

@@ -14,79 +14,23 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from tuning.answer.answer import Answer
+from tuning.answer.attempts import Task, attempts, values_of
 from tuning.answer.findings import findings_of
-from tuning.answer.judged import FRESH, Judged, judge, matters
+from tuning.answer.judged import FRESH, judge, matters
 from tuning.answer.result import result_of
-from tuning.answer.setting import NEAR, PLANTS, Setting, limited_levels, plants_of, setting_of
-from tuning.answer.stay_put import Found, search_from
+from tuning.answer.setting import NEAR, limited_levels, plants_of, setting_of
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
-from tuning.problem.reported import run_measures
-from tuning.problem.scenarios import noisy, with_noise_drawn
+from tuning.problem.reported import margin_measures, run_measures
+from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
 from tuning.search.verdicts import lost_outputs
 from tuning.storage.evaluation_log import EvaluationLog
 from tuning.storage.fingerprint import fingerprint
-
-ATTEMPTS = 4
-"""Searches at most: with a filter, at the true step, with tightened limits."""
-
-MISLED = 1.5
-"""Ratio of the costs at the true and at the coarse step above which the coarse one misleads [-]."""
-
-TIGHTER = 1.2
-"""Factor on the largest violation by which limits are tightened for the next search [-]."""
-
-
-LEVELS = ("max_level", "overflow_volume")
-"""Measures that a safety filter on levels keeps within their limits."""
-
-
-class _Task:
-    """What was asked for, and what stays the same from one search to the next."""
-
-    def __init__(self, free, plan, samples, progress):
-        self.free, self.plan, self.samples = free, plan, samples
-        self.progress, self.may_filter = progress, True
-        self.cache: Any = None
-
-    def problem(self, setting: Setting, case: Case, limits: Mapping[str, Any]) -> Problem:
-        """Return the problem of the search on the plants of a case."""
-        seed = self.plan["seed"]
-        plants = setting.plants(case, PLANTS, seed)
-        found = Problem(case, self.free, setting.objective, limits, plants, seed)
-        found.groups = [with_noise_drawn(group) for group in found.groups]
-        if self.cache is not None:
-            found.cache, self.cache = self.cache, None
-        return found
-
-    def report(self, problem, unit):
-        """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""
-
-        def report(search):
-            if self.progress is None or not search.history:
-                return
-            best, last = search.best, search.history[-1]
-            self.progress(
-                {
-                    "unit": unit,
-                    "start": search.start,
-                    "starts": self.plan["starts"],
-                    "evaluations": len(search.history),
-                    "cost": last[1],
-                    "violation": last[2],
-                    "best": None if best is None else best.cost,
-                    "best_violation": None if best is None else search.violation(best),
-                    "values": None if best is None else problem.values(best.z),
-                }
-            )
-
-        return report
 
 
 def recommend(
@@ -115,7 +59,7 @@ def recommend(
     if safety_filter is False:
         setting = setting.without_filter()
     plan = {"starts": starts, "iterations": iterations, "seed": seed}
-    task = _Task(free, plan, validation, progress)
+    task = Task(free, plan, validation, progress)
     first = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     first.start()
     _check_functions(setting, first.needed)
@@ -127,12 +71,13 @@ def recommend(
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
-    setting, found, problem, after, tightened, attempt = _attempts(task, setting, near)
-    if attempt:  # the plants that asked for another search do not judge it
+    made = attempts(task, setting, near)
+    setting, found, problem = made.setting, made.found, made.problem
+    if made.attempt:  # the plants that asked for another search do not judge it
         as_given = setting.replace(searched=_as_given(setting))
-        before = judge(as_given, task.samples, seed, round_=attempt)
-    values = _values(problem, found)
-    answer = _answer(setting, before, after, found, problem, values, tightened)
+        before = judge(as_given, task.samples, seed, round_=made.attempt)
+    values = values_of(problem, found)
+    answer = _answer(made, before, values)
     answer = dataclasses.replace(answer, feasibility=_feasibility(setting), mended=mended)
     result = result_of(answer, found, problem, values, validation)
     steps = diagnostics.step_warnings(_own(problem), result.tuned, values)
@@ -170,110 +115,9 @@ def _own(problem):
     return Problem(problem.case, problem.given["free"], problem.objective, {}, ())
 
 
-def _attempts(task, setting, near):
-    """Search until the answer holds on validation plants, or nothing is left to try.
-
-    Returns the setting, the Found and the Problem of the last search, its Judged (None where the
-    search was interrupted), the share by which limits were tightened, and its number, from 0: every
-    search is judged on plants of its own.
-    """
-    coarse, tightened, limits = True, 0.0, _searched_limits(setting, near)
-    last = None
-    for attempt in range(ATTEMPTS):
-        case = setting.coarse() if coarse else setting.searched
-        problem, found = task.problem(setting, case, _tightened(limits, tightened)), Found()
-        try:
-            search_from(problem, task.plan, task.report(problem, setting.cost_unit), found)
-            if found.point is None:
-                return setting, found, problem, None, tightened, 0
-            tuned = _at(setting, _values(problem, found))
-            after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
-        except KeyboardInterrupt:
-            if last is None:
-                found.interrupted = True
-                return setting, found, problem, None, tightened, 0
-            last[1].interrupted = True
-            return last
-        last = (setting, found, problem, after, tightened, attempt)
-        if coarse and case is not setting.searched and _misled(found.point.cost, after):
-            coarse = False
-        elif after.held.all():
-            break
-        elif task.may_filter and setting.filter is None and _levels_broken(after):
-            filtered = setting.with_filter(matters(setting, after, NEAR))
-            limits = dict(setting.case.limits) if filtered is setting else dict(filtered.limits)
-            setting = filtered
-        elif limits and found.search and found.search.violation(found.point) == 0:
-            tightened = TIGHTER * _violation(after, setting) + tightened
-        else:
-            break
-    return last
-
-
-def _searched_limits(setting, near):
-    """Return the limits of the search: those not proved, without levels that stay far below."""
-    limits = dict(setting.limits)
-    if not near.any():
-        limits.pop("max_level", None)
-    return limits
-
-
-def _at(setting, values):
-    """Return the setting with the searched case at `values`."""
-    loop = with_values(setting.searched.loop, values)
-    return setting.replace(searched=setting.searched.replace(loop=loop))
-
-
-def _values(problem, found):
-    """Return {name: value} of the answer; exactly the first value of a gain that stays."""
-    own = problem.own_values()
-    if found.point is None:
-        return own
-    values = problem.values(found.point.z)
-    if np.array_equal(found.point.z, problem.start()):
-        values = dict(own)
-    if found.kept is not None:
-        stays = found.kept if found.idle is None else found.kept | found.idle
-        values |= {n: own[n] for n, same in zip(own, stays) if same}
-    return values
-
-
-def _misled(cost, after: Judged):
-    """Return True if the cost at the true step is another than at the coarse one."""
-    good = ~after.failed
-    if not good.any():
-        return True
-    ratio = float(np.mean(after.cost[good])) / cost if cost > 0 else 1.0
-    return not 1.0 / MISLED < ratio < MISLED
-
-
-def _levels_broken(after):
-    return any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
-
-
-def _violation(after, setting):
-    """Return the largest violation on the validation plants, as a share of its limit [-]."""
-    rows = [r for r in after.worst() if r["margin"] < 0 and abs(r["limit"].value) > 0]
-    shares = [-r["margin"] / abs(r["limit"].value) for r in rows]
-    return min(max(shares, default=0.0), 0.5)
-
-
-def _tightened(limits, share):
-    """Return `limits` tightened by a share of each; "rim" stays where it is."""
-    if not share:
-        return limits
-    found = {}
-    for measure, value in limits.items():
-        if isinstance(value, str):
-            found[measure] = value
-            continue
-        numbers = np.asarray(value, dtype=float)
-        found[measure] = (numbers - share * ms.MEASURES[measure].sense * np.abs(numbers)).tolist()
-    return found
-
-
-def _answer(setting, before, after, found, problem, values, tightened):
+def _answer(made, before, values):
     """Return the Answer: what was judged, on which plants, and the case's own run."""
+    setting, found, problem, after = made.setting, made.found, made.problem, made.after
     own = problem.own_values()
     sides = {"before": setting.case, "after": setting.tuned(values)}
     nominal = {side: _nominal(case, problem.needed) for side, case in sides.items()}
@@ -288,7 +132,7 @@ def _answer(setting, before, after, found, problem, values, tightened):
         agreed=found.agreed,
         lost=_lost(setting, problem, nominal, values),
         idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
-        tightened=tightened,
+        tightened=made.tightened,
         coarse_dt=problem.case.clock.dt,
         measures=nominal,
     )
@@ -302,8 +146,13 @@ def _lost(setting, problem, nominal, values):
 
 
 def _nominal(case, needed):
-    """Return the measures of the case's own run, without noise unless it has some."""
-    return run_measures(case.loop, case.clock, jax.random.key(0) if noisy(case) else None, needed)
+    """Return the measures of the case's own run, without noise unless it has some, and the
+    stability margins of its linearised loop.
+    """
+    key = jax.random.key(0) if noisy(case) else None
+    of_run = [m for m in needed if m not in ms.linear()]
+    found = run_measures(case.loop, case.clock, key, of_run)
+    return found | margin_measures(case.loop, case.clock)
 
 
 def _idle(setting, before, after):

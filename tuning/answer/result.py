@@ -4,7 +4,7 @@ import numpy as np
 
 from tuning.answer.answer import Answer
 from tuning.answer.judged import Judged
-from tuning.answer.stay_put import LINE, Found
+from tuning.answer.stay_put import Found
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.status import Status
@@ -112,11 +112,8 @@ def _parameters(problem, found, values):
 
 
 def _sensitivities(problem, z):
-    """Return the change of the cost [%] for 10 % of each parameter, compiling nothing."""
-    near = diagnostics.neighbours(problem, z)
-    filled = np.concatenate([near, np.repeat(near[:1], -len(near) % LINE, axis=0)])
-    blocks = [problem.screen(zs)[0] for zs in filled.reshape(-1, LINE, len(z))]
-    return diagnostics.sensitivities(np.concatenate(blocks)[: len(near)])
+    """Return the change of the cost [%] for 10 % of each parameter."""
+    return diagnostics.sensitivities(problem.screen(diagnostics.neighbours(problem, z))[0])
 
 
 def _rows(answer: Answer, problem: Problem) -> list[ConstraintRow]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import Search
@@ -28,15 +29,19 @@ AGREE = 0.01
 """Two searches whose costs differ by less than this share agree [-]: the mean of 32 plants is known
 to a few percent."""
 
+AGAIN = 1.25
+"""All gains stay at their first values where that costs less than this many times WORTH: those of
+an earlier answer, which may cost WORTH already, on plants and limits that differ a little [-]."""
+
 TOLERANCE = 1e-4
 """Change of the cost, as a share of its first value, at which a search has converged [-]."""
 
 PROBES = 3
 """Differential evolutions that are tried, at most, until one finds nothing better."""
 
-LINE = 32
-"""Values that are tried between a gain's best and its first value; also the screened points, so
-that one compiled program serves both."""
+LINE, STRIDE = 32, 8
+"""Values that are tried between a gain's best and its first value, also the screened points; and
+how many of these values are run at once."""
 
 MANY = 4
 """Number of parameters from which Gauss-Newton is tried before limits are considered."""
@@ -48,6 +53,8 @@ class Found:
 
     z : (P,) the answer.  kept : (P,) True for gains at their first value.  agreed : True if two
     searches ended within AGREE, or evolution found nothing better.  starts : as in `TuningResult`.
+    slack : (limits,) by how much the first values may violate the limits of the search, in the unit
+    of each; None for nothing.
     """
 
     search: Search | None = None
@@ -55,6 +62,7 @@ class Found:
     z: Any = None
     kept: Any = None
     idle: Any = None
+    slack: Any = None
     agreed: bool = False
     interrupted: bool = False
 
@@ -119,7 +127,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     """
     first = problem.start()
     reference = problem.point(first)
-    problem.check_slopes(reference)
+    check_slopes(problem, reference)
     search = found.search = Search(problem, reference, report, TOLERANCE)
     search.take(reference)
     zs = sobol(LINE, len(first), plan["seed"])
@@ -140,7 +148,7 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     if not found.agreed:
         found.agreed = _confirmed(search, found, Population(zs, costs, margins), plan)
     found.idle = diagnostics.unexercised(problem, search, first)
-    found.z, found.kept = stay_put(search, first, plan["iterations"])
+    found.z, found.kept = stay_put(search, first, plan["iterations"], found.slack)
 
 
 def _local_search(search, found, z, iterations):
@@ -199,7 +207,9 @@ def _agree(starts):
     return len(costs) > 1 and converged and costs[1] <= costs[0] * (1.0 + AGREE)
 
 
-def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+def stay_put(
+    search: Search, first: np.ndarray, iterations: int, slack: Any = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more.
 
     One gain after the other is set back to its value in `first` and the rest searched again. It
@@ -214,7 +224,7 @@ def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.nda
     def good(point):
         return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
 
-    if good(search.point(first)):
+    if _all_stay(search, search.point(first), allowed, slack):
         return first.copy(), ~kept
     # first those whose value costs least by the curvature at the best point
     order = np.argsort(np.diag(best.gauss_newton) * (best.z - first) ** 2, kind="stable")
@@ -227,6 +237,13 @@ def stay_put(search: Search, first: np.ndarray, iterations: int) -> tuple[np.nda
         else:
             z = _towards(search, i, first, z, ceiling, allowed, good)
     return z, kept
+
+
+def _all_stay(search, start, allowed, slack):
+    """Return True if the first values may stay, all of them: see AGAIN and `Found.slack`."""
+    given = start if slack is None else start._replace(margins=start.margins + slack)
+    dearest = search.best.cost + AGAIN * WORTH * abs(search.best.cost)
+    return start.finite and start.cost <= dearest and search.violation(given) <= allowed
 
 
 def _without(search, trial, first, z, iterations):
@@ -243,15 +260,19 @@ def _without(search, trial, first, z, iterations):
 def _towards(search, i, first, z, ceiling, allowed, good):
     """Return z with gain i moved towards its first value as far as the cost stays below `ceiling`.
 
-    All LINE values are run at once: the program of the screening, without derivatives.
+    LINE values at most, a few at once, up to the first that does not fit; without derivatives.
     """
     shares = np.arange(1, LINE + 1) / (LINE + 1)
     line = np.repeat(z[None], LINE, axis=0)
     line[:, i] = z[i] + shares * (first[i] - z[i])
-    costs, margins = search.problem.screen(line)
-    shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
-    fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
-    count = LINE if fits.all() else int(np.argmin(fits))  # all before the first that does not fit
+    count = 0
+    for some in np.split(line, LINE // STRIDE):
+        costs, margins = search.problem.screen(some)
+        shortfall = np.max(-margins / search.limit_scale, axis=1, initial=0.0)
+        fits = np.isfinite(costs) & (costs <= ceiling) & (shortfall <= allowed)
+        count += STRIDE if fits.all() else int(np.argmin(fits))
+        if not fits.all():
+            break
     for k in range(count - 1, -1, -1):
         if good(search.point(line[k])):
             return line[k]

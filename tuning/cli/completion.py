@@ -29,6 +29,7 @@ KINDS = {
     "MEASURE=LOW:HIGH[:N]": "limits",
     "SLOT=HEADER[;UNIT]": "text",
     "CSV": "files",
+    "HTML": "files",
     "CASE": "cases",
     "PAPER": "papers",
     "SHELL": "shells",

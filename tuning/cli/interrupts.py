@@ -3,7 +3,8 @@ imports only what is part of the interpreter; any module of `tuning` may import 
 
 The program ends at once, with exit code 130 or 143 and one line, wherever it is: in an import, in a
 compilation, in a run. Only a search that has found something (`Interrupts`) goes on after the first
-Ctrl-C, to report the best point so far.
+signal, to report the best point so far. SIGINT that is ignored at the start, as of a job that a
+script runs with &, stays ignored; SIGTERM ends such a job.
 """
 
 # `signal` adds enumerations, whose import takes longer than all of this; _signal has no stubs
@@ -15,7 +16,7 @@ import time
 
 SIGNALS = {_signal.SIGINT: b"interrupted", _signal.SIGTERM: b"terminated"}
 
-_searches = []  # the Interrupts that takes SIGINT, if any
+_searches = []  # the Interrupts that takes the signals, if any
 _before = []  # what is called before the process ends
 _leaving = _thread.allocate_lock()
 _watched = []  # True once a thread answers signals
@@ -56,7 +57,7 @@ def _watch(pipe):
     while True:
         for number in os.read(pipe, 64):
             for _ in range(20):  # the main thread stops first, unless it is in native code
-                if _held or (number == _signal.SIGINT and _searches):
+                if _held or _searches:
                     break
                 time.sleep(0.005)
             if number in SIGNALS:
@@ -67,15 +68,15 @@ def _handler(number, _):
     """Hold the main thread while the watching thread ends the process."""
     if not _watched:
         _answer(number)
-    elif number != _signal.SIGINT or not _searches:
+    elif not _searches:
         _held.append(True)
         time.sleep(1.0)
         leave(number)  # the thread is gone, for the interpreter is ending
 
 
 def _answer(number):
-    if number == _signal.SIGINT and _searches:
-        _searches[-1].interrupt()
+    if _searches:
+        _searches[-1].interrupt(number)
     else:
         leave(number)
 
@@ -117,28 +118,35 @@ class before_leaving:
 
 
 class Interrupts:
-    """Ctrl-C of a search: the first one ends it with the best point so far, the second at once.
+    """Ctrl-C or SIGTERM of a search: one ends it with the best point so far, the next at once.
 
     It takes effect from the first `check` on; before that there is no point to report.
     """
 
     def __init__(self):
         self.stop = self.taken = False
+        self.number = _signal.SIGINT
 
-    def interrupt(self, *_):
-        """The handler of SIGINT."""
+    @property
+    def code(self):
+        """Exit code of a search that was stopped: 130 after SIGINT, 143 after SIGTERM."""
+        return 128 + self.number
+
+    def interrupt(self, number=_signal.SIGINT, *_):
+        """The handler of a signal."""
         if self.stop:
-            leave(words=b"stopped at once")
-        self.stop = True
-        say(b"interrupted, finishing with the best point so far (Ctrl-C again stops at once)")
+            leave(number, b"stopped at once")
+        self.stop, self.number = True, number
+        again = b"Ctrl-C again" if number == _signal.SIGINT else b"a second signal"
+        say(SIGNALS[number] + b", finishing with the best point so far (%b stops at once)" % again)
 
     def check(self, *_):
-        """Take SIGINT; raise KeyboardInterrupt once it has come."""
+        """Take the signals; raise KeyboardInterrupt once one has come."""
         if not self.taken:
             self.taken = True
-            if _signal.getsignal(_signal.SIGINT) is _handler:
+            if any(_signal.getsignal(number) is _handler for number in SIGNALS):
                 _searches.append(self)
-            elif _in_main_thread():
+            elif _signal.getsignal(_signal.SIGINT) != _signal.SIG_IGN and _in_main_thread():
                 _signal.signal(_signal.SIGINT, self.interrupt)
         if self.stop:
             raise KeyboardInterrupt

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done (and every limit holds), 1 internal error, 2 bad input (one line, nothing
 written), 3 not converged, 4 a limit is violated (`attack`: passed), 5 bad data file,
-130 interrupted (the best point so far of a search is written and printed), 143 terminated. Nothing
+130 interrupted, 143 terminated (the best point so far of a search is written and printed). Nothing
 heavy is imported before the arguments are read.
 """
 

@@ -4,7 +4,7 @@ Imports nothing heavy, so that --help is quick.
 """
 
 from tuning.cli.arguments import Parser, shared
-from tuning.cli.commands import case, falsification, identification, studies, tools, tuning
+from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
 
 
 def parser():
@@ -26,6 +26,6 @@ def parser():
     )
     top.add_argument("--version", action="store_true", help="print the version and exit")
     commands, parents = top.add_subparsers(dest="command", metavar="COMMAND"), shared()
-    for module in (case, tuning, studies, falsification, identification, tools):
+    for module in (case, explore, tuning, studies, falsification, identification, tools):
         module.add(commands, parents)
     return top

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank import rig
 from jaxtank.case import Case
-from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.errors import InputError
 from jaxtank.rig.values import with_models
 from tuning.feasible.mends import DESIGN, KINDS, TARGET, find_mends
 from tuning.feasible.offset import least_offsets
@@ -241,7 +241,7 @@ def apply_mend(
     (True, 'rims')
     """
     if kind not in KINDS:
-        raise unknown("mend", str(kind), KINDS)
+        raise InputError(f"unknown mend {str(kind)!r}: must be one of {', '.join(KINDS)}")
     if kind == "ramps":
         mend = mended_ramp(case if limits is None else case.replace(limits=limits))
         needed = ""

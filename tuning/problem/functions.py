@@ -7,15 +7,18 @@ Imported by `problem` and by what takes an objective or limits: `search`, `answe
 # pyright: reportUnknownMemberType=false
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, cast
+
+import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import program_of
-from jaxtank.rig.entry import is_finite
+from tuning.problem.point import Point
 from tuning.storage.fingerprint import digest
 
 UNNAMED = "own_objective"
@@ -88,7 +91,11 @@ class Constraint:
     def __post_init__(self) -> None:
         if (self.upper is None) == (self.lower is None):
             raise InputError(f"constraint {self.name}: must have either upper or lower")
-        if not is_finite(self.limit, 0):
+        try:
+            finite = not isinstance(self.limit, bool) and math.isfinite(self.limit)
+        except (TypeError, OverflowError):
+            finite = False
+        if not finite:
             raise InputError(
                 f"constraint {self.name}: limit {shortened(self.limit)} must be a finite number"
                 f" [{self.unit}]"
@@ -137,10 +144,11 @@ def as_measures(objective: Any, limits: Any, taken: Iterable[str] = ()) -> tuple
 
 def _weights(objective: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
     """Return {measure: weight} of an objective, its functions entered in `found`."""
-    terms: Any = objective.items() if isinstance(objective, Mapping) else [(objective, 1.0)]
+    table = isinstance(objective, Mapping)
+    terms: Any = cast(Any, objective).items() if table else [(objective, 1.0)]
     weights: dict[str, Any] = {}
     for term, weight in terms:
-        if isinstance(term, str) and isinstance(objective, Mapping):
+        if isinstance(term, str) and table:
             name = term
         else:
             own = term if isinstance(term, Objective) else _of_function(term)
@@ -164,18 +172,19 @@ def _of_function(term: Any) -> Objective:
 def _limited(limits: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
     """Return {measure: limit} of limits, their functions entered in `found`."""
     if isinstance(limits, Mapping):
-        return dict(limits)
-    several: Any = [limits] if isinstance(limits, Constraint) else limits
-    if not isinstance(several, list | tuple):
+        return dict(cast(Any, limits))
+    if not isinstance(limits, list | tuple | Constraint):
         raise InputError(
             f"limits = {shortened(limits)}: must be {{measure: value}}, a tuning.Constraint, or a"
             " list of both"
         )
     limited: dict[str, Any] = {}
-    for entry in several:
-        if isinstance(entry, Constraint):
-            entry = {_enter(entry.name, entry.measure, found): entry.limit}
-        if not isinstance(entry, Mapping):
+    several = cast(Any, [limits] if isinstance(limits, Constraint) else limits)
+    for one in several:
+        entry: Any = one
+        if isinstance(one, Constraint):
+            entry = {_enter(one.name, one.measure, found): one.limit}
+        elif not isinstance(one, Mapping):
             raise InputError(
                 f"limits: {shortened(entry)} must be {{measure: value}} or a tuning.Constraint"
             )
@@ -210,3 +219,20 @@ def digests(loop: ClosedLoop, clock: Any, names: Iterable[str]) -> dict[str, Any
     own = ms.functions(names)
     found = {name: digest(program_of(loop, clock, name)) for name in own}
     return {"functions": found} if found else {}
+
+
+def check_slopes(problem: Any, point: Point) -> None:
+    """Raise InputError for a function of the user's whose derivative at the start is NaN.
+
+    problem : the Problem. point : its Point at the starting values.
+    """
+    if not np.isfinite(point.cost):
+        return
+    bad = [*ms.functions(problem.objective)] if np.isnan(point.gradient).any() else []
+    measured = zip(problem.limits, point.margin_slopes)
+    bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
+    for name in ms.functions(bad):
+        raise InputError(
+            f"function {name}: its derivative by {', '.join(problem.names)} is not a number at the"
+            " starting values, as of a root or a quotient at 0"
+        )

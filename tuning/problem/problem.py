@@ -9,7 +9,6 @@ Imported by `search`, and as `tuning.Problem`.
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxtank import measures as ms
@@ -20,6 +19,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.functions import check_functions
 from jaxtank.rig import check_objective
 from tuning.problem import scenarios as sc
+from tuning.problem.blocks import Blocks, in_blocks
 from tuning.problem.bounds import bounds
 from tuning.problem.functions import as_measures
 from tuning.problem.limits import UNDEFINED_MARGIN, Limit, limit_scale, resolve_in
@@ -55,10 +55,9 @@ class Problem:
     ----------
     case : the Case.
     free : {name: (low, high) or Free}; the case's own where None, as for the next three.
-    objective : {measure: weight}; a measure with several entries counts with their sum. A function
-        of one's own may stand in the place of a measure, or alone (`tuning.Objective`).
-    limits : {measure: value}, as in `resolve_limits`; every limit must hold in every scenario. With
-        functions of one's own a list: [{measure: value}, tuning.Constraint(...)].
+    objective : {measure: weight}; a measure with several entries counts with their sum. Also a
+        function of one's own, or a `tuning.Objective`, alone or in the place of a measure.
+    limits : as in `resolve_limits`, or a list with `tuning.Constraint`s; of every scenario.
     scenarios : tuple of Scenario, () for the case's own run alone.
     seed : of the sensor noise, which is the same for every evaluation (common random numbers).
     cache : an EvaluationCache of what was evaluated before.
@@ -105,33 +104,21 @@ class Problem:
         self.limit(limits)
         self.cache = EvaluationCache() if cache is None else cache
         self.simulations, self.gradients, self.non_finite = 0, 0, 0
+        self.blocks = Blocks(len(self.runs))
 
     def limit(self, limits: Any) -> None:
         """Replace the limits by `limits`, as in `resolve_limits`.
 
         The evaluation cache holds margins of the former limits, and is emptied."""
         self.given["limits"] = limits
-        limits = as_measures(None, limits, self.objective)[1]
-        self.limits: list[Limit] = resolve_in(self.runs, limits)
+        _, named = as_measures(None, limits, self.objective)
+        self.limits: list[Limit] = resolve_in(self.runs, named)
         self.limit_scales: Floats = np.array([limit_scale(x, self.loop) for x in self.limits])
         self.needed = tuple(
             dict.fromkeys([*self.objective, *(limit.measure for limit in self.limits)])
         )
         check_functions(self.loop, self.clock, self.needed)
         self.cache = EvaluationCache()
-
-    def check_slopes(self, point: Point) -> None:
-        """Raise InputError for a function of the user's whose derivative at a Point is NaN."""
-        if not np.isfinite(point.cost):
-            return
-        bad = [*ms.functions(self.objective)] if np.isnan(point.gradient).any() else []
-        measured = zip(self.limits, point.margin_slopes)
-        bad += [limit.measure for limit, slope in measured if np.isnan(slope).any()]
-        for name in ms.functions(bad):
-            raise InputError(
-                f"function {name}: its derivative by {', '.join(self.names)} is not a number at the"
-                " starting values, as of a root or a quotient at 0"
-            )
 
     @property
     def names(self) -> list[str]:
@@ -209,11 +196,17 @@ class Problem:
         """
         zs = np.asarray(zs, dtype=float)
         self.simulations += len(zs) * len(self.runs)
-        found = self.cache.recall("screen", [zs, coarse], lambda: self._screen(zs, coarse))
+        samples = max(group.clock.samples for group in self.groups) // (sc.COARSE if coarse else 1)
+        size = self.blocks.size(len(zs), coarse, samples)
+        found = self.cache.recall(
+            "screen",
+            [zs, coarse],
+            lambda: in_blocks(lambda some: self._screen(some, coarse), zs, size),
+        )
         return found[0].copy(), found[1].copy()
 
     def _screen(self, zs: Floats, coarse: bool) -> tuple[Floats, Floats]:
-        points = {b.name: jnp.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
+        points = {b.name: np.asarray(b.from_unit(zs[:, i])) for i, b in enumerate(self.bounds)}
         tables, broken = [self._per_run() for _ in zs], np.zeros(len(zs), dtype=bool)
         for group in self.groups:
             clock = sc.screening_clock(group.clock) if coarse else group.clock
@@ -301,7 +294,7 @@ class Problem:
         table, slopes, matrices, diverged = *(self._per_run() for _ in range(3)), False
         for group in groups:
             measures, rates, curvature, broken = self._run(group, values)
-            diverged = diverged or bool(np.any(broken))
+            diverged = diverged or bool(np.asarray(broken).any())
             for j, i in enumerate(group.runs):
                 table[i] = {m: np.asarray(v)[j] for m, v in measures.items()}
                 slopes[i] = {

@@ -50,6 +50,14 @@ class Result(Shown):
         """Return matplotlib figures {name: Figure} of what there is to show."""
         return self._report().figures(self)
 
+    def explore(self) -> Any:
+        """Return the live page of the result's case, a `tuning.live.shown.LivePage`: of a tuned one
+        with its values before and after. A notebook shows it, and `.save(path)` writes it.
+
+        Raises InputError for a case that cannot be run in a browser.
+        """
+        return importlib.import_module("tuning.live.shown").of_result(self)
+
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths.
 

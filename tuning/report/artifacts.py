@@ -10,7 +10,7 @@ from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.loop import run as lp
-from jaxtank.loop.trajectory import csv
+from jaxtank.loop.trajectory import csv, stride
 from tuning.report.figures import failed
 from tuning.report.tables import dumps
 
@@ -35,11 +35,7 @@ def rig_text(case):
 
 def run_for_people(case, key=None, rows=3000):
     """A Trajectory of about `rows` rows, as host arrays."""
-    steps = case.clock.samples - 1
-    least = max(1, steps // rows)
-    # an odd stride, so that a pump that chatters from sample to sample is not drawn as one that
-    # is constant; one that ends at the end, if any
-    every = next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
+    every = stride(case.clock.samples, rows)
     run = lp.simulate(case.loop, case.clock, key, save_every=every)
     return jax.tree.map(np.asarray, run)
 
@@ -98,9 +94,10 @@ def write_result(folder, files, draw, page=None, stale=()):
     return written + write_folder(folder, more | pngs(drawn))
 
 
-def save_run(case, run, payload, folder, gif=False):
+def save_run(case, run, payload, folder, gif=False, page=None):
     """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to
-    `folder`, from which the run.gif of an earlier one is removed.
+    `folder`, from which the run.gif of an earlier one is removed; page: function of the pictures
+    that returns report.html.
     """
     from jaxtank.plots import responses
 
@@ -108,12 +105,14 @@ def save_run(case, run, payload, folder, gif=False):
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
-    stale = [Path(folder) / name for name in ("responses.png", "run.gif")] if old else []
+    names = ("responses.png", "run.gif", "report.html")
+    stale = [Path(folder) / name for name in names] if old else []
     written = write_result(
         folder,
         files,
         lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)},
-        stale=stale,
+        page,
+        stale,
     )
     if gif:
         from jaxtank.plots.animation import animate

@@ -1,7 +1,7 @@
 """One HTML page of a result, and the HTML that a notebook shows; imported by the reports.
 
 A page is self-contained: pictures are inside as SVG, nothing is fetched from the network, there is
-no script, and every text of the user is escaped.
+no script but that of the live page in its frame, and every text of the user is escaped.
 """
 
 import html
@@ -81,6 +81,7 @@ def document(
     command=None,
     provenance=None,
     files=None,
+    live="",
 ):
     """Return the whole page as text; the same arguments give the same bytes.
 
@@ -106,12 +107,16 @@ def document(
         {name: value}.
     files : dict or None
         {name: text} to be unfolded.
+    live : str
+        Element with the live page (`tuning.report.panel`), "" for none.
     """
     body = [f"<h1>{escape(title)}</h1>", f"<p>{escape(subtitle)}</p>" if subtitle else ""]
     body.append(f'<p class="status{"" if good else " warn"}">{escape(status)}</p>')
     if facts:
         cells = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
         body.append(f'<dl class="facts">{"".join(cells)}</dl>')
+    if live:  # wider than the text
+        body += ["</header>", *_chapter("Move its parameters", [live]), "<main>"]
     body += _chapter("In words", [_list(sentences)] if sentences else [])
     body += _chapter("Pictures", [_figure(*picture) for picture in pictures])
     body += _chapter("Numbers", [_part(p) for p in _grouped(parts)])
@@ -126,7 +131,8 @@ def document(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>\n<main>",
+            f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>",
+            "<header>" if live else "<main>",
             *filter(None, body),
             "</main>\n</body>\n</html>\n",
         ]

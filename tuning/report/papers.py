@@ -22,6 +22,7 @@ from jaxtank.presets.paper import Claim
 from tuning.problem.scenarios import noisy
 from tuning.report import artifacts, figures, tables
 from tuning.report.html import document, drawings
+from tuning.report.panel import panel
 
 QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
 
@@ -216,6 +217,7 @@ def save(pages, folder, command=None):
             parts,
             command,
             {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
+            live="\n".join(panel(next(iter(presets.load(p).cases.values()))) for p in pages),
         )
 
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]

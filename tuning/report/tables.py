@@ -73,11 +73,7 @@ def reasons(measures):
 def _why(measure, values):
     """Why entries of a measure are not finite, each cause once; "" where all are finite."""
     spec, values = ms.MEASURES[measure], np.ravel(np.asarray(values, dtype=float))
-    causes = {
-        i: spec.nan_holds if np.isnan(v) and spec.nan_holds else spec.undefined
-        for i, v in enumerate(values)
-        if not np.isfinite(v)
-    }
+    causes = {i: spec.cause(float(v)) for i, v in enumerate(values) if not np.isfinite(v)}
     if len(set(causes.values())) < 2:
         return next(iter(causes.values()), "")
     return ", ".join(f"{spec.per} {i + 1}: {why}" for i, why in causes.items())

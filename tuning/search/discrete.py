@@ -1,4 +1,5 @@
-"""Discrete choices (a number of Laguerre terms, a pairing) by enumeration: the best is taken.
+"""Discrete choices (a number of Laguerre terms, a pairing, the controller) by enumeration: the best
+is taken.
 
 Imported by `tuner`, which it calls through its argument.
 """
@@ -6,17 +7,23 @@ Imported by `tuner`, which it calls through its argument.
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtank import rig
-from jaxtank.core.errors import InputError
+from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.tree import split_index
+from jaxtank.rig.components import ROLES
 from tuning.problem.bounds import bounds
+from tuning.problem.controllers import NAMES, with_kind
+from tuning.problem.status import Status
 from tuning.search.result import Message, TuningResult
 from tuning.storage.evaluation_log import NAME
 
 MANY = 64
 """Combinations that are tried at most."""
+
+UNFIT = "does not fit"
+"""Status of a combination that the rig cannot have."""
 
 
 def tune_choices(
@@ -37,7 +44,9 @@ def tune_choices(
     Parameters
     ----------
     tune : what is called for each combination, with `options`.
-    choices : {static name: [values]}.
+    choices : {static name: [values]}; "controller.kind" (or "law.kind", as the table of a rig file
+        is called) is the controller, each kind with its own gains and ranges (`with_kind`). A kind
+        that the rig cannot have is a row of `choices` that says why.
     checkpoint : folder with a log of its own for every combination, which resume=True continues.
 
     Raises
@@ -50,42 +59,105 @@ def tune_choices(
             f"--resume: {str(checkpoint)!r} holds no checkpoint to continue: there is no choice_1"
         )
     results: list[tuple[dict[str, Any], TuningResult]] = []
-    for i, (values, variant) in enumerate(variants):
+    rows: list[dict[str, Any]] = []
+    for i, variant in enumerate(variants):
+        if variant.case is None:
+            rows.append(_row(variant, UNFIT, None, None, reason=variant.why))
+            continue
         folder = None if checkpoint is None else _folder(checkpoint, i)
         old = resume and folder is not None and (folder / NAME).exists()
-        results.append((values, tune(variant, method, checkpoint=folder, resume=old, **options)))
-    rows = [
-        {
-            "values": values,
-            "status": str(r.status),
-            "objective": {k: r.objective[k] for k in ("before", "after")},
-            "parameters": {n: p["after"] for n, p in r.parameters.items()},
-        }
-        for values, r in results
-    ]
+        own = options | {"free": variant.free}
+        result = tune(variant.case, method, checkpoint=folder, resume=old, **own)
+        results.append((variant.values, result))
+        after = {n: p["after"] for n, p in result.parameters.items()}
+        before, now = (result.objective[side] for side in ("before", "after"))
+        rows.append(_row(variant, str(result.status), before, now, after))
+        if result.status == Status.INTERRUPTED:
+            break
     chosen, best = min(results, key=lambda found: _rank(found[1]))
     text = ", ".join(f"{n} = {v}" for n, v in chosen.items())
-    first = Message("best-of-choices", f"best of {len(rows)} choices: {text}")
-    return best.replace(choices=rows, messages=(first, *best.messages))
+    first = Message("best-of-choices", f"best of {len(results)} choices: {text}")
+    unfit = [Message("choice-does-not-fit", f"{_words(v)}: {v.why}") for v in variants if v.why]
+    return best.replace(choices=rows, messages=(first, *best.messages, *unfit))
+
+
+class Variant(NamedTuple):
+    """One combination of choices: its case and what is free in it, or why there is none."""
+
+    values: dict[str, Any]
+    case: Any
+    free: Any
+    why: str = ""
+
+
+def _words(variant):
+    return ", ".join(f"{n} = {v}" for n, v in variant.values.items())
+
+
+def _row(variant, status, before, after, parameters=None, reason=None):
+    """Return the row of one combination in a result."""
+    return {
+        "values": variant.values,
+        "status": status,
+        "objective": {"before": before, "after": after},
+        "parameters": parameters or {},
+        "reason": reason,
+    }
 
 
 def _variants(case, choices, free):
-    """Return [(values, Case)] of all combinations. Raises InputError for one that cannot be."""
+    """Return the Variants of all combinations. Raises InputError for one that cannot be."""
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
             raise InputError(f"choices {name}: must be a list of values to try")
+    combinations = list(itertools.product(*choices.values()))
+    if len(combinations) > MANY:
+        raise InputError(f"choices: {len(combinations)} combinations, must be at most {MANY}")
+    kinds = [name for name in choices if name in NAMES]
+    if len(kinds) > 1:
+        raise InputError(f"choices {kinds[1]}: is {kinds[0]} by another name; leave one out")
+    found = [_variant(case, dict(zip(choices, c)), kinds, free) for c in combinations]
+    if all(variant.case is None for variant in found):
+        raise InputError(f"choices: none fits the rig; {_words(found[0])}: {found[0].why}")
+    fitting = [variant.case for variant in found if variant.case is not None]
+    for name in free or {}:
+        if kinds and not any(rig.has(variant.loop, name) for variant in fitting):
+            bounds(fitting[0].loop, {name: free[name]})  # raises, with the nearest name
+    return found
+
+
+def _variant(case, values, kinds, free):
+    """Return the Variant of one combination."""
+    rest = {name: value for name, value in values.items() if name not in kinds}
+    if kinds:
+        kind = values[kinds[0]]
+        if kind not in ROLES["law"].classes:
+            raise unknown("controller kind", str(kind), ROLES["law"].classes)
+        try:
+            case = with_kind(case, kind)
+        except InputError as error:
+            return Variant(values, None, None, str(error))
+        free = _free_of(case, free)
     taken = {split_index(b.name)[0] for b in bounds(case.loop, case.free if free is None else free)}
-    for name in choices:
+    for name in rest:
         if split_index(name)[0] in taken:
             raise InputError(
                 f"choices {name}: is free, and cannot be chosen as well; leave it out of one of"
                 " them"
             )
-    combinations = list(itertools.product(*choices.values()))
-    if len(combinations) > MANY:
-        raise InputError(f"choices: {len(combinations)} combinations, must be at most {MANY}")
-    named = [dict(zip(choices, c)) for c in combinations]
-    return [(values, rig.check(rig.set_values(case, values))) for values in named]
+    return Variant(values, rig.check(rig.set_values(case, rest)), free)
+
+
+def _free_of(case, free):
+    """Return what is free in a case with another controller: of `free` what it has, and its own
+    ranges where that leaves the controller without any.
+    """
+    if free is None:
+        return None
+    found = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}
+    if any(name.startswith("controller.") for name in found):
+        return found
+    return {n: f for n, f in case.free.items() if n.startswith("controller.")} | found
 
 
 def _folder(checkpoint, i):

@@ -34,6 +34,7 @@ support-scenarios                violations on validation plants that were to be
 screened-at-true-step            screening points were unstable at the coarse step only
 non-finite-points                trial points gave non-finite numbers
 best-of-choices                  which discrete choice is best (`choices=`)
+choice-does-not-fit              a discrete choice that the rig cannot have, and why
 no-rig-file                      no rig file describes the case (`save`)
 ===============================  =============================================================
 """

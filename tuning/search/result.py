@@ -337,5 +337,4 @@ def _reason(limit: Limit, value: float) -> str | None:
     """Return why the value of a limited measure is not a finite number; None where it is."""
     if np.isfinite(value):
         return None
-    spec = ms.MEASURES[limit.measure]
-    return spec.nan_holds if np.isnan(value) and spec.nan_holds else spec.undefined
+    return ms.MEASURES[limit.measure].cause(value)

@@ -32,6 +32,11 @@ MUCH = 1e12
 CROSSED = 0.9
 """Share of the parameters that a member of the differential evolution takes from its move [-]."""
 
+AFFORDED = 2**23
+"""Samples of all runs of a screening up to which it is done at the true step: faster than to
+compile what finds out whether the coarse one misleads.
+"""
+
 LARGEST_STATE = 60
 """Numbers in the loop's state above which its stability is not computed: eigenvalues cost their
 cube.
@@ -126,29 +131,22 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 def screen(problem, count, seed):
     """Return (zs, costs, margins, redone) of `count` Sobol points.
 
-    zs (points, P), costs (points,), margins (points, limits). Points that the coarse step alone
-    makes unstable, or whose coarse run is not finite, are run again at the true step; `redone`
-    counts the first.
+    zs (points, P), costs (points,), margins (points, limits). At the true step where all runs have
+    few samples. Else at a coarse step: points that this step alone makes unstable, or whose coarse
+    run is not finite, are run again at the true step; `redone` counts the first.
     """
     zs = sobol(count, len(problem.bounds), seed)
-    clock = screening_clock(problem.clock)
-    costs, margins = problem.screen(zs, coarse=True)
-    unstable = np.zeros(count, dtype=bool)
+    clock, unstable = screening_clock(problem.clock), np.zeros(count, dtype=bool)
+    if count * len(problem.runs) * problem.clock.samples <= AFFORDED:
+        clock = problem.clock
+    costs, margins = problem.screen(zs, coarse=clock != problem.clock)
     if clock != problem.clock:
         unstable = (spectral_radius(problem, zs, clock) > 1.0) & ~(
             spectral_radius(problem, zs, problem.clock) > 1.0
         )
         suspect = unstable | ~np.isfinite(costs)
         if suspect.any():
-            # always the same number of points, so that one compiled program serves every search
-            again = np.concatenate(
-                [zs[suspect], np.repeat(zs[suspect][:1], count - suspect.sum(), axis=0)]
-            )
-            true_costs, true_margins = problem.screen(again)
-            costs[suspect], margins[suspect] = (
-                true_costs[: suspect.sum()],
-                true_margins[: suspect.sum()],
-            )
+            costs[suspect], margins[suspect] = problem.screen(zs[suspect])
     return zs, costs, margins, int(unstable.sum())
 
 

@@ -16,7 +16,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from tuning.problem.functions import as_measures, digests
+from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.reported import run_measures, table_of
@@ -248,7 +248,7 @@ def _check_start(problem, before, first):
             )
     if ms.functions(problem.needed):  # before anything is written
         cache = problem.cache
-        problem.check_slopes(problem.point(first))
+        check_slopes(problem, problem.point(first))
         problem.cache, problem.simulations, problem.gradients = cache, 0, 0
 
 

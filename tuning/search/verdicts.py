@@ -3,9 +3,11 @@
 Imported by `tuner` and `messages`.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxtank.core.tree import with_values
@@ -92,13 +94,21 @@ def _suspect(run, before, after) -> set[int]:
     """Return the outputs (from 0) whose measures give a reason to compare their trajectories."""
     suspect = np.asarray(after["rms_error"]) > WORSE * np.asarray(before["rms_error"])
     if suspect.any():
-        setpoints = run.case.loop.reference.sample(run.case.clock)[0]
+        setpoints, _ = _followed(run.case.loop, run.case.clock)
         size = np.array([float(np.max(np.abs(v))) for v in setpoints])
         suspect &= np.asarray(after["rms_error"]) > 0.5 * OFF * size
     for measure in ("settling_time", "recovery_time"):
         if measure in before:
             suspect |= np.isposinf(after[measure]) & ~np.isposinf(before[measure])
     return set(map(int, np.flatnonzero(suspect)))
+
+
+@functools.partial(jax.jit, static_argnames="clock")
+def _followed(loop: Any, clock: Any) -> Any:
+    """Return (setpoints of all samples, windows of their changes): one program, not one for each of
+    some eighty operations.
+    """
+    return loop.reference.sample(clock)[0], windows(loop, clock)
 
 
 def _distances(run, values, i) -> list[tuple[float, float]]:
@@ -117,8 +127,8 @@ def _farthest(loop, clock, key, i) -> tuple[float, float]:
     """
     every = max(1, clock.samples // SAVED)
     errors = np.asarray(lp.simulate(loop, clock, key, save_every=every).e)[:, i]
-    setpoint = np.asarray(loop.reference.sample(clock)[0][i])[::every][: len(errors)]
-    found = windows(loop, clock)
+    setpoints, found = _followed(loop, clock)
+    setpoint = np.asarray(setpoints[i])[::every][: len(errors)]
     target, step = (
         (setpoint, 0 * setpoint)
         if found is None

@@ -1,5 +1,6 @@
 """The default answer of `tune`: what it minimises, where it stays, how it is judged and printed."""
 
+import dataclasses
 import json
 
 import jax
@@ -202,6 +203,9 @@ class Bowl:
             (2 * w * d)[None],
         )
 
+    def check_slopes(self, point):
+        assert np.isfinite(point.gradient).all()
+
     def screen(self, zs, coarse=False):
         return np.array([self.point(z).cost for z in zs]), np.zeros((len(zs), 0))
 
@@ -318,3 +322,24 @@ def test_an_interrupted_search_gives_its_best_gains(case):
     assert "not yet validated" in str(result)
     assert result.objective["after"] != result.objective["after"]  # NaN: not known
     assert result.to_json()["objective"]["after"] is None
+
+
+def test_an_interrupt_keeps_the_answer_of_an_earlier_search_that_was_judged(case, monkeypatch):
+    """A judgement that is not held leads to another search; Ctrl-C comes as that one is judged."""
+    options = dict(safety_filter=False, validation=24, starts=2, limits={"max_level": 2.62})
+    whole, calls = tuning.tune(case, **options), []
+
+    def judged(*given, **keywords):
+        calls.append(given)
+        if len(calls) > 1:
+            raise KeyboardInterrupt
+        return dataclasses.replace(judge(*given, **keywords), held=np.zeros(24, dtype=bool))
+
+    monkeypatch.setattr("tuning.answer.attempts.judge", judged)
+    result = tuning.tune(case, **options)
+    assert len(calls) == 2, "there was a second search"
+    assert result.status == "interrupted" and result.answer.after is not None
+    assert {n: result[n].after for n in result} == {n: whole[n].after for n in whole}
+    np.testing.assert_array_equal(result.answer.after.cost, whole.answer.after.cost)
+    words = "these are the best gains so far, of the search before this one"
+    assert words in " ".join(str(result).split())

@@ -37,3 +37,23 @@ def test_its_program_holds_no_loop():
     """The loops of jax's own generator are what it avoids."""
     text = jax.jit(lambda key: normal(key, (4, 64))).lower(jax.random.key(0)).as_text()
     assert "while" not in text and "threefry" not in text
+
+
+def test_the_noise_of_a_run_drawn_in_its_loop_is_that_drawn_before():
+    """Deviates that are given, as the tuner gives them, against those drawn sample by sample."""
+    import jaxtank
+    from jaxtank import presets, rig
+    from jaxtank.loop.run import evaluate_compiled
+
+    case = presets.find("cascaded/pi")
+    case = rig.set_values(case, {"clock.duration": 400.0, "sensor.noise": [0.1, 0.2]})
+    key = jax.random.key(3)
+    names = ("rms_error_total", "max_level")
+    given = jnp.stack(case.loop.sensor.draw(key, case.clock.samples))
+    before, there = (
+        evaluate_compiled(case.loop, case.clock, names, k, False)[0] for k in (given, key)
+    )
+    for name in names:
+        np.testing.assert_array_equal(before[name], there[name])
+    run = jaxtank.simulate(case.loop, case.clock, key=key)
+    np.testing.assert_array_equal(there["max_level"], run.x.max(axis=0))

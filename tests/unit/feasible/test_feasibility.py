@@ -10,7 +10,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.tree import get_value, with_values
+from jaxtank.core.tree import get_value, parameters, with_values
+from tuning.answer.setting import setting_of
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
 
@@ -179,6 +180,31 @@ def test_the_shortest_ramps_hold_the_limits_and_shorter_ones_do_not():
     assert high[0] <= 30.0 < high[1]
 
 
+@pytest.mark.parametrize("kind", ["rims", "orifices"])
+def test_a_mended_case_has_the_safety_filter_of_its_new_design(kind):
+    """Equal to that of a case on which the changed values are set before the filter is designed."""
+    filtered = CASE.with_safety_filter()
+    mended, mend = tuning.apply_mend(filtered, kind, samples=512)
+    fresh = rig.set_values(CASE, {**dict(mend.set), **_of_models(mend)}).with_safety_filter()
+    found, before = mended.loop.safety_filter, filtered.loop.safety_filter
+    for name, value in parameters(fresh.loop.safety_filter).items():
+        np.testing.assert_array_equal(parameters(found)[name], value, err_msg=name)
+    old = parameters(before)
+    assert any(not np.array_equal(old[n], v) for n, v in parameters(found).items()), "another one"
+    assert setting_of(mended).filter is not None
+    searched = setting_of(mended).searched.loop.safety_filter
+    np.testing.assert_array_equal(searched.limit, found.limit)
+
+
+def _of_models(mend):
+    """The values of the controller's model that follow those of the plant."""
+    return {
+        name.replace("plant.", "controller.model."): value
+        for name, value in mend.set.items()
+        if name.startswith("plant.")
+    }
+
+
 def test_a_case_that_needs_no_mend_is_left_as_it_is():
     case = presets.find("cascaded/pi")
     found = tuning.feasibility(case, samples=64)
@@ -191,7 +217,10 @@ def test_a_case_that_needs_no_mend_is_left_as_it_is():
 @pytest.mark.parametrize(
     "call, words",
     [
-        (lambda: tuning.apply_mend(CASE, "setpoint"), "nearest: setpoints"),
+        (
+            lambda: tuning.apply_mend(CASE, "setpoint"),
+            "one of setpoints, rims, orifices, pumps, ramps",
+        ),
         (
             lambda: tuning.apply_mend(CASE, "pumps", samples=256),
             "no change of its pumps alone was found",

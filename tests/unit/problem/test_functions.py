@@ -188,6 +188,19 @@ def test_a_function_has_the_optimum_of_the_measure_that_it_repeats(watertank):
     assert own.optimality["kkt_residual"] < 1e-3
 
 
+@pytest.mark.slow
+def test_bfgs_ends_where_gauss_newton_does_on_gouta2015():
+    """Without limits; the optimum is flat along k, so that the gains are less certain."""
+    case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1})
+    options = dict(limits={}, starts=2, screening=16, validation=0)
+    own = tuner.tune(case, objective=root_mean_square, **options)
+    other = tuner.tune(case, objective={"rms_error_total": 1.0}, **options)
+    assert (own.method, other.method) == ("slsqp", "trf")
+    assert own.success and other.success
+    assert own.objective["after"] == pytest.approx(other.objective["after"], rel=1e-4)
+    assert own["controller.k1"].after == pytest.approx(other["controller.k1"].after, rel=1e-2)
+
+
 def test_an_own_constraint_is_active_at_the_least_cost_of_a_grid_that_keeps_it(watertank):
     """One gain: 400 values of it, run one beside the other, without the tuner."""
     limit, low, high = 60.0, 0.5, 20.0

@@ -52,7 +52,7 @@ def test_backstepping_on_tracking_error_alone(gouta):
 
 @pytest.fixture(scope="module")
 def limited(gouta):
-    return tuning.tune(gouta("backstepping"), nominal=True)
+    return tuning.tune(gouta("backstepping"), nominal=True, starts=2, screening=32)
 
 
 def test_backstepping_under_the_rims(gouta, limited):
@@ -238,6 +238,7 @@ def test_results_stay_in_the_box_and_are_never_worse_than_the_start(gouta):
     assert all(np.all((np.array(h[3]) >= 0) & (np.array(h[3]) <= 1)) for h in result.history)
 
 
+@pytest.mark.slow  # of a smaller rig: test_verdicts.py, what is missed is told in full
 def test_limits_that_cannot_be_met_are_told(gouta):
     result = quick(gouta, limits={"max_level": 5.0}, starts=1)
     assert not result.success and result.status == "infeasible"

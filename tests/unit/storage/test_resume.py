@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import tuning
+from jaxtank import presets, rig
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
 from tuning.storage import batch_store, evaluation_log
 from tuning.storage.evaluation_log import NAME, EvaluationCache, EvaluationLog
 
-FAST = {"clock.dt": 0.1, "clock.duration": 300.0}
 OPTIONS = {"starts": 2, "screening": 8, "validation": 8}
 SAME = (
     "parameters",
@@ -32,6 +32,11 @@ SAME = (
 )
 
 
+def case(values=None):
+    """A small one: what is stored does not depend on the rig."""
+    return rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 1200.0, **(values or {})})
+
+
 def reported(result):
     from tuning.report.tuned import report
 
@@ -40,74 +45,59 @@ def reported(result):
 
 
 @pytest.fixture(scope="module")
-def whole(gouta, tmp_path_factory):
+def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    return (
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=folder, **OPTIONS),
-        (folder / NAME).read_bytes(),
-    )
+    return (tuning.tune(case(), nominal=True, log=folder, **OPTIONS), (folder / NAME).read_bytes())
 
 
-def test_with_and_without_a_log_alike(gouta, whole):
-    assert reported(tuning.tune(gouta("backstepping", FAST), nominal=True, **OPTIONS)) == reported(
-        whole[0]
-    )
+def test_with_and_without_a_log_alike(whole):
+    assert reported(tuning.tune(case(), nominal=True, **OPTIONS)) == reported(whole[0])
 
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
-def test_a_log_cut_anywhere_is_gone_on_with(gouta, whole, tmp_path, share):
+def test_a_log_cut_anywhere_is_gone_on_with(whole, tmp_path, share):
     data = whole[1]
     (tmp_path / NAME).write_bytes(data[: int(share * len(data))])
     kept = data[: int(share * len(data))].count(b"\n")
-    result = tuning.tune(
-        gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS
-    )
+    result = tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     assert reported(result) == reported(whole[0])
     assert (tmp_path / NAME).read_bytes() == data and kept < data.count(b"\n")
 
 
-def test_what_is_in_the_log_is_not_run_again(gouta, whole, tmp_path, monkeypatch):
+def test_what_is_in_the_log_is_not_run_again(whole, tmp_path, monkeypatch):
     (tmp_path / NAME).write_bytes(whole[1])
     monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
     assert reported(
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     ) == reported(whole[0])
 
 
-def test_a_log_of_another_problem_is_refused_and_kept(gouta, whole, tmp_path):
+def test_a_log_of_another_problem_is_refused_and_kept(whole, tmp_path):
     (tmp_path / NAME).write_bytes(whole[1])
     with pytest.raises(InputError, match="of another problem; what differs: seed"):
-        tuning.tune(
-            gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS
-        )
+        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, seed=1, **OPTIONS)
     with pytest.raises(InputError, match="what differs: loop"):
         tuning.tune(
-            gouta("backstepping", {**FAST, "controller.k": 0.031}),
-            nominal=True,
-            log=tmp_path,
-            resume=True,
-            **OPTIONS,
+            case({"controller.Kc": [1.4]}), nominal=True, log=tmp_path, resume=True, **OPTIONS
         )
     assert (tmp_path / NAME).read_bytes() == whole[1]
     with pytest.raises(InputError, match="holds no checkpoint to continue"):
-        tuning.tune(
-            gouta("backstepping", FAST), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS
-        )
+        tuning.tune(case(), nominal=True, log=tmp_path / "none", resume=True, **OPTIONS)
 
 
 @pytest.mark.parametrize("text", [b"hello\n", b"[1]\n", b'{"jaxtank": 1}\n', b"\xff\xfe\n"])
-def test_what_is_no_log_is_refused(gouta, tmp_path, text):
+def test_what_is_no_log_is_refused(tmp_path, text):
     (tmp_path / NAME).write_bytes(text)
     with pytest.raises(InputError, match="not a log"):
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
     assert (tmp_path / NAME).read_bytes() == text
 
 
-def test_a_broken_line_inside_is_refused(gouta, whole, tmp_path):
+def test_a_broken_line_inside_is_refused(whole, tmp_path):
     lines = whole[1].splitlines(keepends=True)
     (tmp_path / NAME).write_bytes(b"".join([*lines[:3], b"{}\n", *lines[3:]]))
     with pytest.raises(InputError, match="line 4"):
-        tuning.tune(gouta("backstepping", FAST), nominal=True, log=tmp_path, resume=True, **OPTIONS)
+        tuning.tune(case(), nominal=True, log=tmp_path, resume=True, **OPTIONS)
 
 
 @pytest.mark.parametrize(

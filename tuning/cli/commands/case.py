@@ -26,13 +26,18 @@ def add(commands, parents):
     one = commands.add_parser(
         "simulate",
         parents=[common, case, run],
-        help="one run: measures; with --out its trajectory and pictures",
+        help="one run: measures; with --out its trajectory, pictures and a page",
     )
     one.set_defaults(run=simulate)
     one.add_argument(
         "--gif",
         action="store_true",
         help="with --out also run.gif, the tanks of the rig filling and emptying",
+    )
+    one.add_argument(
+        "--margins",
+        action="store_true",
+        help="also the stability margins of the linearised loop at each plateau of the reference",
     )
     _add_init(commands, [common, case])
     _add_export(commands, [common, case])
@@ -112,15 +117,18 @@ def simulate(args):
     import jax
 
     from jaxtank.loop import run, step_size
+    from jaxtank.loop.margins import stability_margins
     from tuning.problem import provenance, reported
     from tuning.problem.scenarios import noisy
-    from tuning.report import artifacts, tables
+    from tuning.report import artifacts, margin_tables, run_page, tables
     from tuning.report import case as manual
 
     key = jax.random.key(seed) if noisy(case) else None
     if step_size.step_warnings(case.loop, case.clock):
         step_size.check_run(case.loop, case.clock, run.simulate(case.loop, case.clock, key))
     values = dict(reported.run_measures(case.loop, case.clock, key))
+    plateaus = stability_margins(case.loop, case.clock) if args.margins else ()
+    values |= reported.margin_measures(case.loop, case.clock) if args.margins else {}
     payload = {
         "case": case.name,
         "measures": tables.measures_json(values),
@@ -130,16 +138,22 @@ def simulate(args):
         "parameters": tables.clean(run.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
+    if args.margins:
+        payload["margins"] = margin_tables.json_of(plateaus)
     written = []
     if args.out:
         trajectory = artifacts.run_for_people(case, key)
-        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif)
+        made = payload["provenance"]
+        page = lambda drawn: run_page.page_of(case, values, drawn, args.line, made)
+        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page)
     if args.json:
         print(tables.dumps(payload))
     else:
         print(f"{case.name}: {case.title}\n\n{tables.measure_table(values, case.loop.units)}")
         for line in tables.undefined(values):
             print(line)
+        if args.margins:
+            print(f"\n{margin_tables.text(case.loop, plateaus)}")
         if case.loop.safety_filter is not None:
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
     report_written(written, args)

@@ -130,7 +130,7 @@ def _identify(args, case, free):
         discard(args.out)  # the result is complete: the checkpoint is not needed
     report_written(written, args)
     _report_next(args, found, free, written)
-    return STATUS["interrupted" if interrupts.stop else found.status]
+    return interrupts.code if interrupts.stop else STATUS[found.status]
 
 
 def _check_data_given(args):

@@ -28,7 +28,9 @@ CODES = """exit codes:
   2    bad input: one line on stderr, nothing written
   3    not converged
   4    a limit is violated
-  130  interrupted: the best point so far is printed and written"""
+  130  interrupted (Ctrl-C): the best point so far is printed and written
+  143  terminated (SIGTERM): the same; so ends a job that a script runs with &, which ignores
+       Ctrl-C. A second signal stops at once; --resume DIR goes on where either stopped"""
 
 EXIT = {"converged": 0, "not_converged": 3, "infeasible": 4, "interrupted": 130}
 
@@ -66,7 +68,10 @@ def _add_problem(one):
         'a run to tune for, as "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value'
         " of the case); replaces those of the case; none: the case's own run",
     )
-    text = "a static number or text to try the values of"
+    text = (
+        "a static number or text to try the values of; controller.kind=pid,lqi: the controllers"
+        " that a rig file may name, each with gains and ranges of its own"
+    )
     repeatable(one, "--choose", "NAME=V1,V2", text)
     text = "validation plants (default 256; --nominal: 64, 0 for none)"
     option(one, "--validation", "N", text)
@@ -149,7 +154,7 @@ def _tune(args):
     result = _besides(args, case, result, task, sweep, progress)
     args.out = folder
     _finish(args, result)
-    return EXIT["interrupted" if progress.stop else result.status]
+    return progress.code if progress.stop else EXIT[result.status]
 
 
 def _task(args, case, seed) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
+from tuning.report.panel import panel
 from tuning.storage.batch_store import remove_batches
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
@@ -264,6 +265,7 @@ def page_of(ensemble, drawn, command=None):
         lines(ensemble),
         command,
         provenance.provenance(ensemble.case, ensemble.seed),
+        live=panel(ensemble),
     )
 
 

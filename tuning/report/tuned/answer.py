@@ -139,6 +139,7 @@ def _effects(answer):
         *_able(answer, sides, unit),
         [f"error, nominal plant [{unit}]", *(number(e, 3) for e in answer.nominal.values())],
     ]
+    rows += _margins(answer)
     if answer.setting.own_objective:
         rows.insert(0, [_objective_words(answer), *(_mean(s.cost, s) for s in sides)])
     if answer.before.limits:
@@ -153,6 +154,21 @@ def _effects(answer):
     )
     heads = ["what it gives", "before", "now"]
     return table(rows, heads[: 1 + len(sides)])
+
+
+def _margins(answer):
+    """The rows of the sensitivity peak and the delay margin of the linearised nominal loop."""
+    sides = [m for m in answer.measures.values() if "sensitivity_peak" in m]
+    if not sides or not any(np.isfinite(m["sensitivity_peak"]) for m in sides):
+        return []
+    peaks = [float(m["sensitivity_peak"]) for m in sides]
+    delays = [float(np.min(m["delay_margin"])) for m in sides]
+    cells = ["unstable" if p == np.inf else number(p, 3) for p in peaks]
+    rows = [["sensitivity peak Ms, nominal plant [-]", *cells]]
+    if any(np.isfinite(delays)):
+        cells = ["any" if d == np.inf else number(d, 3) for d in delays]
+        rows.append(["delay margin, nominal plant [s]", *cells])
+    return rows
 
 
 def _objective_words(answer):

@@ -9,6 +9,7 @@ from jaxtank.core.files import check_folder
 from jaxtank.loop.trajectory import csv
 from tuning.report import html
 from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
+from tuning.report.panel import panel
 from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
 from tuning.report.tuned import answer
 from tuning.report.tuned.figures import CAPTIONS, figures, result_key
@@ -99,6 +100,7 @@ def page_of(result, drawn, command=None):
         command,
         result.provenance,
         {"The tuned rig as a file (rig.toml)": rig} if rig else None,
+        panel(result),
     )
 
 

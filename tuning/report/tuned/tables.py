@@ -285,12 +285,13 @@ def _choice_table(result):
         [
             ", ".join(f"{n} = {v}" for n, v in c["values"].items()),
             c["status"],
-            number(c["objective"]["before"]),
-            number(c["objective"]["after"]),
+            *("-" if v is None else number(v) for v in c["objective"].values()),
         ]
         for c in result.choices
     ]
-    return [table(rows, ["choice", "status", "objective before", "after"]), ""]
+    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    sides = [f"objective {side} [{unit}]" for side in ("before", "after")]
+    return [table(rows, ["choice", "status", *sides]), ""]
 
 
 def _tradeoff_table(result):

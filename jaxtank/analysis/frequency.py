@@ -1,0 +1,211 @@
+"""Frequency response of a sampled open loop, without LAPACK: it vmaps, and runs on any device.
+
+Imports jax only; imported by `analysis.margins`.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+RADIUS = 1e-7
+"""How far outside the unit circle encirclements are counted: a growth below it is none [-]."""
+
+SQUARINGS = 40
+"""A matrix is raised to the power 2^SQUARINGS to find its spectral radius."""
+
+
+class OpenLoop(NamedTuple):
+    """L(z) = C (z I - A)^-1 B z^-dead, the loop broken at its m inputs; closed with u = -L u.
+
+    A (n, n), B (n, m), C (m, n): one sample of `dt` [s]; dead: samples of dead time, a whole
+    number known when a program is compiled.
+
+    Examples
+    --------
+    >>> one = jnp.eye(1)
+    >>> OpenLoop(0.9 * one, one, 0.5 * one, dead=0, dt=1.0).dead
+    0
+    """
+
+    A: Any
+    B: Any
+    C: Any
+    dead: int
+    dt: Any
+
+
+def solve(M: Any, rhs: Any) -> Any:
+    """Return M^-1 rhs for M (n, n), real or complex, and rhs (n, k); Gauss with partial pivoting.
+
+    Not finite where M is singular.
+
+    Examples
+    --------
+    >>> solve(jnp.array([[0.0, 2.0], [1.0, 0.0]]), jnp.array([[4.0], [3.0]])).ravel().tolist()
+    [3.0, 2.0]
+    """
+    n, index = M.shape[0], np.arange(M.shape[0])
+
+    def eliminate(k, T):
+        size = jnp.where(index >= k, _size(T[:, k]), -1.0)
+        j = jnp.argmax(size)
+        first, other = T[k], T[j]
+        T = T.at[j].set(first).at[k].set(other / other[k])
+        return T - jnp.where(index == k, 0.0, T[:, k])[:, None] * T[k]
+
+    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([M, rhs], axis=1))[:, n:]
+
+
+def _size(value):
+    """A size of complex numbers that costs no root."""
+    return jnp.abs(jnp.real(value)) + jnp.abs(jnp.imag(value))
+
+
+def is_stable(A: Any) -> Any:
+    """Return True if the spectral radius of A (n, n) is at most 1, to 1e-9.
+
+    By repeated squaring: the logarithm of |A^(2^k)|, divided by 2^k.
+
+    Examples
+    --------
+    >>> bool(is_stable(jnp.array([[0.5, 9.0], [0.0, -0.99]]))), bool(is_stable(jnp.eye(1) * 1.01))
+    (True, False)
+    """
+
+    def square(_, state):
+        P, log, power = state
+        P, power = P @ P, 0.5 * power
+        size = jnp.sqrt(jnp.sum(P * P))
+        size = jnp.where(size > 0.0, size, 1.0)
+        return P / size, log + power * jnp.log(size), power
+
+    start = (A, jnp.zeros((), A.dtype), jnp.ones((), A.dtype))
+    P, log, _ = jax.lax.fori_loop(0, SQUARINGS, square, start)
+    return jnp.any(P != 0.0) & (log <= 1e-9) | ~jnp.any(P != 0.0)
+
+
+def hessenberg(loop: OpenLoop) -> OpenLoop:
+    """Return the same loop with A in Hessenberg form, by Householder's reflections (Laub 1981).
+
+    Examples
+    --------
+    >>> A = jnp.arange(9.0).reshape(3, 3)
+    >>> found = hessenberg(OpenLoop(A, jnp.ones((3, 1)), jnp.ones((1, 3)), 0, 1.0))
+    >>> abs(float(found.A[2, 0])) < 1e-6
+    True
+    """
+    index = np.arange(loop.A.shape[0])
+
+    def reflect(k, state):
+        H, B, C = state
+        x = jnp.where(index > k, H[:, k], 0.0)
+        size = jnp.sqrt(jnp.sum(x * x))
+        v = x + jnp.where(index == k + 1, jnp.where(x[k + 1] < 0.0, -size, size), 0.0)
+        square = jnp.sum(v * v)
+        scaled = v * jnp.where(square > 0.0, 2.0 / jnp.where(square > 0.0, square, 1.0), 0.0)
+        H = H - scaled[:, None] * (v @ H)
+        return (
+            H - (H @ v)[:, None] * scaled,
+            B - scaled[:, None] * (v @ B),
+            C - (C @ v)[:, None] * scaled,
+        )
+
+    H, B, C = jax.lax.fori_loop(0, max(len(index) - 2, 0), reflect, (loop.A, loop.B, loop.C))
+    return loop._replace(A=H, B=B, C=C)
+
+
+def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
+    """Return (L (F, m, m), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form.
+
+    Examples
+    --------
+    >>> one = jnp.eye(1)
+    >>> L, det = response(OpenLoop(0.5 * one, one, one, 1, 1.0), jnp.array([2.0 + 0j]))
+    >>> round(float(L[0, 0, 0].real), 4), round(float(det[0].real), 4)
+    (0.3333, 0.75)
+    """
+    H, B, C, dead, _ = loop
+    n, F = H.shape[0], z.shape[0]
+    eye = jnp.eye(n, dtype=z.dtype)
+
+    def row(k):
+        left = z[:, None] * eye[k] - H[k]
+        return jnp.concatenate([left, jnp.broadcast_to(B[k], (F, B.shape[1]))], axis=1)
+
+    def eliminate(state, k):
+        now, det = state
+        after = row(k + 1)
+        swap = (_size(after[:, k]) > _size(now[:, k]))[:, None]
+        pivot, other = jnp.where(swap, after, now), jnp.where(swap, now, after)
+        now = other - (other[:, k] / pivot[:, k])[:, None] * pivot
+        det = det * pivot[:, k] / z * jnp.where(swap[:, 0], -1.0, 1.0)
+        return (now, det), pivot
+
+    start = (row(0), jnp.ones(F, z.dtype))
+    (last, det), rows = jax.lax.scan(eliminate, start, jnp.arange(n - 1))
+    det = det * last[:, n - 1] / z
+    rows = jnp.concatenate([rows, last[None]])
+
+    def substitute(X, k):
+        row = rows[k]
+        known = jnp.einsum("fj,fjm->fm", row[:, :n], X)
+        return X.at[:, k].set((row[:, n:] - known) / row[:, k, None]), None
+
+    zero = jnp.zeros((F, n, B.shape[1]), z.dtype)
+    X = jax.lax.scan(substitute, zero, jnp.arange(n - 1, -1, -1))[0]
+    return jnp.einsum("in,fnm->fim", C, X) * (z**-dead)[:, None, None], det
+
+
+class Held(NamedTuple):
+    """X = (z I - A)^-1 B (K, n, m) and Y = C (z I - A)^-1 (K, m, n), without derivatives."""
+
+    X: Any
+    Y: Any
+
+
+def held(loop: OpenLoop, w: Any) -> Held:
+    """Return what `near` needs at frequencies w (K,) [rad/s].
+
+    Examples
+    --------
+    >>> one = jnp.eye(1)
+    >>> held(OpenLoop(0.9 * one, one, 0.5 * one, 0, 1.0), jnp.array([0.5])).X.shape
+    (1, 1, 1)
+    """
+    (A, B, C), w = jax.lax.stop_gradient((loop[:3], w))
+
+    def one(w):
+        M = jnp.exp(1j * w * loop.dt) * jnp.eye(A.shape[0]) - A
+        both = jnp.stack([M, M.T])
+        widest = max(B.shape[1], C.shape[0])
+        pad = lambda v: jnp.pad(v.astype(M.dtype), ((0, 0), (0, widest - v.shape[1])))
+        X, Y = jax.vmap(solve)(both, jnp.stack([pad(B), pad(C.T)]))
+        return Held(X[:, : B.shape[1]], Y[:, : C.shape[0]].T)
+
+    return jax.vmap(one)(w)
+
+
+def near(loop: OpenLoop, held: Held, w: Any) -> Any:
+    """Return L (K, m, m) at frequencies w (K,) [rad/s] next to those of `held`, to second order,
+    with first derivatives by the loop and w.
+
+    C X + Y (B - (z I - A) X) has the value of C X and the derivatives of L: no system is solved
+    for each of many directions.
+
+    Examples
+    --------
+    >>> one, w = jnp.eye(1), jnp.array([0.5])
+    >>> loop = lambda a: OpenLoop(a * one, one, one, 0, 1.0)
+    >>> L = lambda a: near(loop(a), held(loop(a), w), w)[0, 0, 0].real
+    >>> exact = (1.0 / (np.exp(0.5j) - 0.3) ** 2).real
+    >>> bool(abs(float(jax.grad(L)(0.3)) - exact) < 1e-5)
+    True
+    """
+    A, B, C, dead, dt = loop
+    z = jnp.exp(1j * w * dt)
+    X, Y = held
+    left = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
+    L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, left)
+    return L * jnp.exp(-1j * w * dt * dead)[:, None, None]

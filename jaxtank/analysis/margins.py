@@ -1,0 +1,284 @@
+"""Stability margins of a sampled open loop: sensitivity peak, gain, phase and delay margin.
+
+Imports `analysis.frequency`; may be imported by every folder above.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.analysis import frequency as fr
+from jaxtank.analysis.frequency import OpenLoop
+
+POINTS = 224
+"""Frequencies of the grid, evenly spaced in their logarithm."""
+
+DELAYED = 96
+"""Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
+
+TURN = 50.0
+
+LOWEST = 1e-7
+"""Lowest frequency of the grid, as a share of the Nyquist frequency [-]."""
+
+ZOOMS, ZOOM = 5, 15
+"""A bracket on the grid is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
+
+
+class Margins(NamedTuple):
+    """Margins of a loop with m inputs; inf where nothing crosses, and all of them only if `stable`.
+
+    Gain, phase and delay margin are of one input at a time, with the other loops closed.
+    """
+
+    stable: Any  # True if the closed loop is stable
+    sensitivity_peak: Any  # Ms: largest singular value of S = (I + L)^-1 over all frequencies [-]
+    gain_margin: Any  # (m,) least factor, up or down, on the gain that makes the loop unstable [-]
+    phase_margin: Any  # (m,) least change of the phase, either way, that does [deg]
+    delay_margin: Any  # (m,) least additional dead time that does [s]
+    peak_frequency: Any  # where the sensitivity peaks [rad/s]
+    gain_frequency: Any  # (m,) where the phase is -180 deg [rad/s]
+    phase_frequency: Any  # (m,) where the gain is 1, for the phase margin [rad/s]
+    delay_frequency: Any  # (m,) the same for the delay margin [rad/s]
+
+
+def margins(loop: OpenLoop) -> Margins:
+    """Return the Margins of a loop, with derivatives of the margins by A, B and C.
+
+    The sensitivity peak and every crossover are bracketed on a grid of frequencies and narrowed
+    down. The derivative is that at the frequency found: a peak does not move to first order, and
+    a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
+    negative L counts as a crossover of the phase.
+
+    Parameters
+    ----------
+    loop : OpenLoop
+
+    Returns
+    -------
+    Margins
+
+    Examples
+    --------
+    A sampled integrator L = 0.5/(z - 1): 1 + k L is zero at z = -1 for k = 4.
+
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> one = jnp.eye(1)
+    >>> found = margins(OpenLoop(one, 0.5 * one, one, 0, 1.0))
+    >>> bool(found.stable), round(float(found.gain_margin[0]), 4)
+    (True, 4.0)
+    """
+    still = jax.lax.stop_gradient(loop._replace(dead=0))._replace(dead=loop.dead)
+    form = fr.hessenberg(still)
+    w = _grid(still)
+    L, _ = fr.response(form, jnp.exp(1j * w * loop.dt))
+    brackets = _brackets(w, L)
+    stop = jax.lax.stop_gradient(brackets.low)
+    found = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets)))
+    return _values(loop, still, brackets._replace(low=stop), found, _is_stable(still, form))
+
+
+def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
+    """True if the closed loop is stable; with a dead time by the number of its unstable poles: the
+    winding of its characteristic polynomial, as a share of z^degree, along |z| = 1 + RADIUS.
+    """
+    if still.dead == 0:
+        return fr.is_stable(still.A - still.B @ still.C)
+    slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
+    angles = jnp.concatenate([slow, _grid(still) * still.dt])
+    L, det = fr.response(form, (1.0 + fr.RADIUS) * jnp.exp(1j * angles))
+    turning = det * _det(jnp.eye(L.shape[1]) + L)
+    turns = jnp.sum(jnp.angle(turning[1:] / turning[:-1])) / np.pi
+    # near z = 1 and at -1 the polynomial is real, so that the lower half mirrors the upper one
+    return jnp.abs(turns) < 0.5
+
+
+def _grid(loop: OpenLoop) -> Any:
+    """Frequencies [rad/s] from LOWEST to the Nyquist frequency, in increasing order."""
+    nyquist = np.pi / loop.dt
+    found = nyquist * jnp.exp(jnp.linspace(np.log(LOWEST), 0.0, POINTS))
+    if not loop.dead:
+        return found
+    most = min(TURN / (loop.dead * np.pi), 1.0)
+    even = nyquist * jnp.linspace(0.0, most, DELAYED + 2)[1:-1]
+    return jnp.sort(jnp.concatenate([found, even]))
+
+
+def _det(M: Any) -> Any:
+    """Determinants of M (F, m, m)."""
+    m = M.shape[1]
+    if m == 1:
+        return M[:, 0, 0]
+    if m == 2:
+        return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
+    inner = M[:, 1:, 1:] - M[:, 1:, :1] * M[:, :1, 1:] / M[:, :1, :1]
+    return M[:, 0, 0] * _det(inner)
+
+
+def _sensitivity(L: Any) -> Any:
+    """S = (I + L)^-1 (F, m, m)."""
+    M = jnp.eye(L.shape[1]) + L
+    if L.shape[1] == 1:
+        return 1.0 / M
+    if L.shape[1] == 2:
+        rows = [[M[:, 1, 1], -M[:, 0, 1]], [-M[:, 1, 0], M[:, 0, 0]]]
+        return jnp.stack([jnp.stack(r, -1) for r in rows], -2) / _det(M)[:, None, None]
+    return jax.vmap(lambda M: fr.solve(M, jnp.eye(M.shape[0], dtype=M.dtype)))(M)
+
+
+def _alone(S: Any) -> Any:
+    """(F, m) open loops of one input each, with the others closed: 1/S_ii - 1."""
+    diagonal = jnp.diagonal(S, axis1=1, axis2=2)
+    return 1.0 / diagonal - 1.0
+
+
+def _largest_gain(S: Any) -> Any:
+    """(F,) largest singular values: closed form up to two inputs, else 30 steps of the power
+    method, whose result is a lower bound.
+    """
+    m, square = S.shape[1], jnp.sum(jnp.abs(S) ** 2, axis=(1, 2))
+    if m == 1:
+        return jnp.sqrt(square)
+    if m == 2:
+        inside = square**2 - 4.0 * jnp.abs(_det(S)) ** 2
+        return jnp.sqrt(0.5 * (square + jnp.sqrt(jnp.maximum(inside, 0.0))))
+    return jnp.sqrt(jax.vmap(lambda S: _pair(S)[2])(S))
+
+
+def _pair(S: Any) -> tuple[Any, Any, Any]:
+    """(u, v, sigma^2) of the largest singular value of S (m, m), by squaring S^H S."""
+    P = jnp.conj(S).T @ S
+
+    def square(_, P):
+        P = P @ P
+        return P / jnp.sqrt(jnp.sum(jnp.abs(P) ** 2))
+
+    P = jax.lax.fori_loop(0, 30, square, P / jnp.sqrt(jnp.sum(jnp.abs(P) ** 2)))
+    v = P[:, jnp.argmax(jnp.real(jnp.diagonal(P)))]
+    v = v / jnp.sqrt(jnp.sum(jnp.abs(v) ** 2))
+    u = S @ v
+    size = jnp.sum(jnp.abs(u) ** 2)
+    return u / jnp.sqrt(size), v, size
+
+
+class _Brackets(NamedTuple):
+    """Where to look, of the sensitivity peak, then of the m phase crossovers, the m gain crossovers
+    of the phase margins and those of the delay margins: (1 + 3 m,) each.
+    """
+
+    low: Any  # logarithm of a frequency [rad/s]
+    high: Any
+    exists: Any  # False where nothing crosses
+    inside: Any  # False for an end of the grid, which is no bracket
+
+
+def _brackets(w: Any, L: Any) -> _Brackets:
+    """Brackets of all that is looked for, from L (F, m, m) on the grid w (F,)."""
+    log, S = jnp.log(w), _sensitivity(L)
+    gain, alone = _largest_gain(S), _alone(S)
+    k = jnp.argmax(gain)
+    last = len(w) - 1
+    found = [(log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), last > 0)]
+    rows = ([], [], [])
+    for i in range(L.shape[1]):
+        one = alone[:, i]
+        before, after = one[:-1], one[1:]
+        rows[0].append(_phase_crossover(log, one))
+        size = jnp.log(jnp.maximum(jnp.abs(one), 1e-300))
+        crosses = (size[:-1] < 0.0) != (size[1:] < 0.0)
+        share = size[:-1] / jnp.where(crosses, size[:-1] - size[1:], 1.0)
+        middle = before + share * (after - before)
+        angle = jnp.angle(middle)
+        for row, worst in (
+            (1, jnp.pi - jnp.abs(angle)),
+            (2, jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) / jnp.exp(0.5 * (log[1:] + log[:-1]))),
+        ):
+            j = jnp.argmin(jnp.where(crosses, worst, jnp.inf))
+            rows[row].append((log[j], log[j + 1], jnp.any(crosses), True))
+    found += [bracket for row in rows for bracket in row]
+    return _Brackets(*(jnp.stack([jnp.asarray(v) for v in column]) for column in zip(*found)))
+
+
+def _phase_crossover(log: Any, one: Any) -> tuple[Any, Any, Any, Any]:
+    """Bracket of the crossover of the phase of L (F,) whose gain is nearest to 1."""
+    up, re = jnp.imag(one), jnp.real(one)
+    crosses = (up[:-1] < 0.0) != (up[1:] < 0.0)
+    share = up[:-1] / jnp.where(crosses, up[:-1] - up[1:], 1.0)
+    there = re[:-1] + share * (re[1:] - re[:-1])
+    crosses = crosses & (there < 0.0) & (re[:-1] < 0.0) & (re[1:] < 0.0)
+    # the Nyquist frequency, and the lowest one where L is real there
+    ends = jnp.stack([re[0], re[-1]])
+    real = (ends < 0.0) & (jnp.abs(jnp.stack([up[0], 0.0 * up[-1]])) < 1e-3 * jnp.abs(ends))
+    apart = jnp.concatenate([jnp.where(crosses, there, -jnp.inf), jnp.where(real, ends, -jnp.inf)])
+    apart = jnp.abs(jnp.log(jnp.maximum(-apart, 1e-300)))
+    j, last = jnp.argmin(apart), len(log) - 1
+    end = j >= last
+    where = jnp.where(j == last, 0, last)
+    low = jnp.where(end, log[where], log[jnp.minimum(j, last)])
+    high = jnp.where(end, log[where], log[jnp.minimum(j + 1, last)])
+    return low, high, jnp.isfinite(apart[j]), ~end
+
+
+def _crossing(L: Any) -> Any:
+    """(F, 1 + 3m) of L (F, m, m): the gain of S, then what is zero at each crossover."""
+    S = _sensitivity(L)
+    alone = _alone(S)
+    size = jnp.log(jnp.maximum(jnp.abs(alone), 1e-300))
+    return jnp.concatenate([_largest_gain(S)[:, None], jnp.imag(alone), size, size], axis=1)
+
+
+def _narrowed(form: OpenLoop, brackets: _Brackets) -> Any:
+    """Logarithms of the frequencies in the brackets, narrowed ZOOMS times; all in one call."""
+    count = brackets.low.shape[0]
+    index = np.arange(count)
+
+    def zoom(_, ends):
+        low, high = ends
+        log = low[:, None] + (high - low)[:, None] * jnp.linspace(0.0, 1.0, ZOOM)  # (count, ZOOM)
+        L, _ = fr.response(form, jnp.exp(1j * form.dt * jnp.exp(jnp.ravel(log))))
+        values = _crossing(L).reshape(count, ZOOM, count)[index, :, index]
+        k = jnp.argmax(values[0])
+        first = jnp.argmax((values[:, :-1] < 0.0) != (values[:, 1:] < 0.0), axis=1)
+        left = first.at[0].set(jnp.maximum(k - 1, 0))
+        right = (first + 1).at[0].set(jnp.minimum(k + 1, ZOOM - 1))
+        return log[index, left], log[index, right]
+
+    low, high = jax.lax.fori_loop(0, ZOOMS, zoom, (brackets.low, brackets.high))
+    return 0.5 * (low + high)
+
+
+def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable: Any) -> Margins:
+    """The Margins at the frequencies w (1 + 3m,), with derivatives."""
+    m = loop.B.shape[1]
+    which = np.concatenate([[0], np.tile(np.arange(m), 3)])
+    index = np.arange(len(which))
+
+    held = fr.held(still, w)
+
+    def zero(loop, w):
+        one = _alone(_sensitivity(fr.near(loop, held, w)))[index, which]
+        size = jnp.log(jnp.where(jnp.abs(one) > 0.0, jnp.abs(one), 1.0))
+        return jnp.where(index <= m, jnp.imag(one), size)
+
+    steep = jax.jvp(lambda w: zero(still, w), (w,), (jnp.ones_like(w),))[1]
+    steep = jax.lax.stop_gradient(steep)
+    moves = brackets.exists & brackets.inside & (index > 0) & (steep != 0.0)
+    w = w - jnp.where(moves, zero(loop, w) / jnp.where(steep != 0.0, steep, 1.0), 0.0)
+
+    every = _sensitivity(fr.near(loop, held, w))
+    S = every[0]
+    u, v, _ = _pair(jax.lax.stop_gradient(S))
+    peak = jnp.real(jnp.conj(u) @ S @ v)
+    one = jnp.where(brackets.exists, _alone(every)[index, which], 1.0)  # no zero to divide by
+    size, angle = jnp.log(jnp.abs(one)), jnp.angle(one)
+    wrapped = jnp.mod(angle + jnp.pi, 2.0 * jnp.pi)
+    found = jnp.where(
+        index <= m,
+        jnp.exp(jnp.abs(size)),
+        jnp.where(index <= 2 * m, jnp.degrees(jnp.pi - jnp.abs(angle)), wrapped / w),
+    )
+    found = jnp.where(brackets.exists, found, jnp.inf)
+    parts = lambda v: (v[1 : m + 1], v[m + 1 : 2 * m + 1], v[2 * m + 1 :])
+    return Margins(stable, peak, *parts(found), w[0], *parts(w))

@@ -1,0 +1,72 @@
+"""Speed of the live page in headless Chromium: a run, frames while a slider moves, a search.
+
+python tests/benchmarks/live_page.py [CASE ...]     # on a quiet machine
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import jax
+
+from jaxtank import presets
+from tuning.live.page import page
+
+DRAG = """async () => {
+  const own = document.querySelector("#groups input[type=range]"), frame = () =>
+    new Promise((done) => requestAnimationFrame(done));
+  const times = [];
+  for (let i = 0; i < 90; i += 1) {
+    own.value = 200 + 6 * i;
+    own.dispatchEvent(new Event("input"));
+    const start = performance.now();
+    await frame();  // the run and its picture
+    times.push(performance.now() - start);
+  }
+  return times.slice(10).sort((a, b) => a - b);
+}"""
+RUN = """() => {
+  const engine = makeEngine(), times = [];
+  for (let i = 0; i < 12; i += 1) {
+    const start = performance.now();
+    engine.run({}, { every: 21 });
+    times.push(performance.now() - start);
+  }
+  return Math.min(...times);
+}"""
+TUNE = """async () => {
+  const start = performance.now(), found = await jaxtank.tune();
+  return [(performance.now() - start) / 1000, found.objective, found.violation];
+}"""
+
+
+def measure(browser, name, folder):
+    """Print one line of a case."""
+    from browser import opened
+
+    path = Path(folder, "page.html")
+    path.write_text(page(presets.find(name)), encoding="utf-8")
+    with opened(browser, path) as live:
+        run, drag = live(RUN), live(DRAG)
+        seconds, objective, violation = live(TUNE)
+    middle, slow = drag[len(drag) // 2], drag[int(0.95 * len(drag))]
+    print(
+        f"{name}: {path.stat().st_size / 1000:.0f} kB; run {run:.1f} ms; frame {middle:.1f} ms"
+        f" (95 %: {slow:.1f} ms); search {seconds:.2f} s, objective {objective:.6g}, limits passed"
+        f" by {100 * violation:.2g} %"
+    )
+
+
+def main(names):
+    """Measure each case."""
+    jax.config.update("jax_enable_x64", True)
+    from browser import chromium  # of tests/
+
+    with chromium() as browser, tempfile.TemporaryDirectory() as folder:
+        for name in names or ["gouta2015/backstepping", "cascaded/pi"]:
+            measure(browser, name, folder)
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    main(sys.argv[1:])

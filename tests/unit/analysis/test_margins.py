@@ -1,0 +1,119 @@
+"""Margins of sampled open loops against python-control, eigenvalues and dense grids."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxtank.analysis.frequency import OpenLoop, is_stable
+from jaxtank.analysis.margins import margins
+
+control = pytest.importorskip("control")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def lags_under_pi(rng):
+    """Two lags under a sampled PI controller, of generic gains, as python-control builds it."""
+    dt, plant = 0.5, control.tf([1.0], [1.0])
+    for _ in range(2):
+        plant = plant * control.tf([rng.uniform(0.7, 1.5)], [rng.uniform(2.0, 30.0), 1.0])
+    gain, time = rng.uniform(0.5, 6.0), rng.uniform(4.0, 30.0)
+    pi = control.ss([[1.0]], [[1.0]], [[gain * dt / time]], [[gain]], dt)
+    return pi * control.ss(control.c2d(plant, dt))
+
+
+def delayed(A, B, C, dead):
+    """(A, B, C) with the dead time as states."""
+    m = B.shape[1]
+    for _ in range(dead):
+        n = len(A)
+        A = np.block([[A, B], [np.zeros((m, n + m))]])
+        B = np.concatenate([np.zeros((n, m)), np.eye(m)])
+        C = np.concatenate([C, np.zeros((len(C), m))], axis=1)
+    return A, B, C
+
+
+def of_all(systems, dead, dt):
+    """Margins of systems [(A, B, C), ...] of one size."""
+    stacked = [jnp.asarray(np.stack(part)) for part in zip(*systems)]
+    found = jax.jit(jax.vmap(lambda A, B, C: margins(OpenLoop(A, B, C, dead, dt))))(*stacked)
+    return jax.tree.map(np.asarray, found)
+
+
+@pytest.mark.parametrize("dead", [0, 4])
+def test_margins_of_two_lags_under_pi_are_those_of_python_control(dead):
+    rng = np.random.default_rng(3)
+    loops = [lags_under_pi(rng) for _ in range(24)]
+    found = of_all([(s.A, s.B, s.C) for s in loops], dead, 0.5)
+    compared = 0
+    for k, one in enumerate(loops):
+        A, B, C = delayed(one.A, one.B, one.C, dead)
+        stable = np.abs(np.linalg.eigvals(A - B @ C)).max() < 1.0
+        assert bool(found.stable[k]) == stable
+        if not stable:
+            continue
+        compared += 1
+        L = control.tf(control.ss(A, B, C, [[0.0]], 0.5))
+        gain, phase, distance, _, crossover, _ = control.stability_margins(L)
+        assert found.gain_margin[k, 0] == pytest.approx(np.exp(abs(np.log(gain))), rel=1e-6)
+        assert found.phase_margin[k, 0] == pytest.approx(abs(phase), rel=1e-6)
+        assert found.sensitivity_peak[k] == pytest.approx(1.0 / distance, rel=1e-6)
+        assert found.delay_margin[k, 0] == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
+    assert compared > 8
+
+
+def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
+    rng = np.random.default_rng(5)
+    systems = []
+    while len(systems) < 8:
+        A = scipy.linalg.expm(-0.3 * (np.diag(rng.uniform(0.1, 2.0, 4)) + 0.1 * np.ones((4, 4))))
+        B, C = 0.3 * rng.normal(size=(4, 2)), 0.5 * rng.normal(size=(2, 4))
+        if np.abs(np.linalg.eigvals(A - B @ C)).max() < 0.99:
+            systems.append((A, B, C))
+    found = of_all(systems, 0, 0.3)
+    z = np.exp(1j * np.geomspace(1e-5, np.pi, 40_000))
+    for k, (A, B, C) in enumerate(systems):
+        L = C @ np.linalg.solve(
+            z[:, None, None] * np.eye(4) - A, np.broadcast_to(B, (len(z), 4, 2))
+        )
+        S = np.linalg.inv(np.eye(2) + L)
+        peak = np.linalg.norm(S, 2, axis=(1, 2)).max()
+        assert found.sensitivity_peak[k] == pytest.approx(peak, rel=1e-6)
+        for i in range(2):  # the other loop closed in the state space: nothing of S is used
+            j = 1 - i
+            closed = A - np.outer(B[:, j], C[j])
+            alone = control.tf(control.ss(closed, B[:, [i]], C[[i]], [[0.0]], 0.3))
+            gains = [g for g in control.stability_margins(alone, returnall=True)[0] if g > 0]
+            grid = control.frequency_response(alone, np.angle(z[-1:]) / 0.3).complex
+            gains += [-1.0 / np.real(grid).item()] if np.real(grid) < 0 else []
+            least = min((abs(np.log(g)) for g in gains), default=np.inf)
+            assert np.log(found.gain_margin[k, i]) == pytest.approx(least, rel=1e-4, abs=1e-6)
+
+
+def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
+    dead, rng = 7, np.random.default_rng(7)
+    systems = []
+    for _ in range(60):
+        A = np.diag(1.0 - rng.uniform(0.005, 0.3, 3)) + np.triu(0.1 * rng.normal(size=(3, 3)), 1)
+        A[0, 0] = 1.0  # an integrator
+        systems.append((A, 0.3 * rng.normal(size=(3, 1)), 0.3 * rng.normal(size=(1, 3))))
+    radius = [np.abs(np.linalg.eigvals(a - b @ c)).max() for a, b, c in
+              (delayed(*s, dead) for s in systems)]  # fmt: skip
+    found = of_all(systems, dead, 1.0).stable
+    np.testing.assert_array_equal(found, np.array(radius) < 1.0)
+    assert 5 < found.sum() < 55
+
+
+def test_the_spectral_radius_is_compared_with_one_next_to_it():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(6, 6))
+    A /= np.abs(np.linalg.eigvals(A)).max()
+    check = jax.jit(is_stable)
+    assert bool(check(A * (1.0 - 1e-7))) and not bool(check(A * (1.0 + 1e-7)))
+    assert bool(check(np.triu(np.ones((4, 4)), 1)))  # all poles at 0

@@ -1,0 +1,84 @@
+"""Limits that nothing proves: tightened by what many plants need, and held when tuned again."""
+
+import numpy as np
+import pytest
+
+import jaxtank
+import tuning
+from jaxtank import rig
+from jaxtank.core.tree import with_values
+from tuning.answer.checks import LARGEST, SHARE, Checks
+from tuning.answer.setting import setting_of
+
+TANK = """
+name = "one tank, stepped"
+tank = [{ area = 20.0, rim = 9.0, drain = 2.0, level = 1.0 }]
+pump = [{ gain = 5.0, to = 1, low = 0.0, high = 4.0, initial = 0.4 }]
+plant = { gravity = 0.5 }
+law = { kind = "pid", Kc = 1.0, Ti = 4.0, Tt = 5.0 }
+reference = { initial = [1.0], changes = [[1.0, 1, 2.0]], ramp = 0.0 }
+values = { "clock.dt" = 0.1, "clock.duration" = 30.0 }
+limits = { overshoot_percent = 4.0 }
+uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
+
+[free]
+"controller.Kc" = [0.05, 50.0]
+"controller.Ti" = [0.5, 100.0]
+"""
+
+
+@pytest.fixture(scope="module")
+def case():
+    return rig.loads(TANK)
+
+
+@pytest.fixture(scope="module")
+def looked(case):
+    setting = setting_of(case)
+    checks = Checks(setting, setting.searched, None, setting.limits, {})
+    checks.look(checks.problem.start())
+    return setting, checks
+
+
+def test_the_tightening_and_the_added_plants_are_those_of_single_runs(looked):
+    """Every plant alone: its overshoot, the spread beyond the 90 % quantile, the two worst."""
+    setting, checks = looked
+    problem, found = checks.problem, []
+    for run in problem.runs[:40]:
+        loop = with_values(setting.searched.loop, problem.scenarios[len(found)].values)
+        run = jaxtank.evaluate(loop, run.case.clock, ["overshoot_percent"], run.key)
+        found.append(float(run["overshoot_percent"][0]))
+    margins = checks.margins["overshoot_percent", 0]
+    np.testing.assert_allclose(4.0 - np.array(found), margins[:40], rtol=1e-9)
+    every = 4.0 - margins
+    spread = every.max() - np.sort(every)[int(0.9 * 255)]  # linear quantiles lie one draw apart
+    wanted = SHARE * spread * 4.0 / every.max()
+    assert checks.tightening["overshoot_percent", 0] == pytest.approx(wanted, rel=0.1)
+    assert checks.added[:2] == np.argsort(-every)[:2].tolist()
+    (limit,) = checks.limits()["overshoot_percent"]
+    assert limit == pytest.approx(4.0 - checks.tightening["overshoot_percent", 0], rel=1e-12)
+    assert not checks.hold() and 0.0 < checks.share < LARGEST
+
+
+def test_plants_do_not_follow_the_seed_and_a_violation_tightens_more(looked, case):
+    setting, checks = looked
+    key = "overshoot_percent", 0
+    more = Checks(setting, setting.searched, None, setting.limits, {key: 0.7})
+    assert [r.case.loop.plant.drain[0] for r in more.problem.runs] == [
+        r.case.loop.plant.drain[0] for r in checks.problem.runs
+    ]
+    more.margins, more.problem = {}, checks.problem
+    more.look(checks.problem.start())
+    assert more.tightening[key] == 0.7 > checks.tightening[key]
+
+
+def test_the_answer_keeps_its_limits_and_is_left_alone_when_tuned_again(case):
+    result = tuning.tune(case, validation=64)
+    answer = result.answer
+    assert result.status == "converged" and answer.held and 0.0 < answer.tightened <= LARGEST
+    assert answer.before.held.mean() < 0.5  # the limit is one that the start violates
+    worst = answer.after.measures["overshoot_percent"].max()
+    assert 3.0 < worst <= 4.0  # near its limit
+    again = tuning.tune(result.tuned, validation=64)
+    assert all(again.answer.kept.values()) and again.answer.held
+    assert again["controller.Ti[0]"].after == result["controller.Ti[0]"].after

@@ -1,0 +1,372 @@
+"""The live page in Chromium, against the library and its own promises."""
+
+import csv
+import io
+import json
+import shlex
+
+import numpy as np
+import pytest
+from browser import chromium, opened
+from helpers import command
+
+import jaxtank
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from tuning.live import shown
+from tuning.live.gallery import gallery
+from tuning.live.page import page
+
+SETTINGS = {
+    "controller.Kc[0]": 1.7,
+    "controller.Ti[0]": 120.0,
+    "plant.orifice[0]": 0.036,
+    "plant.pump_gain[0]": 0.05,
+    "plant.rim[0]": 9.5,
+    "reference.targets[1]": 3.4,
+    "x0[1]": 4.3,
+    "actuator.high[0]": 9.0,
+    "sensor.noise[0]": 0.02,
+    "sensor.noise[1]": 0.01,
+}
+MANY = "&".join(f"{name}={value}" for name, value in SETTINGS.items())
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The page of cascaded/pi as a file."""
+    path = tmp_path_factory.mktemp("live") / "page.html"
+    path.write_text(page(presets.find("cascaded/pi")), encoding="utf-8")
+    return path
+
+
+def table(text):
+    """(header, numbers) of a CSV file."""
+    head, *rows = csv.reader(io.StringIO(text))
+    return head, np.array(rows, dtype=float)
+
+
+def set_all(live, values):
+    """Type values into the boxes of the sliders."""
+    for name, value in values.items():
+        box = live.page.locator(f'input[type=number][aria-label^="{name}"]')
+        box.evaluate("node => (node.closest('details').open = true)")
+        box.fill(str(value))
+    live.page.wait_for_timeout(400)
+
+
+def test_the_page_is_one_small_file_that_asks_for_nothing(browser, written):
+    text = written.read_text(encoding="utf-8")
+    assert len(text.encode()) <= 150_000
+    assert "default-src 'none'" in text and "unsafe" not in text
+    assert "eval(" not in text and "new Function" not in text
+    with opened(browser, written) as live:
+        assert live.text("#case") == "cascaded/pi"
+        assert len(live("jaxtank.names")) >= 30
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 390])
+def test_axe_finds_nothing_serious(browser, written, scheme, width):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not there")
+    view = {"width": width, "height": 850}
+    with opened(browser, written, viewport=view, color_scheme=scheme) as live:
+        live("document.querySelectorAll('details').forEach((one) => (one.open = true))")
+        live.page.click("#pin")
+        live.page.wait_for_timeout(400)
+        found = axe.Axe().run(live.page).response["violations"]
+        assert [v["id"] for v in found if v["impact"] in ("serious", "critical")] == []
+        assert live("document.documentElement.scrollWidth") <= width
+
+
+def test_the_file_of_numbers_is_that_of_the_copied_command(browser, written, tmp_path):
+    with opened(browser, written) as live:
+        set_all(live, SETTINGS)
+        line, text = live("jaxtank.command()"), live("jaxtank.csv()")
+        measures = live("(values) => jaxtank.run(values).measures", SETTINGS)
+    done = command(*shlex.split(line)[1:], "--out", str(tmp_path), "--json")
+    assert done.code == 0 and line.count("--set") == len(SETTINGS)
+    head, numbers = table(text)
+    wanted, expected = table((tmp_path / "trajectory.csv").read_text())
+    assert head == wanted
+    np.testing.assert_allclose(numbers, expected, rtol=2e-9, atol=2e-9)
+    for name, value in measures.items():
+        for one, other in zip(np.ravel(value), np.ravel(done.json["measures"][name])):
+            assert (one is None) == (other is None), name
+            assert one is None or one == pytest.approx(other, rel=1e-9, abs=1e-9), name
+
+
+def test_the_copied_rig_file_gives_the_same_run(browser, written):
+    values = {k: v for k, v in SETTINGS.items() if not k.startswith("sensor")}
+    with opened(browser, written) as live:
+        here = live("(values) => jaxtank.run(values)", values)
+        live.page.wait_for_timeout(400)
+        case = rig.loads(live("jaxtank.toml()"))
+    assert case.loop.plant.rim.tolist() == [9.5, 10.0]
+    there = jaxtank.simulate(case.loop, case.clock)
+    np.testing.assert_allclose(np.transpose(here["h"]), there.x, rtol=1e-9, atol=1e-9)
+
+
+def test_a_slider_moves_the_run_and_a_double_click_takes_it_back(browser, written):
+    with opened(browser, written) as live:
+        before = live.text("#measures")
+        own = live.page.locator("#groups input[type=range]").first
+        own.focus()
+        for _ in range(8):
+            own.press("PageUp")
+        live.page.wait_for_timeout(300)
+        assert live("jaxtank.state().values")["controller.Kc[0]"] > 2.0
+        assert live.text("#measures") != before and "Kc" in live.page.url
+        own.dblclick()
+        live.page.wait_for_timeout(300)
+        assert live("jaxtank.state().values") == {} and live.text("#measures") == before
+
+
+def test_a_number_out_of_range_is_refused_in_words(browser, written):
+    with opened(browser, written) as live:
+        box = live.page.locator('input[type=number][aria-label^="controller.Kc[0]"]')
+        box.fill("1e9")
+        assert box.get_attribute("aria-invalid") == "true"
+        assert live("jaxtank.state().values") == {}
+        box.press("Tab")
+        assert "controller.Kc[0] = 1" in live.text("#message") and "to 5" in live.text("#message")
+
+
+def test_a_link_brings_back_the_state_and_a_false_one_is_refused(browser, written):
+    with opened(browser, written, f"#v1&{MANY}&seed=3&filter=0") as live:
+        state = live("jaxtank.state()")
+        assert state["values"] == SETTINGS and state["seed"] == 3 and state["filter"] is False
+        live.page.wait_for_timeout(400)
+        link = live("location.hash")
+    with opened(browser, written, link) as live:
+        assert live("jaxtank.state()") == state
+    bad = "#v1&controller.Kc%5B0%5D=1e99&plant.nothing=2&x0[0]=NaN&seed=-1&%E0%A4%A=1&<b>=2"
+    with opened(browser, written, bad) as live:
+        assert live("jaxtank.state()")["values"] == {"controller.Kc[0]": 5.0}
+        assert "range" in live.text("#message")
+    with opened(browser, written, "#v9&controller.Kc[0]=2") as live:
+        assert live("jaxtank.state()")["values"] == {}
+        assert "another version" in live.text("#message")
+
+
+def test_names_of_a_rig_stay_text(browser, tmp_path):
+    evil = "</script><img src=x onerror=alert(1)>\u2028${alert(2)}"
+    case = presets.find("cascaded/pi").replace(
+        name=evil, title=evil, names={"tank": (evil, "b"), "pump": (evil,)}
+    )
+    path = tmp_path / "page.html"
+    path.write_text(page(case), encoding="utf-8")
+    with opened(browser, path) as live:
+        assert live.text("#case") == evil and live("document.images.length") == 0
+        assert live.page.locator(".panel .name").first.text_content().startswith(evil)
+
+
+def test_what_is_broken_changes_the_plant_alone(browser, written):
+    with opened(browser, written) as live:
+        live.page.click("#breaks summary")
+        live.page.click("text=pump 1 at 70 %")
+        live.page.wait_for_timeout(300)
+        values = live("jaxtank.state().values")
+        gain = float(presets.find("cascaded/pi").loop.plant.pump_gain[0])
+        assert values == {"plant.pump_gain[0]": pytest.approx(0.7 * gain)}
+        assert "--set 'plant.pump_gain[0]=" in live("jaxtank.command()")
+        live.page.click("#reset")
+        assert live("jaxtank.state().values") == {}
+
+
+def test_64_plants_are_those_that_the_page_says(browser, written):
+    """The share that keeps the limits against the library's own draws of the same spread."""
+    case = presets.find("cascaded/pi")
+    with opened(browser, written) as live:
+        live.page.click("#plants")
+        live.wait("document.querySelector('#message').textContent.includes('plants keep')")
+        kept = int(live.text("#message").split()[0])
+        assert "90 % of 64 plants" in live.text("#legend")
+    import tuning
+
+    drawn = tuning.ensemble(
+        case, samples=64, key=0, measures=["overflow_volume", "max_level"], limits=case.limits
+    )
+    held = 64 - max(v["count"] for v in drawn.violations())
+    assert abs(kept - held) <= 16  # two samples of 64
+
+
+def test_runs_are_pinned_zoomed_and_played_by_keyboard(browser, written):
+    with opened(browser, written) as live:
+        live.page.focus("#pin")
+        live.page.keyboard.press("Enter")
+        assert "run 1" in live.text("#legend") and "run 1" in live.text("#measures")
+        live.page.focus("#time")
+        live.page.keyboard.press("Home")
+        assert live.text("#now") == "0 s"
+        live.page.focus("#closer")
+        live.page.keyboard.press("Enter")
+        live.page.focus("#play")
+        live.page.keyboard.press("Enter")
+        live.wait("document.querySelector('#now').textContent !== '0 s'")
+        live.page.keyboard.press("Enter")
+        live.page.get_by_label("remove run 1").click()
+        assert "run 1" not in live.text("#legend")
+
+
+def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(browser, written):
+    with opened(browser, written) as live:
+        box = live.page.locator(".u-over").first.bounding_box()
+        x, y, width = box["x"], box["y"] + 20, box["width"]
+        live.page.mouse.move(x + 0.25 * width, y)
+        live.page.mouse.down()
+        live.page.mouse.move(x + 0.5 * width, y, steps=4)
+        live.page.mouse.up()
+        np.testing.assert_allclose(live("jaxtank.state().shown"), [700.0, 1400.0], rtol=0.02)
+        live.page.mouse.dblclick(x + 0.5 * width, y)
+        assert live("jaxtank.state().shown") == [0, 2800]
+
+
+def test_states_of_a_result_are_compared(browser, tmp_path):
+    case = presets.find("cascaded/pi")
+    states = [("before", {}, False), ("after", {"controller.Kc": 0.4}, False)]
+    live_page = shown.of_case(case, states)
+    live_page.save(tmp_path / "page.html")
+    inside = tmp_path / "report.html"
+    inside.write_text(f"<!DOCTYPE html><title>r</title>{shown.frame(live_page)}", encoding="utf-8")
+    with opened(browser, tmp_path / "page.html") as live:
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 0.4}
+        assert "before" in live.text("#legend") and "before" in live.text("#measures")
+    context = browser.new_context(offline=True)
+    try:
+        faults, tab = [], context.new_page()
+        tab.on("console", lambda m: faults.append(m.text))
+        tab.on("pageerror", lambda e: faults.append(str(e)))
+        tab.goto(inside.as_uri())
+        frame = tab.frame_locator("iframe.live")
+        assert frame.locator("#legend").text_content(timeout=5000).count("before") == 1
+        assert not frame.locator("#link").is_visible()
+        assert faults == []
+    finally:
+        context.close()
+
+
+def test_the_command_writes_one_file_or_none(tmp_path):
+    path = tmp_path / "new" / "page.html"
+    done = command("explore", "cascaded/pi", "--out", str(path), "--json", "--set", "plant.rim=9")
+    assert done.code == 0 and done.json["bytes"] == path.stat().st_size
+    assert "cascaded/pi" in path.read_text(encoding="utf-8")
+    for words, error in (
+        ((), "give a case"),
+        (("cascaded/pi",), "--out page.html"),
+        (("cascaded/pi", "--all", "--out", str(tmp_path)), "give a case"),
+        (("cascaded/pi", "--out", str(tmp_path)), "is a folder"),
+        (("cascaded/pj", "--out", str(tmp_path / "a.html")), "cascaded/pi"),
+        (("cascaded/pi", "--out", str(path / "a.html")), "is a file"),
+    ):
+        done = command("explore", *words)
+        assert done.code == 2 and error in done.err and done.err.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.rglob("*.html")) == ["page.html"]
+
+
+def test_a_changed_case_keeps_the_words_that_make_it(browser, tmp_path):
+    case = rig.set_values(
+        presets.find("cascaded/pi"), {"clock.duration": 800.0, "controller.Kc": 2.0}
+    )
+    path = tmp_path / "page.html"
+    path.write_text(page(case), encoding="utf-8")
+    with opened(browser, path) as live:
+        assert shlex.split(live("jaxtank.command()")) == [
+            *("jaxtank", "simulate", "cascaded/pi", "--set", "clock.duration=800.0"),
+            *("--set", "controller.Kc[0]=2"),
+        ]
+
+
+def test_a_filtered_case_is_repeated_with_its_settings(browser, tmp_path):
+    path = tmp_path / "page.html"
+    words = ["--safety-filter", "--set", "safety_filter.rate=0.1", "--set", "clock.duration=800"]
+    assert command("explore", "cascaded/pi", *words, "--out", str(path), "--quiet").code == 0
+    with opened(browser, path) as live:
+        assert live("jaxtank.state().filter") is True
+        line, found = live("jaxtank.command()"), live("jaxtank.run({}).measures")
+        live.page.click("#filter-row")
+        without = live("jaxtank.command()")
+    assert "--safety-filter" in line and "safety_filter" not in without
+    done = command(*shlex.split(line)[1:], "--json", "--quiet")
+    for name in ("rms_error_total", "max_level", "filter_active_fraction"):
+        assert found[name] == pytest.approx(done.json["measures"][name], rel=1e-9), name
+    assert np.max(found["filter_active_fraction"]) > 0.0
+
+
+def test_the_gallery_lists_what_it_has(browser, tmp_path):
+    paths = gallery(tmp_path, ["cascaded/pi"])
+    assert [p.name for p in paths] == ["index.html", "cascaded-pi.html"]
+    context = browser.new_context(offline=True)
+    try:
+        tab = context.new_page()
+        tab.goto(paths[0].as_uri())
+        tab.click("text=pi")
+        assert tab.text_content("#case") == "cascaded/pi"
+    finally:
+        context.close()
+
+
+def test_a_result_without_a_case_has_no_page():
+    with pytest.raises(InputError, match="has no case of its own"):
+        shown.of_result(object())
+    live = presets.find("cascaded/pi").explore()
+    assert isinstance(live, shown.LivePage) and "srcdoc=" in live._repr_html_()
+    assert json.dumps(live.name) in repr(live).replace("'", '"')
+
+
+def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, written):
+    import tuning
+
+    case = presets.find("cascaded/pi")
+    wanted = tuning.tune(case, nominal=True, starts=1, screening=16).objective
+    with opened(browser, written) as live:
+        found = live("jaxtank.tune()")
+        assert found["violation"] == 0.0
+        assert "before tuning" in live.text("#legend") and "Tuned in" in live.text("#message")
+        assert live("jaxtank.state().values")["controller.Kc[0]"] == pytest.approx(
+            found["values"]["controller.Kc[0]"]
+        )
+        assert live.text("#verdict").startswith("Every limit holds")
+    assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
+
+
+def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
+    with opened(browser, written) as live:
+        live.page.click("#tune")
+        live.wait("document.querySelector('#message').textContent.startsWith('Tuning')")
+        live.page.click("#tune")
+        assert "Stopped" in live.text("#message") or "Tuned in" in live.text("#message")
+        assert live.text("#tune") == "Tune"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gouta2015/ngpc", "gouta2022/enmpc", "mirakhorli/hybrid"])
+def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
+    path = tmp_path / "page.html"
+    path.write_text(page(presets.find(name)), encoding="utf-8")
+    assert path.stat().st_size <= 150_000
+    rng = np.random.default_rng(0)
+    with opened(browser, path) as live:
+        names = live("jaxtank.names")
+        leaves = live("makeEngine().info.leaves")
+        own = [v for v in leaves if v["name"] in names and v["value"]]
+        chosen = {}
+        for leaf in rng.choice(own, 10, replace=False):
+            part = 0.1 * rng.uniform(-1.0, 1.0) * (leaf["upper"] - leaf["lower"])
+            chosen[leaf["name"]] = float(
+                np.clip(leaf["value"] + part, leaf["lower"], leaf["upper"])
+            )
+        live("(values) => void jaxtank.run(values)", chosen)
+        line, text = live("jaxtank.command()"), live("jaxtank.csv()")
+    done = command(*shlex.split(line)[1:], "--out", str(tmp_path / "out"), "--quiet")
+    assert done.code == 0, done.err
+    head, numbers = table(text)
+    wanted, expected = table((tmp_path / "out" / "trajectory.csv").read_text())
+    assert head == wanted
+    np.testing.assert_allclose(numbers, expected, rtol=2e-9, atol=2e-9)

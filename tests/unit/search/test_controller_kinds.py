@@ -1,0 +1,156 @@
+"""The choice of the controller: first gains against closed forms, the best against searches of each
+kind described in a rig file of its own."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import RIGS
+
+from jaxtank import presets, rig
+from jaxtank.core.errors import InputError
+from tuning.cli import main
+from tuning.problem.controllers import START, with_kind
+from tuning.search import tuner
+
+QUICK = dict(starts=1, screening=8, validation=0, iterations=40)
+
+
+@pytest.fixture(scope="module")
+def watertank():
+    """A dH/dt = b V - a sqrt(H): A = 20, b = 5, a = 2, from 1 to 2 cm."""
+    case = rig.load(RIGS / "watertank.toml")
+    case = rig.set_values(case, {"clock.dt": 0.1, "clock.duration": 20.0})
+    return case.replace(limits={}, objective={"rms_error_total": 1.0})
+
+
+def test_first_gains_of_one_tank_are_those_of_its_closed_forms(watertank):
+    """Linear about 2 cm: T dh' = -dh + k du with T = 2 A sqrt(H) / a, k = 2 b sqrt(H) / a."""
+    area, gain, drain, level = 20.0, 5.0, 2.0, 2.0
+    k, T = 2 * gain * level**0.5 / drain, 2 * area * level**0.5 / drain
+    T, slow = min(T, 20.0), T  # the length of the run
+    pid = with_kind(with_kind(watertank, "state-feedback"), "pid").loop.controller
+    at_rest = k / (1 + 1e-3 * slow / T)  # the gain of a pole moved by 1e-3 / T
+    np.testing.assert_allclose(pid.Kc, [T / (at_rest * T / 10)], rtol=1e-9)
+    np.testing.assert_allclose(pid.Ti, [4 * T / 10], rtol=1e-9)
+    # scalar Riccati equation: 2 a p - p^2 b^2 / r + q = 0
+    a, b = -1 / slow, gain / area
+    q, r = (0.05 * 40.0) ** -2, (0.25 * 50.0) ** -2
+    p = r / b**2 * (a + np.sqrt(a**2 + q * b**2 / r))
+    feedback = with_kind(watertank, "state-feedback")
+    np.testing.assert_allclose(feedback.loop.controller.K, [[b * p / r]], rtol=1e-6)
+    largest = 4 * b * p / r
+    assert feedback.free["controller.K"][:2] == pytest.approx((-largest, largest))
+    lqi = with_kind(watertank, "lqi").loop.controller
+    np.testing.assert_allclose(lqi.Q, [q, q / (T / 10) ** 2], rtol=1e-12)
+    np.testing.assert_allclose(lqi.R, [r], rtol=1e-12)
+
+
+def test_ranges_are_a_decade_each_way_and_what_else_is_free_stays(watertank):
+    case = watertank.replace(free={**watertank.free, "reference.ramp": (0.1, 2.0)})
+    found = with_kind(case, "enmpc")
+    low, high = found.free["controller.Tp"][:2]
+    first = float(found.loop.controller.Tp)
+    assert (low, high) == pytest.approx((0.1 * first, 10.0 * first), rel=1e-2)
+    assert found.free["reference.ramp"] == (0.1, 2.0) and len(found.free) == 2
+    assert with_kind(case, "pid") is case
+
+
+def test_published_gains_of_the_same_plant_are_taken():
+    case = presets.find("gouta2015/backstepping")
+    other, published = with_kind(case, "ngpc"), presets.find("gouta2015/ngpc")
+    assert float(other.loop.controller.Tp) == float(published.loop.controller.Tp)
+    assert other.free == published.free and other.symmetry is None
+    weaker = rig.set_values(case, {"plant.pump_gain[0]": 1.0, "controller.model.pump_gain[0]": 1.0})
+    assert float(with_kind(weaker, "ngpc").loop.controller.Tp) != float(other.loop.controller.Tp)
+
+
+@pytest.mark.parametrize("kind", START)
+def test_every_kind_has_first_gains_for_a_rig_that_it_fits(kind):
+    """They are finite, pass input validation, and are written to a file and read back."""
+    rigs = {
+        "two-tank-backstepping": "calofir/backstepping",
+        "ngpc": "gouta2015/backstepping",
+        "backstepping": "gouta2015/ngpc",
+        "enmpc": "gouta2022/pi",
+    }
+    case = rig.open_case(rigs.get(kind, str(RIGS / "quadruple_tank.toml")))
+    found = with_kind(case.replace(name="own"), kind)
+    assert rig.loads(rig.dump(found)).free == found.free
+    values = [rig.values.get_value(found.loop, name) for name in found.free]
+    assert all(np.all(np.isfinite(np.asarray(v))) for v in values)
+
+
+def test_the_best_kind_is_that_of_searches_of_each_kind_alone(watertank):
+    """Each described in a rig file, with the gains and ranges that the choice begins with."""
+    kinds, watertank = ["pid", "lqi"], rig.set_values(watertank, {"clock.dt": 0.2})
+    chosen = tuner.tune(watertank, choices={"controller.kind": kinds}, **QUICK)
+    alone = {}
+    for kind in kinds:
+        case = rig.loads(rig.dump(with_kind(watertank, kind)))
+        alone[kind] = tuner.tune(case, **QUICK)
+    after = {kind: found.objective["after"] for kind, found in alone.items()}
+    rows = {row["values"]["controller.kind"]: row for row in chosen.choices}
+    for kind in kinds:
+        assert rows[kind]["objective"]["after"] == pytest.approx(after[kind], rel=1e-6)
+    best = min(after, key=after.get)
+    assert chosen.objective["after"] == pytest.approx(after[best], rel=1e-6)
+    assert type(chosen.tuned.loop.controller) is type(alone[best].tuned.loop.controller)
+    assert set(chosen.parameters) == set(alone[best].parameters)
+    assert f"best of 2 choices: controller.kind = {best}" in chosen.message
+    assert f"controller.kind = {best}" in str(chosen)
+
+
+def test_a_kind_that_does_not_fit_is_a_row_with_the_reason(watertank, capsys):
+    """On the command line, by the name of the table of a rig file."""
+    options = ["--starts", "1", "--screening", "4", "--validation", "0", "--iterations", "5"]
+    settings = ["--set", "clock.dt=0.2", "--limit", "none", "--objective", "rms_error_total=1"]
+    path = str(RIGS / "watertank.toml")
+    free = ["--free", "controller.Kc=1:10"]
+    code = main.main(
+        ["tune", path, *settings, *options, *free, "--choose", "law.kind=pid,ngpc", "--json"]
+    )
+    found = json.loads(capsys.readouterr().out)
+    assert code in (0, 3)
+    first, second = found["choices"]
+    assert first["reason"] is None and set(first["parameters"]) == {"controller.Kc[0]"}
+    assert second["status"] == "does not fit" and "state-coupled four-tank" in second["reason"]
+    assert second["objective"] == {"before": None, "after": None}
+    assert any(m["code"] == "choice-does-not-fit" for m in found["messages"])
+
+
+@pytest.mark.parametrize(
+    ("choices", "free", "words"),
+    [
+        ({"controller.kind": ["pdi"]}, None, "unknown controller kind 'pdi'; nearest: pid"),
+        ({"controller.kind": ["ngpc", "fuzzy"]}, None, "none fits the rig; controller.kind = ngpc"),
+        ({"controller.kind": ["open-loop"]}, None, "has no gains to start from"),
+        ({"controller.kind": "pid"}, None, "must be a list of values to try"),
+        (
+            {"controller.kind": ["pid"], "law.kind": ["lqi"]},
+            None,
+            "law.kind: is controller.kind by another name",
+        ),
+        (
+            {"controller.kind": ["pid", "lqi"]},
+            {"controller.Kd": (0.1, 1.0)},
+            r"unknown parameter 'controller.Kd'; nearest: controller.Td",
+        ),
+    ],
+)
+def test_a_choice_that_cannot_be_made_is_refused_in_one_line(watertank, choices, free, words):
+    with pytest.raises(InputError, match=words) as error:
+        tuner.tune(watertank, choices=choices, free=free, **QUICK)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_named_free_counts_for_the_kinds_that_have_it(watertank):
+    free = {"controller.Kc": (1.0, 10.0)}
+    result = tuner.tune(
+        watertank,
+        choices={"controller.kind": ["pid", "enmpc"]},
+        free=free,
+        **QUICK | {"iterations": 3, "screening": 4},
+    )
+    pid, other = (set(row["parameters"]) for row in result.choices)
+    assert pid == {"controller.Kc[0]"} and other == {"controller.Tp"}

@@ -1,0 +1,255 @@
+// Pure functions of the page: numbers, scales of sliders, links, files, decimation. No DOM.
+
+const LINK = "v1";
+
+// a number as people read it, with `digits` significant digits
+function shown(value, digits = 4) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  if (size > 0 && (size < 1e-3 || size >= 1e6)) return value.toExponential(digits - 1);
+  return String(Number(value.toPrecision(digits)));
+}
+
+function clamp(value, low, high) {
+  return Math.min(Math.max(value, low), high);
+}
+
+// the ends of a slider, wide enough for its default; logarithmic for gains and times
+function scaleOf(leaf) {
+  const low = Math.min(leaf.lower, leaf.value), high = Math.max(leaf.upper, leaf.value);
+  const log = leaf.scale ? leaf.scale === "log" : low > 0 && high / low >= 30;
+  return { low, high, log: log && low > 0 };
+}
+
+const STEPS = 1000;
+
+function positionOf(value, s) {
+  if (s.high === s.low) return 0;
+  const part = s.log
+    ? Math.log(clamp(value, s.low, s.high) / s.low) / Math.log(s.high / s.low)
+    : (clamp(value, s.low, s.high) - s.low) / (s.high - s.low);
+  return Math.round(STEPS * part);
+}
+
+function valueAt(position, s) {
+  if (position <= 0) return s.low;
+  if (position >= STEPS) return s.high;
+  const part = position / STEPS;
+  const value = s.log ? s.low * (s.high / s.low) ** part : s.low + part * (s.high - s.low);
+  const span = s.log ? value : s.high - s.low; // four digits of what one sees
+  const unit = 10 ** (Math.floor(Math.log10(Math.abs(span))) - 3);
+  return clamp(Number((Math.round(value / unit) * unit).toPrecision(12)), s.low, s.high);
+}
+
+// the state of the page as the fragment of its address
+function linkOf(state, leaves) {
+  const parts = [LINK];
+  for (const leaf of leaves) {
+    const value = state.values[leaf.name];
+    if (value !== undefined && value !== leaf.value)
+      parts.push(`${encodeURIComponent(leaf.name)}=${value}`);
+  }
+  if (state.filter !== null) parts.push(`filter=${state.filter ? 1 : 0}`);
+  if (state.seed) parts.push(`seed=${state.seed}`);
+  return `#${parts.join("&")}`;
+}
+
+// {values, filter, seed, notes} of a fragment; what is unknown or no number is left out and noted
+function readLink(text, leaves, hasFilter) {
+  const found = { values: {}, filter: null, seed: 0, notes: [] };
+  const parts = text.replace(/^#/, "").split("&");
+  if (!parts[0]) return found;
+  if (parts[0] !== LINK) {
+    found.notes.push("The link is of another version of this page and was not read.");
+    return found;
+  }
+  const known = new Map(leaves.map((leaf) => [leaf.name, leaf]));
+  for (const part of parts.slice(1, 1000)) {
+    const cut = part.indexOf("=");
+    let name = "";
+    try {
+      name = decodeURIComponent(part.slice(0, cut));
+    } catch {
+      name = "";
+    }
+    const word = part.slice(cut + 1), value = word.trim() === "" ? NaN : Number(word);
+    if (name === "filter" && hasFilter && (word === "0" || word === "1")) {
+      found.filter = word === "1";
+    } else if (name === "seed" && Number.isInteger(value) && value >= 0 && value < 2 ** 31) {
+      found.seed = value;
+    } else if (known.has(name) && Number.isFinite(value)) {
+      const s = scaleOf(known.get(name));
+      found.values[name] = clamp(value, s.low, s.high);
+      if (found.values[name] !== value) found.notes.push(`${name} was brought into its range.`);
+    } else {
+      found.notes.push(`The link sets ${name.slice(0, 60) || "something"}, which this page has not.`);
+    }
+  }
+  return found;
+}
+
+// a leaf's array as TOML: every entry of `base`, from the current values
+function arrayOf(base, leaves, values) {
+  const root = [];
+  let scalar = null;
+  for (const leaf of leaves) {
+    const cut = leaf.name.indexOf("[");
+    if ((cut < 0 ? leaf.name : leaf.name.slice(0, cut)) !== base) continue;
+    const value = values[leaf.name] ?? leaf.value;
+    if (cut < 0) scalar = value;
+    else {
+      const [i, j] = leaf.name.slice(cut + 1, -1).split(",").map(Number);
+      if (j === undefined) root[i] = value;
+      else (root[i] ??= [])[j] = value;
+    }
+  }
+  return scalar === null ? JSON.stringify(root) : real(scalar);
+}
+
+function real(value) {
+  const text = String(value);
+  return /^-?\d+$/.test(text) ? `${text}.0` : text;
+}
+
+// the rig file `text` with `values` {name: number} in its table [values], and with or without filter
+function tomlOf(text, leaves, values, filter) {
+  let lines = text.split("\n");
+  const guard = lines.findIndex((line) => line.trim() === "[safety_filter]");
+  if (filter === true && guard < 0) lines.push("[safety_filter]", "");
+  if (filter === false && guard >= 0) {
+    const end = lines.findIndex((line, k) => k > guard && /^\s*\[/.test(line));
+    lines = lines.filter((_, k) => k < guard || (end >= 0 && k >= end));
+  }
+  const bases = [...new Set(Object.keys(values).map((name) => name.split("[")[0]))];
+  // in a file the models follow the plant unless they are set
+  for (const base of bases.filter((name) => name.startsWith("plant.")))
+    for (const part of ["controller.model", "controller.law.model", "observer.model"]) {
+      const model = base.replace("plant", part);
+      if (leaves.some((leaf) => leaf.name.split("[")[0] === model)) bases.push(model);
+    }
+  let start = lines.findIndex((line) => line.trim() === "[values]");
+  if (bases.length && start < 0) {
+    start = lines.findIndex((line) => /^\s*\[/.test(line));
+    start = start < 0 ? lines.length : start;
+    lines.splice(start, 0, "[values]", "");
+  }
+  for (const base of bases) {
+    const line = `${JSON.stringify(base)} = ${arrayOf(base, leaves, values)}`;
+    let end = lines.findIndex((other, k) => k > start && /^\s*\[/.test(other));
+    end = end < 0 ? lines.length : end;
+    const old = lines.findIndex(
+      (other, k) => k > start && k < end && other.startsWith(`${JSON.stringify(base)} =`),
+    );
+    if (old < 0) lines.splice(start + 1, 0, line);
+    else lines[old] = line;
+  }
+  return lines.join("\n");
+}
+
+// a run as CSV, with the columns of trajectory.csv that the engine has
+function csvOf(run, units) {
+  const columns = [["t [s]", run.t]];
+  const add = (name, unit, list) =>
+    (list || []).forEach((values, i) => columns.push([`${name}${i + 1} [${unit}]`, values]));
+  add("h", units.length, run.h);
+  add("y", units.length, run.y);
+  add("r", units.length, run.r);
+  add("u", units.drive, run.u);
+  add("command", units.drive, run.command);
+  add("spilled", units.length === "-" ? "-" : `${units.length}^3`, run.spilled);
+  if (run.d_hat && run.d_hat.some((d) => d.some((v) => v !== 0)))
+    add("d_hat", `${units.length}/s`, run.d_hat);
+  const rows = [columns.map((c) => c[0]).join(",")];
+  for (let k = 0; k < run.t.length; k += 1) rows.push(columns.map((c) => c[1][k]).join(","));
+  return `${rows.join("\n")}\n`;
+}
+
+// first index of sorted `t` with t[k] >= x
+function indexOf(t, x) {
+  let low = 0, high = t.length;
+  while (low < high) {
+    const mid = (low + high) >> 1;
+    if (t[mid] < x) low = mid + 1;
+    else high = mid;
+  }
+  return low;
+}
+
+// [t, ...series] from `from` to `to` with at most 2 `buckets` points, the extremes of each kept
+function envelope(t, series, from, to, buckets) {
+  const first = Math.max(0, indexOf(t, from) - 1), end = Math.min(t.length, indexOf(t, to) + 2);
+  const count = end - first;
+  if (count <= 2 * buckets) return [t, ...series].map((v) => v.slice(first, end));
+  const out = [t, ...series].map(() => new Float64Array(2 * buckets));
+  for (let b = 0; b < buckets; b += 1) {
+    const i = first + Math.floor((b * count) / buckets);
+    const j = first + Math.floor(((b + 1) * count) / buckets);
+    out[0][2 * b] = t[i];
+    out[0][2 * b + 1] = t[(i + j) >> 1];
+    for (let s = 0; s < series.length; s += 1) {
+      const v = series[s];
+      let least = i, most = i;
+      for (let k = i + 1; k < j; k += 1) {
+        if (v[k] < v[least]) least = k;
+        else if (v[k] > v[most]) most = k;
+      }
+      out[s + 1][2 * b] = v[Math.min(least, most)];
+      out[s + 1][2 * b + 1] = v[Math.max(least, most)];
+    }
+  }
+  // the last bucket ends at the last sample
+  out.forEach((v, s) => (v[v.length - 1] = (s ? series[s - 1] : t)[end - 1]));
+  return out;
+}
+
+// values of `v` over `t`, linearly at the times `at`
+function interpolated(t, v, at) {
+  return Float64Array.from(at, (x) => {
+    const k = clamp(indexOf(t, x), 1, t.length - 1);
+    const part = clamp((x - t[k - 1]) / (t[k] - t[k - 1]), 0, 1);
+    return v[k - 1] + part * (v[k] - v[k - 1]);
+  });
+}
+
+// least and greatest of several arrays
+function extent(arrays) {
+  let low = Infinity, high = -Infinity;
+  for (const v of arrays)
+    for (let k = 0; k < v.length; k += 1) {
+      if (v[k] < low) low = v[k];
+      if (v[k] > high) high = v[k];
+    }
+  return [low, high];
+}
+
+// margins of the limits in a run: [{limit, value, margin, where}], the smallest first
+function marginsOf(limits, measures) {
+  const found = [];
+  for (const limit of limits) {
+    const all = measures[limit.measure];
+    if (all === undefined || all === null) continue;
+    const value = Array.isArray(all) || ArrayBuffer.isView(all) ? all[limit.entry ?? 0] : all;
+    const margins = [];
+    if (limit.upper !== null && limit.upper !== undefined) margins.push(limit.upper - value);
+    if (limit.lower !== null && limit.lower !== undefined) margins.push(value - limit.lower);
+    found.push({ limit, value, margin: Math.min(...margins) });
+  }
+  return found.sort((a, b) => a.margin - b.margin);
+}
+
+// a quantile of numbers, between the nearest two
+function quantile(sorted, share) {
+  const at = share * (sorted.length - 1), k = Math.floor(at);
+  return k + 1 < sorted.length ? sorted[k] + (at - k) * (sorted[k + 1] - sorted[k]) : sorted[k];
+}
+
+// uniform numbers in [0, 1) from a seed (mulberry32), for the 64 plants
+function uniform(seed) {
+  let a = seed >>> 0;
+  return () => {
+    a = (a + 0x6d2b79f5) >>> 0;
+    let t = Math.imul(a ^ (a >>> 15), 1 | a);
+    t = (t + Math.imul(t ^ (t >>> 7), 61 | t)) ^ t;
+    return ((t ^ (t >>> 14)) >>> 0) / 4294967296;
+  };
+}

@@ -1,0 +1,49 @@
+"""The drawing of a rig as data for the live page, in the geometry of the package's pictures.
+
+Imported by `page` and its tests.
+"""
+
+from jaxtank.plots.layout import jets, overflows, pipes, place
+
+
+def drawing(plant):
+    """Return the positions of all parts of a rig, in heights of its tallest tank.
+
+    Parameters
+    ----------
+    plant : Plant
+        None is returned for one that is no network of tanks.
+
+    Returns
+    -------
+    {"boxes": [[x, y, width, height, drawn height of one unit of level]], "pumps": [[x, y]],
+    "risers": [[pump, tank, path]], "pipes": [[left, right, height]], "jets": [[tank, path]],
+    "overflows": [[tank, path]], "left", "right", "bottom", "top"}
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> found = drawing(presets.find("cascaded/pi").loop.plant)
+    >>> len(found["boxes"]), len(found["risers"])
+    (2, 1)
+    """
+    if not hasattr(plant, "links"):
+        return None
+    where = place(plant)
+    return {
+        "boxes": [_rounded(box) for box in where.boxes],
+        "pumps": [_rounded(p) for p in where.pumps],
+        "risers": [[pump, tank, _path(path)] for pump, tank, path in where.risers],
+        "pipes": [_rounded(p) for p in pipes(plant, where)],
+        "jets": [[tank, _path(path)] for tank, path in jets(plant, where)],
+        "overflows": [[tank, _path(path)] for tank, path in overflows(plant, where)],
+        **{end: round(float(getattr(where, end)), 4) for end in ("left", "right", "bottom", "top")},
+    }
+
+
+def _rounded(values):
+    return [round(float(v), 4) for v in values]
+
+
+def _path(path):
+    return [_rounded(point) for point in path]

@@ -1,0 +1,148 @@
+"""Where a case comes from: the words of the command line that make it, and its filter's twin.
+
+Imported by `page`.
+"""
+
+import contextlib
+import shlex
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxtank import presets, rig
+from jaxtank.core.clock import CLOCK_UNITS
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import parameters, walk
+
+GUARD = "safety_filter."
+"""What the names of a safety filter begin with."""
+
+NEW = "rig.toml"
+"""Name of the rig file that a case without a name of its own is copied to."""
+
+
+class Origin(NamedTuple):
+    """How `jaxtank simulate` makes a case.
+
+    words : the case, with --set of its static fields and clock
+    values : {name of one entry: value before} of the leaves that differ from the preset or the file
+    filtered : whether the preset or the file has a safety filter
+    guard : --set of the settings of the filter that differ, for runs with it
+
+    Examples
+    --------
+    >>> origin_of(presets.find("cascaded/pi"))
+    Origin(words='cascaded/pi', values={}, filtered=False, guard='')
+    """
+
+    words: str
+    values: dict[str, float]
+    filtered: bool
+    guard: str
+
+
+def origin_of(case, source=None):
+    """Return the Origin of a case.
+
+    Parameters
+    ----------
+    case : Case
+    source : str or None
+        The rig file that it was read from, as the command line names it.
+
+    Examples
+    --------
+    >>> case = rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 2.0, "plant.rim[0]": 8.0})
+    >>> origin_of(case).words, origin_of(case).values["plant.rim[0]"]
+    ('cascaded/pi --set clock.dt=2.0', 10.0)
+    """
+    source = source or (case.name if case.name in presets.names() else None)
+    known, words = None, None
+    if source is not None:
+        with contextlib.suppress(InputError):  # the file has gone
+            known = rig.open_case(source)
+            words = _static(case, known)
+    if source is None or known is None or words is None:
+        return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
+    differing, own = {}, entries(case.loop, parameters(case.loop))
+    for name, value in entries(known.loop, parameters(known.loop)).items():
+        if own[name] != value:
+            differing[name] = value
+    words = " ".join([shlex.quote(source), *words])
+    return Origin(words, differing, known.safety is not None, _guard(case, known))
+
+
+def _guard(case, known):
+    """--set of the settings of the safety filter of a case that its origin does not have."""
+    before: dict[str, Any] = dict(known.safety or {})
+    found = []
+    for key, value in (case.safety or {}).items():
+        if key not in before or not np.array_equal(before[key], value):
+            text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
+            found += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    return " ".join(found)
+
+
+def _static(case, known):
+    """--set of the static fields and the clock that differ; None where the structure does."""
+    found = []
+    shapes = [
+        {n: np.shape(v) for n, v in parameters(c.loop).items() if not n.startswith(GUARD)}
+        for c in (case, known)
+    ]
+    mine, theirs = (dict(_fields(c.loop)) for c in (case, known))
+    if shapes[0] != shapes[1] or mine.keys() != theirs.keys():
+        return None
+    for name, value in mine.items():
+        if value != theirs[name]:
+            if isinstance(value, tuple) or value is None:
+                return None
+            found.append((name, str(value).lower() if isinstance(value, bool) else value))
+    for name in CLOCK_UNITS:
+        if getattr(case.clock, name) != getattr(known.clock, name):
+            found.append((f"clock.{name}", getattr(case.clock, name)))
+    return [word for name, value in found for word in ("--set", shlex.quote(f"{name}={value}"))]
+
+
+def _fields(loop):
+    for name, value, _ in walk(loop, kind="static"):
+        if not name.startswith(GUARD):
+            yield name, value
+
+
+def entries(loop, values):
+    """Return {name of one entry: number} of {dotted name: number or array}.
+
+    Examples
+    --------
+    >>> entries(presets.find("cascaded/pi").loop, {"plant.rim": 5.0})
+    {'plant.rim[0]': 5.0, 'plant.rim[1]': 5.0}
+    """
+    found, own = {}, parameters(loop)
+    for name, value in values.items():
+        if name.startswith(GUARD):
+            continue
+        shape = np.shape(own[name]) if name in own else ()
+        if not shape:
+            found[name] = float(np.ravel(value)[0])
+        else:
+            array = np.broadcast_to(np.asarray(value, dtype=float), shape)
+            for index, entry in np.ndenumerate(array):
+                found[f"{name}[{','.join(map(str, index))}]"] = float(entry)
+    return found
+
+
+def both(case):
+    """Return (case without a safety filter, the same with one or None, whether it has one now).
+
+    Examples
+    --------
+    >>> off, on, now = both(presets.find("cascaded/pi"))
+    >>> off.loop.safety_filter is None, on.loop.safety_filter is None, now
+    (True, False, False)
+    """
+    has = case.loop.safety_filter is not None
+    try:
+        return case.without_safety_filter(), case if has else rig.filtered(case, on=True), has
+    except InputError:  # nothing to keep, or no way to
+        return case, None, has

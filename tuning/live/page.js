@@ -1,0 +1,744 @@
+// The page: state, sliders, one run per frame, buttons. core.js, charts.js and rig.js are above.
+
+const $ = (id) => document.getElementById(id);
+
+function make(tag, attributes = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes))
+    if (value !== null && value !== undefined) node.setAttribute(name, value);
+  node.append(...children.filter((child) => child !== null));
+  return node;
+}
+
+const { unpacked } = window.jaxtank; // by loader.js
+const data = JSON.parse(unpacked.data);
+const engine = makeEngine();
+const { info } = engine;
+info.measures = info.measures.filter((m) => !m.name.startsWith("time_of_")); // as simulate prints them
+info.filter.default_on = data.filter;
+const leaves = info.leaves.filter((leaf) => leaf.value !== null);
+const byName = new Map(leaves.map((leaf) => [leaf.name, leaf]));
+// the entries of what is named, as controller.Kc or plant.rim[0]
+const entriesOf = (names) => leaves.map((leaf) => leaf.name)
+  .filter((name) => names.includes(name) || names.includes(name.split("[")[0]));
+const state = {
+  values: {}, // {leaf: number} that differ from the case
+  filter: info.filter.present ? data.filter : null,
+  seed: 0,
+  broken: new Set(), // names of data.breaks
+  free: new Set(entriesOf(info.free)),
+};
+const view = { from: 0, to: info.duration, at: info.duration };
+const pins = []; // {name, run}
+const framed = window !== window.parent; // in a report or a notebook
+let current = null, bands = null, worker = null, charts = [], rig = null;
+
+// --- what a run takes -------------------------------------------------------------------------
+
+const valueOf = (name) => state.values[name] ?? byName.get(name)?.value;
+
+// the values that differ from the case, with what is broken
+function effective() {
+  const values = { ...state.values };
+  for (const fault of data.breaks) {
+    if (!state.broken.has(fault.name) || !byName.has(fault.leaf)) continue;
+    const before = values[fault.leaf] ?? byName.get(fault.leaf).value;
+    values[fault.leaf] = fault.factor === null ? fault.value : before * fault.factor;
+  }
+  return values;
+}
+
+const options = () => ({ seed: state.seed, filter: state.filter === true });
+
+function run(values = effective(), every = data.drawn) {
+  try {
+    const found = engine.run(values, { ...options(), every });
+    if (!state.filter) delete found.measures.filter_active_fraction;
+    return found;
+  } catch (error) {
+    say(`This run is not possible: ${error.message}`);
+    return null;
+  }
+}
+
+// --- one run per frame ------------------------------------------------------------------------
+
+let asked = false, resting = 0;
+
+function touch() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    current = run() ?? current;
+    show();
+    rest();
+  });
+}
+
+function rest() {
+  clearTimeout(resting);
+  resting = setTimeout(settle, 250);
+}
+
+// once nothing moves: every sample of a part, the address, words for a screen reader, the plants
+function settle() {
+  const rows = ((view.to - view.from) / info.dt) / data.drawn;
+  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples) {
+    current = run(effective(), 1) ?? current;
+    show();
+  }
+  if (!framed) history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
+  describe();
+  if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants();
+}
+
+function describe() {
+  if (!current) return;
+  charts.forEach(({ spec, describe: put }) => {
+    const values = current[spec.what][spec.index], [low, high] = extent([values]);
+    const limits = spec.limits.map(({ words }) => words).filter(Boolean).join(", ");
+    put(`${spec.title}: from ${shown(low)} to ${shown(high)}, ${shown(values[values.length - 1])} at the end${
+      limits ? `; ${limits}` : ""}`);
+  });
+  const first = info.measures.find((m) => m.name in info.objective.measures);
+  const words = first ? `${first.name} ${cells(current.measures[first.name])} ${first.unit}` : "";
+  $("spoken").textContent = [$("verdict").textContent, words].filter(Boolean).join(". ");
+}
+
+// a command designs the filter for the plant, the pumps and the noise that it is given
+function noteFilter() {
+  const groups = ["plant", "pumps", "sensor"];
+  const moved = Object.keys(effective()).some((name) => groups.includes(byName.get(name)?.group));
+  $("filter-note").hidden = !(state.filter && moved);
+}
+
+function changed() {
+  noteFilter();
+  bands = null;
+  touch();
+}
+
+// --- drawing ----------------------------------------------------------------------------------
+
+function show() {
+  if (!current) return;
+  charts.forEach((chart) => {
+    const { what, index, output } = chart.spec;
+    chart.draw(current.t, {
+      run: current[what][index],
+      setpoint: what === "h" && output >= 0 ? current.r[output] : null,
+      pins: pins.map((pin) => onTimes(pin.run, what, index)),
+      band: bands && { t: bands.t, ...bands[what][index] },
+    });
+  });
+  showTables();
+  atTime(view.at);
+}
+
+function onTimes(other, what, index) {
+  const values = other[what][index];
+  return other.t.length === current.t.length ? values : interpolated(other.t, values, current.t);
+}
+
+function atTime(time) {
+  view.at = clamp(time, 0, info.duration);
+  if (!current) return;
+  const k = Math.min(Math.max(indexOf(current.t, view.at + 1e-9) - 1, 0), current.t.length - 1);
+  const column = (list) => list.map((values) => values[k]);
+  const h = column(current.h), r = column(current.r), u = column(current.u);
+  const share = u.map((v, j) => {
+    const { lower, upper } = info.pumps[j];
+    return upper > lower ? clamp((v - lower) / (upper - lower), 0, 1) : 0.5;
+  });
+  const before = Math.max(0, k - 1);
+  const spills = (current.spilled ?? []).map((values) => values[k] > values[before]);
+  if (rig) rig.update({ h, r, u, share, spills });
+  charts.forEach(({ spec, read }) => {
+    const { what, index, output, unit } = spec;
+    const target = what === "h" && output >= 0 ? `, setpoint ${shown(r[output])}` : "";
+    read(`${shown((what === "h" ? h : u)[index])} ${unit}${target}`);
+  });
+  $("now").textContent = `${shown(view.at, 5)} s`;
+  $("time").value = Math.round((1000 * view.at) / info.duration);
+  $("time").setAttribute("aria-valuetext", `${shown(view.at, 5)} seconds`);
+}
+
+function zoom(from, to) {
+  const least = info.duration / 2000;
+  view.from = clamp(from, 0, info.duration - least);
+  view.to = clamp(to, view.from + least, info.duration);
+  show();
+  rest();
+}
+
+const cells = (value) =>
+  (typeof value === "number" || value === null || value === undefined ? [value] : Array.from(value))
+    .map((v) => shown(v)).join(", ");
+
+function showTables() {
+  const margins = marginsOf(info.limits, current.measures);
+  const worst = margins[0];
+  let verdict = "", good = true;
+  if (current.broken) {
+    verdict = "The run diverged: a level stopped being finite.";
+    good = false;
+  } else if (worst) {
+    good = worst.margin >= 0;
+    const which = `${limitWords(worst.limit)}: ${shown(worst.value)} ${worst.limit.unit}`;
+    verdict = good
+      ? `Every limit holds, smallest margin ${shown(worst.margin, 3)} ${worst.limit.unit}`
+      : `Limit passed by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`;
+  }
+  $("verdict").textContent = verdict;
+  $("verdict").className = good ? "good" : "bad";
+  const pinned = pins[pins.length - 1];
+  fill($("margins"), "Limits", ["", "value", "margin"], margins.map(({ limit, value, margin }) => ({
+    head: `${limitWords(limit)} ${limit.lower === null || limit.lower === undefined ? "≤" : "≥"} ${
+      shown(limit.upper ?? limit.lower)} ${limit.unit}`,
+    cells: [shown(value), shown(margin, 3)],
+    bad: margin < 0,
+  })));
+  const rows = info.measures.filter((m) => current.measures[m.name] !== undefined).map((m) => ({
+    head: `${m.name}${m.unit && m.unit !== "-" ? ` [${m.unit}]` : ""}`,
+    title: m.doc,
+    cells: [cells(current.measures[m.name]), ...(pinned ? [cells(pinned.run.measures[m.name])] : [])],
+  }));
+  fill($("measures"), "Measures", ["", "now", ...(pinned ? [pinned.name] : [])], rows);
+}
+
+// e.g. "max_level of tank 3"
+function limitWords(limit) {
+  const own = info.measures.find((m) => m.name === limit.measure);
+  if (limit.entry === null || limit.entry === undefined) return limit.measure;
+  const tank = own && own.size === info.tanks.length ? info.tanks[limit.entry].name : limit.entry + 1;
+  return `${limit.measure}, ${tank}`;
+}
+
+// a name that may be broken after each "_"
+const broken = (text) => text.split(/(?<=_)/).flatMap((part, i) => (i ? [make("wbr"), part] : [part]));
+
+// a table, its cells replaced and not made anew where its shape stays
+function fill(host, caption, heads, rows) {
+  const shape = JSON.stringify([heads, rows.map((row) => row.head)]);
+  if (host.dataset.shape !== shape) {
+    host.dataset.shape = shape;
+    const head = make("tr", {}, ...heads.map((text) => make(text ? "th" : "td", text ? { scope: "col" } : {}, text)));
+    const body = rows.map((row) => make("tr", {}, make("th", { scope: "row", title: row.title }, ...broken(row.head)),
+      ...row.cells.map(() => make("td"))));
+    host.replaceChildren(...(rows.length
+      ? [make("table", {}, make("caption", {}, caption), make("thead", {}, head), make("tbody", {}, ...body))]
+      : []));
+  }
+  const lines = host.querySelectorAll("tbody tr");
+  rows.forEach((row, i) => {
+    lines[i].classList.toggle("bad", Boolean(row.bad));
+    row.cells.forEach((text, j) => {
+      const cell = lines[i].cells[j + 1];
+      if (cell.textContent !== text) cell.textContent = text;
+    });
+  });
+}
+
+function say(text) {
+  $("message").textContent = text;
+}
+
+// --- sliders ----------------------------------------------------------------------------------
+
+const rows = new Map(); // {leaf name: {update, row}}
+
+function slider(leaf) {
+  const scale = scaleOf(leaf), id = `leaf-${rows.size}`;
+  const words = leaf.unit && leaf.unit !== "-" ? ` [${leaf.unit}]` : "";
+  const range = make("input", { type: "range", min: 0, max: STEPS, id, title: leaf.doc });
+  const number = make("input", { type: "number", step: "any", min: scale.low, max: scale.high,
+    "aria-label": `${leaf.name}${words}` });
+  const label = make("label", { for: id, title: leaf.doc }, leaf.name, make("span", { class: "unit" }, words));
+  const row = make("div", { class: "row" }, label, number, range);
+  if (state.free.has(leaf.name)) {
+    const free = make("input", { type: "checkbox", "aria-label": `tune ${leaf.name}` });
+    free.checked = true;
+    free.addEventListener("change", () => state.free[free.checked ? "add" : "delete"](leaf.name));
+    row.classList.add("tunable");
+    row.append(make("label", { class: "free", title: "changed by Tune" }, free, "tune"));
+  }
+  range.style.setProperty("--default", positionOf(leaf.value, scale) / STEPS);
+  let dragged = false;
+  const set = (value) => {
+    if (value === leaf.value) delete state.values[leaf.name];
+    else state.values[leaf.name] = value;
+    update();
+    changed();
+  };
+  const update = () => {
+    const value = valueOf(leaf.name);
+    range.value = positionOf(value, scale);
+    range.setAttribute("aria-valuetext", `${shown(value)} ${leaf.unit}`);
+    if (document.activeElement !== number) number.value = Number(value.toPrecision(6));
+    row.classList.toggle("moved", leaf.name in state.values);
+  };
+  range.addEventListener("pointerdown", () => (dragged = true));
+  range.addEventListener("pointerup", () => (dragged = false));
+  range.addEventListener("input", () => {
+    const position = Number(range.value);
+    const near = Math.abs(position - positionOf(leaf.value, scale)) <= (dragged ? 8 : 0);
+    set(near ? leaf.value : valueAt(position, scale));
+  });
+  range.addEventListener("dblclick", () => set(leaf.value));
+  number.addEventListener("input", () => {
+    const value = number.value.trim() === "" ? NaN : Number(number.value);
+    const good = Number.isFinite(value) && value >= scale.low && value <= scale.high;
+    number.setAttribute("aria-invalid", String(!good));
+    if (good) set(value);
+  });
+  number.addEventListener("change", () => {
+    const value = number.value.trim() === "" ? NaN : Number(number.value);
+    if (!Number.isFinite(value)) number.value = valueOf(leaf.name);
+    else if (value < scale.low || value > scale.high) {
+      say(`${leaf.name} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`);
+      number.value = clamp(value, scale.low, scale.high);
+      set(clamp(value, scale.low, scale.high));
+    }
+    number.setAttribute("aria-invalid", "false");
+  });
+  rows.set(leaf.name, { row, update });
+  update();
+  return row;
+}
+
+// numbers without a slider: of models, and of the safety filter, which a command designs anew
+const HIDDEN = ["model", "safety filter"];
+
+function makeSliders() {
+  const groups = new Map();
+  for (const leaf of leaves) {
+    if (HIDDEN.includes(leaf.group)) continue;
+    const own = state.free.has(leaf.name) ? "tuned gains" : leaf.group;
+    if (!groups.has(own)) groups.set(own, []);
+    groups.get(own).push(leaf);
+  }
+  const order = ["tuned gains", "controller", "reference", "plant", "pumps", "disturbance", "sensor"];
+  const rank = (name) => (order.includes(name) ? order.indexOf(name) : order.length);
+  for (const [name, own] of [...groups].sort((a, b) => rank(a[0]) - rank(b[0]))) {
+    const count = make("span", { class: "unit" }, ` ${own.length}`);
+    const group = make("details", { class: "group" }, make("summary", {}, name, count), ...own.map(slider));
+    group.open = rank(name) === 0 || (!groups.has(order[0]) && rank(name) === 1);
+    if (name === "sensor" && info.noise) group.append(seedRow());
+    $("groups").append(group);
+  }
+}
+
+function seedRow() {
+  const input = make("input", { type: "number", min: 0, max: 2 ** 31 - 1, step: 1, id: "seed" });
+  input.value = state.seed;
+  input.addEventListener("change", () => {
+    const value = Math.trunc(Number(input.value));
+    state.seed = Number.isFinite(value) ? clamp(value, 0, 2 ** 31 - 1) : 0;
+    input.value = state.seed;
+    changed();
+  });
+  return make("div", { class: "row" }, make("label", { for: "seed" }, "seed of the noise"), input);
+}
+
+function search() {
+  const words = $("search").value.toLowerCase().split(/\s+/).filter(Boolean);
+  let any = false;
+  for (const group of $("groups").children) {
+    let here = false;
+    group.querySelectorAll(".row").forEach((row) => {
+      const label = row.querySelector("label"), text = `${label.textContent} ${label.title}`.toLowerCase();
+      row.hidden = !words.every((word) => text.includes(word));
+      here ||= !row.hidden;
+    });
+    group.hidden = !here;
+    if (words.length && here) group.open = true;
+    any ||= here;
+  }
+  $("nothing").hidden = any;
+}
+
+function refresh() {
+  rows.forEach(({ update }) => update());
+  if ($("seed")) $("seed").value = state.seed;
+  $("filter").checked = state.filter === true;
+  noteFilter();
+  document.querySelectorAll("#breaks button").forEach((button) =>
+    button.setAttribute("aria-pressed", String(state.broken.has(button.textContent))));
+  changed();
+}
+
+// --- buttons ----------------------------------------------------------------------------------
+
+function pin(name) {
+  if (!current) return;
+  const old = pins.findIndex((other) => other.name === name);
+  if (old >= 0) pins.splice(old, 1);
+  if (pins.length === PINS) pins.shift();
+  pins.push({ name, run: current });
+  makeLegend();
+  show();
+}
+
+function makeLegend() {
+  const key = (kind, text) => make("span", { class: `key ${kind}` }, text);
+  const own = pins.map((one, i) => {
+    const remove = make("button", { type: "button", "aria-label": `remove ${one.name}` }, "×");
+    remove.addEventListener("click", () => {
+      pins.splice(pins.indexOf(one), 1);
+      makeLegend();
+      show();
+    });
+    return make("span", { class: `key pin${i}` }, one.name, remove);
+  });
+  $("legend").replaceChildren(key("run", "this run"), ...own, key("setpoint", "setpoint"),
+    ...(bands ? [key("band", "90 % of 64 plants")] : []));
+}
+
+function newWorker() {
+  const text = [unpacked.engine, unpacked.core, unpacked.worker];
+  const url = URL.createObjectURL(new Blob([text.join("\n")], { type: "text/javascript" }));
+  const made = new Worker(url);
+  URL.revokeObjectURL(url);
+  return made;
+}
+
+function stop() {
+  if (worker) worker.terminate();
+  worker = null;
+  $("tune").textContent = "Tune";
+  document.body.removeAttribute("aria-busy");
+}
+
+// starts a worker; answers: {kind: function}, each called with the message
+function ask(message, answers) {
+  stop();
+  worker = newWorker();
+  document.body.setAttribute("aria-busy", "true");
+  worker.onmessage = ({ data: answer }) => {
+    if (answer.kind !== "progress") stop();
+    answers[answer.kind](answer);
+  };
+  worker.onerror = (event) => {
+    stop();
+    answers.failed({ text: event.message });
+  };
+  worker.postMessage(message);
+}
+
+function tuneNow() {
+  let best = null, finish = null;
+  const names = [...state.free], start = effective();
+  const promise = new Promise((resolve, reject) => (finish = { resolve, reject }));
+  const apply = (found) => {
+    for (const name of names)
+      if (found.values && Number.isFinite(found.values[name])) state.values[name] = found.values[name];
+    rows.forEach(({ update }) => update());
+    changed();
+  };
+  if (!names.length) {
+    say("Mark at least one parameter with tune.");
+    return Promise.reject(new Error("no free parameter"));
+  }
+  pin("before tuning");
+  const words = (found) => `objective ${shown(found.objective)}${
+    found.violation > 0 ? `, limits passed by ${shown(100 * found.violation, 3)} %` : ""}`;
+  ask({ kind: "tune", values: start, free: names, limits: info.limits, ...options() }, {
+    progress(now) {
+      if (!best || now.values) best = now;
+      say(`Tuning ${names.length === 1 ? "one parameter" : `${names.length} parameters`}: iteration ${now.iterations}, ${words(now)}`);
+      if (now.values) apply(now);
+    },
+    tuned(found) {
+      apply(found);
+      say(`Tuned in ${found.iterations} iterations (${found.status}): ${words(found)}`);
+      finish.resolve({ values: found.values, objective: found.objective, violation: found.violation });
+    },
+    failed({ text }) {
+      say(`Tuning failed: ${text}`);
+      finish.reject(new Error(text));
+    },
+  });
+  $("tune").textContent = "Stop";
+  tuneNow.stop = () => {
+    stop();
+    say(best ? `Stopped; the best so far is set: ${words(best)}` : "Stopped before the first iteration.");
+    finish.resolve(best);
+  };
+  return promise;
+}
+
+function manyPlants() {
+  const spread = {}, values = {};
+  const now = effective();
+  for (const leaf of leaves) {
+    const share = data.uncertain[leaf.name] ?? data.uncertain[leaf.name.split("[")[0]];
+    if (share === undefined || HIDDEN.includes(leaf.group)) continue;
+    spread[leaf.name] = share;
+    values[leaf.name] = now[leaf.name] ?? leaf.value;
+  }
+  ask({
+    kind: "plants", count: 64, values: { ...now, ...values }, spread, limits: info.limits, ...options(),
+    measures: [...new Set(info.limits.map((limit) => limit.measure))],
+    every: Math.max(1, Math.ceil(info.samples / 400)),
+  }, {
+    progress: ({ done, of }) => say(`Simulating ${of} plants: ${done} done`),
+    plants(found) {
+      bands = found;
+      const kept = info.limits.length ? `${found.kept} of ${found.count} plants keep every limit` :
+        `${found.count} plants simulated`;
+      say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`);
+      makeLegend();
+      show();
+    },
+    failed: ({ text }) => say(`The plants could not be simulated: ${text}`),
+  });
+}
+
+async function copy(text, what) {
+  try {
+    await navigator.clipboard.writeText(text);
+    say(`${what} copied.`);
+  } catch {
+    const area = make("textarea", { readonly: "", "aria-label": what });
+    area.value = text;
+    document.body.append(area);
+    area.select();
+    const done = document.execCommand("copy");
+    area.remove();
+    say(done ? `${what} copied.` : text);
+  }
+}
+
+function download(name, text) {
+  const url = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+  const link = make("a", { href: url, download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(url), 1000);
+}
+
+const csv = () => csvOf(run(effective(), data.every), info.units);
+
+// the command that repeats the run: all that differs from the preset or the file
+function command() {
+  const now = effective(), { origin } = data, words = ["jaxtank simulate", origin.words];
+  for (const leaf of leaves) {
+    const value = now[leaf.name] ?? leaf.value;
+    if (value !== (origin.values[leaf.name] ?? leaf.value)) words.push(`--set ${leaf.name.includes("[") ? `'${leaf.name}=${value}'` : `${leaf.name}=${value}`}`);
+  }
+  if (state.filter && origin.guard) words.push(origin.guard);
+  if (state.filter !== null && state.filter !== origin.filtered)
+    words.push(state.filter ? "--safety-filter" : "--no-safety-filter");
+  if (state.seed) words.push(`--seed ${state.seed}`);
+  return words.join(" ");
+}
+
+const toml = () => tomlOf(data.toml, leaves, effective(), state.filter);
+
+function reset() {
+  stop();
+  state.values = {};
+  state.broken.clear();
+  state.seed = 0;
+  state.filter = info.filter.present ? data.filter : null;
+  pins.length = 0;
+  bands = null;
+  $("plants").setAttribute("aria-pressed", "false");
+  zoom(0, info.duration);
+  makeLegend();
+  refresh();
+  say("Reset to the case.");
+}
+
+let played = 0;
+
+function play(yes) {
+  cancelAnimationFrame(played);
+  $("play").setAttribute("aria-pressed", String(yes));
+  $("play").textContent = yes ? "Pause" : "Play";
+  if (!yes) return;
+  if (view.at >= info.duration) atTime(0);
+  let last = performance.now();
+  const frame = (now) => {
+    const next = view.at + ((now - last) / 12000) * info.duration;
+    last = now;
+    moveCursor(next);
+    if (next >= info.duration) play(false);
+    else played = requestAnimationFrame(frame);
+  };
+  played = requestAnimationFrame(frame);
+}
+
+function moveCursor(time) {
+  atTime(time);
+  charts.forEach((chart) => chart.at(view.at));
+}
+
+// --- start ------------------------------------------------------------------------------------
+
+function makeCharts() {
+  let drawn = false; // the charts that share the cursor report the same selection
+  const once = (from, to) => {
+    if (drawn) return;
+    drawn = true;
+    zoom(from, to);
+    setTimeout(() => (drawn = false));
+  };
+  const on = { cursor: atTime, zoom: once, whole: () => zoom(0, info.duration) };
+  const { length, drive } = info.units;
+  info.tanks.forEach((tank, i) => {
+    const rim = tank.rim === null || tank.rim === undefined ? [] : [{ value: tank.rim, words: `rim ${shown(tank.rim)} ${length}` }];
+    const output = info.outputs.indexOf(i);
+    charts.push(makeChart($("panels"), {
+      kind: "level", what: "h", index: i, output, unit: length, zero: true, limits: rim,
+      forbidden: tank.rim, title: `${tank.name}${output >= 0 ? ", controlled" : ""} [${length}]`,
+    }, view, on));
+  });
+  info.pumps.forEach((pump, j) => {
+    const ends = [pump.lower, pump.upper].map((value, k) => ({ value, words: k ? `at most ${shown(value)} ${drive}` : "" }));
+    charts.push(makeChart($("panels"), {
+      kind: "input", what: "u", index: j, unit: drive, zero: true, title: `${pump.name} [${drive}]`,
+      limits: ends.filter(({ value }) => Number.isFinite(value) && Math.abs(value) < 100 * (1 + Math.abs(info.pumps[j].typical ?? 1))),
+    }, view, on));
+  });
+  $("panels").dataset.count = charts.length;
+  new ResizeObserver(() => {
+    charts.forEach((chart) => chart.size());
+    show();
+  }).observe($("panels"));
+  charts.forEach((chart) => chart.size());
+}
+
+function chips(host, list, pressed, act) {
+  host.replaceChildren(...list.map((one) => {
+    const button = make("button", { type: "button", title: one.text, "aria-pressed": pressed ? "false" : null }, one.name);
+    button.addEventListener("click", () => act(one, button));
+    return button;
+  }));
+}
+
+function listen() {
+  $("search").addEventListener("input", search);
+  $("filter").addEventListener("change", () => {
+    state.filter = $("filter").checked;
+    changed();
+  });
+  let number = 0;
+  $("pin").addEventListener("click", () => pin(`run ${(number += 1)}`));
+  $("reset").addEventListener("click", reset);
+  $("tune").addEventListener("click", () => (worker && $("tune").textContent === "Stop" ? tuneNow.stop() : tuneNow().catch(() => {})));
+  $("plants").addEventListener("click", () => {
+    const on = $("plants").getAttribute("aria-pressed") !== "true";
+    $("plants").setAttribute("aria-pressed", String(on));
+    if (on) manyPlants();
+    else {
+      if ($("tune").textContent !== "Stop") stop();
+      bands = null;
+      makeLegend();
+      show();
+    }
+  });
+  $("copy-command").addEventListener("click", () => copy(command(), "Command"));
+  $("copy-toml").addEventListener("click", () => copy(toml(), "Rig file"));
+  $("csv").addEventListener("click", () => download(`${info.case.replace(/[^\w-]+/g, "-")}.csv`, csv()));
+  $("link").addEventListener("click", () => {
+    const link = linkOf({ ...state, values: effective() }, leaves);
+    copy(location.href.split("#")[0] + link, "Link");
+  });
+  $("time").addEventListener("input", () => moveCursor((Number($("time").value) / 1000) * info.duration));
+  $("play").addEventListener("click", () => play($("play").getAttribute("aria-pressed") !== "true"));
+  $("closer").addEventListener("click", () => {
+    const half = (view.to - view.from) / 4;
+    zoom(view.at - half, view.at + half);
+  });
+  $("whole").addEventListener("click", () => zoom(0, info.duration));
+  window.addEventListener("hashchange", open);
+  for (const query of ["(prefers-color-scheme: dark)", "(resolution: 1dppx)"])
+    matchMedia(query).addEventListener("change", () => {
+      colours.clear();
+      charts.forEach((chart) => chart.redraw());
+    });
+}
+
+function preset(one) {
+  state.values = { ...one.values };
+  if (info.filter.present && typeof one.filter === "boolean") state.filter = one.filter;
+}
+
+// the state of the fragment, else the last preset, the others pinned
+function open() {
+  const found = readLink(location.hash, leaves, info.filter.present);
+  const asked = location.hash.length > 1;
+  if (asked) {
+    state.values = found.values;
+    state.seed = found.seed;
+    if (found.filter !== null) state.filter = found.filter;
+    if (found.notes.length) say(found.notes.slice(0, 3).join(" "));
+  } else {
+    for (const one of data.presets) {
+      preset(one);
+      if (one === data.presets[data.presets.length - 1]) break;
+      current = run();
+      pin(one.name);
+    }
+  }
+  refresh();
+}
+
+function start() {
+  $("case").textContent = info.case;
+  $("title").textContent = info.title;
+  document.title = `${info.case}: live`;
+  $("foot").textContent = `jaxtank ${data.version}: ${info.samples} samples of ${shown(info.dt)} s. Charts by uPlot (MIT).`;
+  $("link").hidden = framed;
+  if (!info.filter.present) $("filter-row").hidden = true;
+  if (data.rig) rig = makeRig($("rig"), data.rig, info);
+  else $("rig").parentNode.hidden = true;
+  makeSliders();
+  const known = data.breaks.filter((one) => byName.has(one.leaf));
+  chips($("breaks").querySelector(".chips"), known, true, (one, button) => {
+    const on = !state.broken.has(one.name);
+    state.broken[on ? "add" : "delete"](one.name);
+    button.setAttribute("aria-pressed", String(on));
+    changed();
+  });
+  $("breaks").hidden = !known.length;
+  chips($("presets"), data.presets, false, (one) => {
+    preset(one);
+    refresh();
+  });
+  $("presets").hidden = data.presets.length < 2;
+  makeCharts();
+  makeLegend();
+  listen();
+  open();
+}
+
+window.jaxtank = {
+  names: leaves.filter((leaf) => !HIDDEN.includes(leaf.group)).map((leaf) => leaf.name),
+  // sets the sliders to `values` (others as in the case), shows the run and returns it
+  run(values = {}) {
+    for (const name of Object.keys(values))
+      if (!byName.has(name)) throw new Error(`no parameter is named ${name}`);
+    state.values = { ...values };
+    state.broken.clear();
+    const found = run(effective(), data.every);
+    refresh();
+    const plain = (list) => list.map((one) => Array.from(one));
+    const finite = (v) => (Number.isFinite(v) ? v : null);
+    const measures = Object.fromEntries(info.measures.filter(({ name }) => name in found.measures).map(({ name }) => {
+      const value = found.measures[name];
+      return [name, typeof value === "number" ? finite(value) : Array.from(value, finite)];
+    }));
+    return { measures, t: Array.from(found.t), h: plain(found.h), u: plain(found.u) };
+  },
+  tune: () => tuneNow(),
+  csv,
+  command,
+  toml,
+  state: () => ({
+    values: effective(), filter: state.filter, seed: state.seed, shown: [view.from, view.to],
+  }),
+};
+
+start();

@@ -1,0 +1,299 @@
+"""The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
+
+Imported by the command `explore`, by reports and by notebooks. Beside it lie the parts of the page:
+page.html, page.css, core.js, charts.js, rig.js, page.js, worker.js, tune.js, and uPlot in vendor/.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import zlib
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import get_value, parameters
+from jaxtank.loop.trajectory import stride
+from tuning.answer.setting import plants_of
+from tuning.live.drawing import drawing
+from tuning.live.engine import engine
+from tuning.live.origin import both, entries, origin_of
+
+HERE = Path(__file__).parent
+SCRIPTS = ("charts", "rig", "page")
+LARGEST = 150_000
+"""Characters of a page, above which the safety filter that a case has not is left out."""
+
+KEPT = 8
+"""Engines that are kept in memory."""
+
+LEAK = 1.5
+"""Factor of an outlet that leaks [-]."""
+
+_KEPT = {}
+
+
+def page(case, presets=(), source=None):
+    """Return the live page of a case as the text of an HTML file.
+
+    Parameters
+    ----------
+    case : Case
+    presets : sequence of (name, {dotted name: value}, safety filter: True, False or None)
+        States to start from; None leaves the filter as in the case. The page opens with the last
+        one and draws the others for comparison. Without any, it opens with the case.
+    source : str or None
+        The rig file that the case was read from, as the command line names it.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        For a case that cannot be run in a browser.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> text = page(presets.find("cascaded/pi"))
+    >>> text[:15], "http-equiv" in text
+    ('<!DOCTYPE html>', True)
+    """
+    off, on, filtered = both(case)
+    data = data_of(case, presets, source)
+    text = assemble(_engine(off, on), case.name, data)
+    if len(text) > LARGEST and not filtered:  # then without a safety filter to switch on
+        text = assemble(_engine(off, None), case.name, data)
+    return text
+
+
+def _engine(off, on):
+    """The engine of a case and of the same with a safety filter or None.
+
+    It is kept for the next page of the same case: two seconds of work.
+    """
+    try:
+        texts = [rig.dump(one) for one in (off, on) if one is not None]
+    except InputError:  # a class of the user's own
+        return engine(off, on)
+    key = repr((texts, off.title, off.names))
+    if key not in _KEPT:
+        if len(_KEPT) >= KEPT:
+            _KEPT.pop(next(iter(_KEPT)))
+        _KEPT[key] = engine(off, on)
+    return _KEPT[key]
+
+
+def data_of(case, presets=(), source=None):
+    """Return what the page knows of a case besides the engine, a JSON object.
+
+    Parameters
+    ----------
+    case, presets, source : as of `page`
+
+    Returns
+    -------
+    {"version", "origin": an Origin, "filter": whether it is on, "every" and "drawn": strides of the
+    rows of a CSV file and of a picture [samples], "toml": rig file of the case, "rig": `drawing`,
+    "presets", "breaks": faults that can be switched on, "uncertain": {dotted name: half-width as a
+    share}}
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> found = data_of(presets.find("cascaded/pi"))
+    >>> found["breaks"][0]["name"], found["uncertain"]["plant.drain"]
+    ('pump 1 at 70 %', 0.05)
+    """
+    try:
+        toml = rig.dump(case)
+    except InputError as error:  # a class of the user's own without a name
+        toml = f"# no rig file describes this case ({error})\n"
+    origin = origin_of(case, source)
+    return {
+        "version": jaxtank.__version__,
+        "origin": origin._asdict(),
+        "filter": case.loop.safety_filter is not None,
+        "every": stride(case.clock.samples),
+        "drawn": stride(case.clock.samples, 6000),
+        "toml": toml,
+        "rig": drawing(case.loop.plant),
+        "presets": [
+            {"name": name, "values": entries(case.loop, values), "filter": on, "text": name}
+            for name, values, on in presets
+        ],
+        "breaks": _breaks(case),
+        "uncertain": _uncertain(case),
+    }
+
+
+def _breaks(case):
+    """Faults of the plant that last the whole run: [{name, text, leaf, factor or value}]."""
+    plant, found = case.loop.plant, []
+
+    def add(name, leaf, factor, text):
+        found.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
+
+    values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
+    for j in range(np.size(values.get("plant.pump_gain", ()))):
+        add(f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %")
+    for i, area in enumerate(values.get("plant.drain", ())):
+        if area > 0:
+            text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
+            add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
+    for k, area in enumerate(values.get("plant.orifice", ())):
+        if area > 0:
+            source, sink = (tank + 1 for tank in plant.links[k])
+            text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
+            add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
+    for k, area in enumerate(values.get("plant.pipe", ())):
+        if area > 0:
+            one, other = (tank + 1 for tank in plant.pipes[k])
+            text = f"the pipe between tanks {one} and {other} is blocked, 40 % open"
+            add(f"blocked pipe {one} to {other}", f"plant.pipe[{k}]", 0.4, text)
+    for k, volume in enumerate(values.get("disturbance.volume", ())):
+        if volume:
+            text = "three times the volume of this inflow disturbance"
+            add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
+    return found
+
+
+def _uncertain(case):
+    """{dotted name: half-width as a share} of what varies from plant to plant.
+
+    Parameters that were identified together have the half-width of a uniform distribution with
+    their standard deviation.
+    """
+    found = {}
+    for name, one in plants_of(case).items():
+        if getattr(one, "relative", None) is not None:
+            found[name] = float(one.relative)
+        elif hasattr(one, "covariance"):
+            for own, variance in zip(one.names, np.diagonal(np.asarray(one.covariance))):
+                value = float(np.ravel(get_value(case.loop, own))[0])
+                if value:
+                    found[own] = float(np.sqrt(3.0 * variance) / abs(value))
+    return found
+
+
+def assemble(engine_text, name, data):
+    """Return the page as text.
+
+    Parameters
+    ----------
+    engine_text : str
+        JavaScript that defines `makeEngine`.
+    name : str
+        Of the case.
+    data : dict
+        What `data_of` returns.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
+    >>> "a &lt;b&gt;" in text, text.count("</script>")
+    (True, 7)
+    """
+    uplot, core, own = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
+    # the scripts of the page are one function, as loader.js joins them
+    run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{own}\n}})();', _loader()]
+    policy = "; ".join(
+        [
+            "default-src 'none'",
+            f"script-src {' '.join(map(source_of, run))}",
+            f"style-src {source_of(_style())}",
+            "worker-src blob:",
+            "img-src data:",
+            "base-uri 'none'",
+            "form-action 'none'",
+        ]
+    )
+    search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
+    packed = {
+        "engine": engine_text,
+        "uplot": uplot,
+        "core": core,
+        "page": own,
+        "worker": f"{search}\n{_script('worker')}",
+        "data": json.dumps(data, allow_nan=False, separators=(",", ":")),
+    }
+    return "\n".join(
+        [
+            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
+            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{html.escape(name)}: live</title>",
+            f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
+            _read("page.html"),
+            *(
+                f'<script type="text/plain" id="{n}">{_packed(t)}</script>'
+                for n, t in packed.items()
+            ),
+            f"<script>{_loader()}</script>",
+            "</body>\n</html>\n",
+        ]
+    )
+
+
+def _packed(text):
+    """A text, deflated, in base64: half as long, and nothing in it can end a script element."""
+    deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
+    return base64.b64encode(deflate.compress(text.encode()) + deflate.flush()).decode()
+
+
+def source_of(text):
+    """Return the source of a content-security policy that allows exactly this script or style.
+
+    Examples
+    --------
+    >>> source_of("")
+    "'sha256-47DEQpj8HBSa+/TImW+5JCeuQeRkm5NMpJWZG3hSuFU='"
+    """
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return f"'sha256-{digest}'"
+
+
+@cache
+def _read(name):
+    return (HERE / name).read_text(encoding="utf-8").strip()
+
+
+@cache
+def _style():
+    """The style sheets, without comments and indentation."""
+    text = re.sub(r"/\*.*?\*/", "", _read("vendor/uPlot.min.css") + _read("page.css"), flags=re.S)
+    return re.sub(r"\s+", " ", text)
+
+
+@cache
+def _script(name):
+    """One script of ours without indentation, blank lines and lines of comments."""
+    lines = (line.strip() for line in _read(f"{name}.js").splitlines())
+    return "\n".join(line for line in lines if line and not line.startswith("//"))
+
+
+@cache
+def _own():
+    """The scripts of the page but core.js."""
+    return "\n".join(map(_script, SCRIPTS))
+
+
+@cache
+def _loader():
+    """The script that unpacks the others, with the licence of what is not ours."""
+    licence = "/* Packed in this page: uPlot 1.6.32, copyright (c) 2022 Leon Sorokin, MIT licence:"
+    terms = _read("vendor/uPlot-LICENSE.txt").partition("\n\n")[2]
+    parts = [licence, terms, '*/\n(() => {"use strict";', _script("inflate"), _script("loader")]
+    return "\n".join([*parts, "})();"])

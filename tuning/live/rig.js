@@ -1,0 +1,78 @@
+// The rig as a drawing: tanks with their levels at the cursor, pumps, pipes, jets, overflow.
+
+const SVG = "http://www.w3.org/2000/svg";
+const UNIT = 100; // of the drawing, for the height of the tallest tank
+
+function draw(tag, attributes, text) {
+  const node = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  if (text !== undefined) node.textContent = text;
+  return node;
+}
+
+// rig: data of tuning/live/drawing.py; returns {update({h, r, u, spills})}
+function makeRig(svg, rig, info) {
+  const { left, right, bottom, top } = rig;
+  const X = (x) => (x - left) * UNIT, Y = (y) => (top - y) * UNIT;
+  const points = (path) => path.map(([x, y]) => `${X(x).toFixed(1)},${Y(y).toFixed(1)}`).join(" ");
+  svg.setAttribute("viewBox", `0 0 ${(right - left) * UNIT} ${(top - bottom) * UNIT}`);
+  const add = (...args) => svg.appendChild(draw(...args));
+  const line = (path, name, more = {}) =>
+    add("polyline", { points: points(path), class: name, fill: "none", ...more });
+  add("rect", { class: "water basin", x: X(left + 0.06), y: Y(bottom + 0.2), height: 14,
+    width: (right - left - 0.12) * UNIT });
+  line([[left + 0.06, -0.82], [left + 0.06, bottom + 0.06], [right - 0.06, bottom + 0.06],
+    [right - 0.06, -0.82]], "glass");
+  const risers = rig.risers.map(([pump, , path]) => [pump, line(path, `riser pump${pump % 4}`)]);
+  const jets = rig.jets.map(([tank, path]) => [tank, line(path, "jet")]);
+  const spills = rig.overflows.map(([tank, path]) => [tank, line(path, "spill")]);
+  const tanks = rig.boxes.map(([x, y, width, height, scale], i) => {
+    const place = { x: X(x), width: width * UNIT };
+    add("rect", { class: "inside", ...place, y: Y(y + height), height: height * UNIT });
+    const water = add("rect", { class: "water", ...place, y: Y(y), height: 0 });
+    return { x, y, width, height, scale, water, controlled: info.outputs.includes(i) };
+  });
+  rig.pipes.forEach(([x0, x1, y]) => {
+    line([[x0, y], [x1, y]], "pipe");
+    line([[x0, y], [x1, y]], "pipe inner");
+  });
+  tanks.forEach((tank, i) => {
+    const { x, y, width, height } = tank;
+    const wall = [[x, y + height], [x, y], [x + width, y], [x + width, y + height]];
+    line(wall, tank.controlled ? "wall controlled" : "wall");
+    const middle = { x: X(x + width / 2), "text-anchor": "middle" };
+    const small = width < 0.7 ? " small" : "";
+    add("text", { ...middle, y: Y(y + height / 2) - 4, class: `halo${small}` }, info.tanks[i].name);
+    tank.text = add("text", { ...middle, y: Y(y + height / 2) + 11, class: `halo value${small}` });
+    if (tank.controlled) tank.mark = line([[0, 0], [0, 0]], "setpoint");
+  });
+  rig.pumps.forEach(([x, y], j) => {
+    add("circle", { cx: X(x), cy: Y(y), r: 17, class: `pump pump${j % 4}` });
+    add("polygon", { points: points([[x - 0.1, y - 0.08], [x + 0.1, y - 0.08], [x, y + 0.13]]),
+      class: `rotor pump${j % 4}` });
+    add("text", { x: X(x), y: Y(y) - 22, "text-anchor": "middle", class: "halo small" }, `${j + 1}`);
+  });
+  return {
+    update(now) {
+      tanks.forEach((tank, i) => {
+        const level = now.h[i];
+        const deep = clamp((Number.isFinite(level) ? level : 0) * tank.scale, 0, 1.05 * tank.height);
+        tank.water.setAttribute("y", Y(tank.y + deep));
+        tank.water.setAttribute("height", deep * UNIT);
+        tank.text.textContent = `${shown(level, 3)} ${info.units.length}`;
+        if (!tank.mark) return;
+        const target = clamp(now.r[info.outputs.indexOf(i)] * tank.scale, 0, 1.05 * tank.height);
+        const end = tank.x + tank.width, y = tank.y + target;
+        const arrow = [[end - 0.12, y], [end + 0.03, y], [end + 0.12, y + 0.05], [end + 0.12, y - 0.05],
+          [end + 0.03, y]];
+        tank.mark.setAttribute("points", points(arrow));
+      });
+      risers.forEach(([pump, node]) => node.setAttribute("stroke-opacity", 0.25 + 0.75 * now.share[pump]));
+      jets.forEach(([tank, node]) => {
+        const part = now.h[tank] / info.tanks[tank].rim || 0;
+        node.setAttribute("stroke-opacity", clamp(0.15 + Math.sqrt(Math.max(part, 0)), 0, 1));
+      });
+      spills.forEach(([tank, node]) => node.setAttribute("stroke-opacity", now.spills[tank] ? 1 : 0.2));
+    },
+  };
+}

@@ -1,0 +1,63 @@
+// In a worker, after the text of the engine, the tuner and core.js: searches and many plants.
+
+const engine = makeEngine();
+
+// values of `count` plants about `values`: each leaf of `spread` {name: share} times 1 +- share
+// the controller's and observer's models are leaves of their own, and stay
+function plantsOf(message) {
+  const next = uniform(message.seed + 1);
+  return Array.from({ length: message.count }, () => {
+    const values = { ...message.values };
+    for (const [name, share] of Object.entries(message.spread)) {
+      const factor = 1 + share * (2 * next() - 1);
+      values[name] = message.values[name] * factor;
+    }
+    return values;
+  });
+}
+
+function many(message) {
+  const runs = [];
+  plantsOf(message).forEach((values, i) => {
+    const options = { every: message.every, seed: message.seed + i, filter: message.filter };
+    const run = engine.run(values, { ...options, measures: message.measures });
+    if (!run.broken) runs.push(run);
+    if (i % 4 === 3) postMessage({ kind: "progress", done: i + 1, of: message.count });
+  });
+  const bands = (what) =>
+    (runs.length ? runs[0][what] : []).map((_, i) => {
+      const low = new Float64Array(runs[0].t.length), high = new Float64Array(low.length);
+      for (let k = 0; k < low.length; k += 1) {
+        const sorted = Float64Array.from(runs, (run) => run[what][i][k]).sort();
+        low[k] = quantile(sorted, 0.05);
+        high[k] = quantile(sorted, 0.95);
+      }
+      return { low, high };
+    });
+  const kept = runs.filter((run) => marginsOf(message.limits, run.measures).every((m) => m.margin >= 0));
+  postMessage({
+    kind: "plants",
+    t: runs.length ? runs[0].t : new Float64Array(0),
+    h: bands("h"),
+    u: bands("u"),
+    kept: kept.length,
+    count: message.count,
+    broken: message.count - runs.length,
+  });
+}
+
+onmessage = async (event) => {
+  const message = event.data;
+  try {
+    if (message.kind === "plants") many(message);
+    else {
+      const progress = (now) => postMessage({ kind: "progress", ...now });
+      const { values, free, limits } = message;
+      const options = { filter: message.filter, seed: message.seed };
+      const found = await tune(engine, values, free, limits, progress, () => false, options);
+      postMessage({ kind: "tuned", ...found });
+    }
+  } catch (error) {
+    postMessage({ kind: "failed", text: String((error && error.message) || error) });
+  }
+};

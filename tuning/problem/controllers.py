@@ -1,0 +1,286 @@
+"""A case with a controller of another kind, with gains to start from and ranges to tune in.
+
+Imported by `search.discrete`.
+"""
+
+# the linear models of jaxtank.analysis and the readers of jaxtank.rig have no types
+# pyright: reportUnknownMemberType=false
+# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false
+# pyright: reportMissingParameterType=false
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxtank import presets, rig
+from jaxtank.analysis.linear_model import linearise
+from jaxtank.analysis.riccati import lqr
+from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.case import Case, Free
+from jaxtank.core.errors import EquilibriumError, InputError, unknown
+from jaxtank.core.tree import describe, get_value
+from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of
+from jaxtank.rig.template import around
+
+NAMES = ("controller.kind", "law.kind")
+"""Names by which a choice of the controller is known: in Python, and of the table of a rig file."""
+
+FASTER = 10.0
+"""Ratio of the time constant of the rig to that of the first closed loop [-]."""
+
+DEVIATION, EFFORT = 0.05, 0.25
+"""A level off by the first share of the tanks' height counts as much as an input off by the second
+share of its range (Bryson's rule) [-]."""
+
+
+class Rig(NamedTuple):
+    """What the first gains are computed from: a linear model at a steady state, and sizes."""
+
+    A: np.ndarray  # (n, n) [1/s]
+    B: np.ndarray  # (n, m)
+    C: np.ndarray  # (outputs, n)
+    levels: np.ndarray  # (n,) [unit of length]
+    setpoint: np.ndarray  # (outputs,)
+    low: np.ndarray  # (m,) limits of the inputs
+    high: np.ndarray
+    off: float  # a level off by this much counts ...
+    effort: np.ndarray  # (m,) ... as much as an input off by this much
+    slowest: float  # largest time constant, at most the length of the run [s]
+
+
+def with_kind(case: Case, kind: str) -> Case:
+    """Return a case with a controller of another kind in the place of its own.
+
+    Gains and ranges: of the case itself where it has that kind; else of a case of the same paper
+    that has it on the same plant; else the first gains of `START`, computed from a linear model,
+    and a decade each way, as in the rig file of `jaxtank init`.
+
+    Parameters
+    ----------
+    case : Case
+    kind : name of a controller in rig files
+
+    Raises
+    ------
+    InputError : for an unknown kind, one without gains to start from, and one that does not fit.
+
+    Examples
+    --------
+    >>> case = with_kind(presets.find("cascaded/pi"), "state-feedback")
+    >>> type(case.loop.controller).__name__, list(case.free)
+    ('StateFeedback', ['controller.K'])
+    """
+    known = ROLES["law"].classes
+    if kind not in known:
+        raise unknown("controller kind", str(kind), known)
+    if kind_of("law", case.loop.controller) == kind:
+        return case
+    if kind in REGISTERED or kind not in START:
+        raise InputError(
+            f"controller kind {kind}: has no gains to start from; tune a rig file that has them"
+        )
+    controller, own = _published(case, kind) or _computed(case, kind)
+    loop = dataclasses.replace(case.loop, controller=controller)
+    kept = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
+    found = case.replace(loop=loop, free={**own, **kept}, symmetry=None)
+    return rig.check(rig.filtered(found))
+
+
+def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
+    """Return (controller, ranges) of a case of the same paper on the same plant, None without."""
+    paper = case.name.partition("/")[0]
+    if paper not in presets.PAPERS:
+        return None
+    for other in presets.load(paper).cases.values():
+        if kind_of("law", other.loop.controller) == kind and _same(other, case):
+            free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
+            return other.loop.controller, free
+    return None
+
+
+def _same(one: Case, other: Case) -> bool:
+    """Return whether two cases have the same plant and pumps."""
+    trees = [(case.loop.plant, case.loop.actuator) for case in (one, other)]
+    (mine, form), (theirs, others) = (jax.tree.flatten(tree) for tree in trees)
+    return form == others and all(np.array_equal(a, b) for a, b in zip(mine, theirs))
+
+
+def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
+    """Return (controller, ranges) of a kind with the first gains of `START`."""
+    known = _rig_of(case)
+    table, names = START[kind](known)
+    plant = getattr(case.loop.controller, "model", case.loop.plant)
+    start = [float(np.asarray(case.loop.x0)[i]) for i in plant.outputs]
+    written = {name: np.asarray(value).tolist() for name, value in table.items()}
+    controller = controller_of({"kind": kind, **written}, plant, start, case.loop.actuator.initial)
+    loop = dataclasses.replace(case.loop, controller=controller)
+    free: dict[str, Any] = {}
+    for name in names:
+        dotted = f"controller.{name}"
+        value = np.asarray(get_value(loop, dotted))
+        if name == "K":  # a matrix, whose entries may have either sign
+            largest = 4.0 * float(np.abs(value).max())
+            free[dotted] = Free(-largest, largest, "linear")
+        else:
+            free[dotted] = around(value, describe(loop, dotted))
+    return controller, free
+
+
+def _rig_of(case: Case) -> Rig:
+    """Return what the first gains are computed from.
+
+    Raises InputError where no plateau of the reference has a steady state.
+    """
+    plant: Any = getattr(case.loop.controller, "model", case.loop.plant)
+    pumps = (plant.pumps,)
+    if plant.pumps != len(plant.outputs):
+        raise InputError(
+            f"controllers are chosen on rigs with as many pumps as outputs: this one has"
+            f" {plant.pumps} and {len(plant.outputs)}"
+        )
+    setpoint, levels, inputs = _steady(case, plant)
+    A, B, C = (np.asarray(v, dtype=float) for v in linearise(plant, levels, inputs))
+    actuator: Any = case.loop.actuator
+    low, high = (
+        np.broadcast_to(np.asarray(v, float), pumps) for v in (actuator.low, actuator.high)
+    )
+    span = np.where(np.isfinite(high - low), high - low, 2.0 * np.abs(inputs) + 1e-9)
+    rims = np.asarray(plant.rim, dtype=float)
+    height = float(np.max(rims[np.isfinite(rims)], initial=0.0)) or float(np.max(levels))
+    slow = float(np.min(-np.linalg.eigvals(A).real))
+    slowest = min(1.0 / max(slow, 1e-300), case.clock.duration)
+    return Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
+
+
+def _steady(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (setpoints, levels, inputs) of the last plateau that has a steady state, of the mean
+    setpoints where there are no plateaus.
+    """
+    plateaus = case.loop.reference.plateaus()
+    if plateaus is None:
+        plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
+    for setpoint in reversed(list(plateaus)):
+        try:
+            levels, inputs = (np.asarray(v, float) for v in equilibrium(plant, setpoint))
+        except EquilibriumError:
+            continue
+        return np.asarray(setpoint, dtype=float), levels, inputs
+    raise InputError("no setpoint has a steady state at which first gains could be computed")
+
+
+def _pid(known: Rig) -> Any:
+    """SIMC (Skogestad, J. Process Control 13, 2003) of each pump's own output:
+
+        Kc = tau / (k (tau_c + theta)),  Ti = min(tau, 4 (tau_c + theta)),  tau_c = T / FASTER
+
+    with the steady gain k. A pump that fills its output directly has theta = 0; else half of the
+    other time constants is taken for a dead time.
+    """
+    n, T = len(known.A), known.slowest
+    # a rig that integrates has the gain of its first T seconds
+    gain = known.C @ np.linalg.solve(np.eye(n) * (1e-3 / T) - known.A, known.B)
+    own, direct = np.diag(gain), np.diag(known.C @ known.B)
+    if np.any(np.abs(own) < 1e-9 * np.abs(gain).max()):
+        raise InputError("controller kind pid: a pump does not change its output")
+    rates = np.sort(np.abs(np.linalg.eigvals(known.A).real))
+    others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
+    theta = np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
+    wanted = T / FASTER + theta
+    return {"Kc": T / (np.abs(own) * wanted), "Ti": np.minimum(T, 4.0 * wanted)}, ("Kc", "Ti")
+
+
+def _weights(known: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (n,) of the levels and (m,) of the inputs by Bryson's rule."""
+    return np.full(len(known.A), known.off**-2.0), known.effort**-2.0
+
+
+def _feedback(known: Rig) -> np.ndarray:
+    """(m, n) linear-quadratic gain of the weights of Bryson's rule."""
+    Q, R = _weights(known)
+    gain = np.asarray(lqr(known.A, known.B, np.diag(Q), np.diag(R)), dtype=float)
+    if not np.all(np.isfinite(gain)):
+        raise InputError("the linear model of the rig has no linear-quadratic gain")
+    return gain
+
+
+def _state_feedback(known: Rig) -> Any:
+    return {"K": _feedback(known)}, ("K",)
+
+
+def _lqi(known: Rig) -> Any:
+    Q, R = _weights(known)
+    n, p = len(Q), len(known.C)
+    integrals = np.full(p, (known.off * known.slowest / FASTER) ** -2.0)
+    table = {"Q": np.concatenate([Q, integrals]), "R": R, "operating_point": known.setpoint}
+    return table, (*(f"Q[{i}]" for i in range(n, n + p)), "R")
+
+
+def _horizon(known: Rig) -> Any:
+    return {"Tp": known.slowest / FASTER}, ("Tp",)
+
+
+def _two_gains(first: str, second: str) -> Callable[[Rig], Any]:
+    """Return the rule of two gains [1/s], each of which is a pole of the closed loop."""
+
+    def rule(known: Rig) -> Any:
+        rate = FASTER / known.slowest
+        return {first: rate, second: rate}, (first, second)
+
+    return rule
+
+
+def _sliding(known: Rig) -> Any:
+    surface = 1.0 / known.slowest
+    phi = known.off * surface
+    return {"surface": surface, "ks": FASTER * surface * phi, "phi": phi}, ("surface", "ks", "phi")
+
+
+def _fuzzy(known: Rig) -> Any:
+    if known.B.shape != (4, 2):
+        n, m = known.B.shape
+        raise InputError(
+            f"controller kind fuzzy: is of the quadruple tank, with 4 tanks and 2 pumps; this rig"
+            f" has {n} and {m}"
+        )
+    table, names = _sliding(known)
+    near = np.full(len(known.C), known.off)
+    table |= {"K": _feedback(known), "b": near, "w": 0.5 * near, "low": known.low}
+    return table | {"high": known.high}, (*names, "b", "w")
+
+
+def _predictive(known: Rig) -> Any:
+    """Levels that differ where pipes join them; limits of the inputs as those of the pumps."""
+    span = known.high - known.low
+    return {
+        "operating_point": known.levels,
+        "r_w": (known.off / float(np.mean(known.effort))) ** 2,
+        "q": np.ones(len(known.C)),
+        "du_limit": np.where(np.isfinite(span), span, 4.0 * known.effort),
+        "u_low": known.low,
+        "u_high": known.high,
+    }, ("r_w",)
+
+
+def _laguerre(known: Rig) -> Any:
+    table, names = _predictive(known)
+    return table | {"a": np.full(len(known.C), 0.5)}, (*names, "a")
+
+
+START: dict[str, Callable[[Rig], Any]] = {
+    "pid": _pid,
+    "state-feedback": _state_feedback,
+    "lqi": _lqi,
+    "ngpc": _horizon,
+    "backstepping": _two_gains("k", "k1"),
+    "enmpc": _horizon,
+    "two-tank-backstepping": _two_gains("K_phi", "K_y"),
+    "sliding-mode": _sliding,
+    "fuzzy": _fuzzy,
+    "gpc": _predictive,
+    "laguerre": _laguerre,
+}
+"""{kind: rule (Rig) -> ({field: first value}, names of those that are tuned)}."""
