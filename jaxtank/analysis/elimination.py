@@ -24,11 +24,11 @@ def rolled() -> Iterator[None]:
     Examples
     --------
     >>> with rolled():
-    ...     isinstance(factor(jnp.eye(2)), list)
+    ...     isinstance(factor(jnp.eye(4)), list)
     False
     """
     global UNROLLED
-    before, UNROLLED = UNROLLED, 0
+    before, UNROLLED = UNROLLED, STAGES - 1
     try:
         yield
     finally:

@@ -4,7 +4,7 @@ Imported by `tuning.live.engine`.
 """
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, cast
 
 from jaxtank.export.statements import (
     TRUTH,
@@ -96,7 +96,7 @@ class Printed:
         while True:
             after = [*wanted, *lines, *(self.loop.after[i] for i in live)]
             found = refs(used(every, names(after)), after)
-            new = sorted(e.index for e in found if e.name == "c")
+            new = sorted(cast(int, e.index) for e in found if e.name == "c")
             if new == live:
                 return live
             live = new
@@ -265,7 +265,7 @@ class Printed:
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 
-def place(e: Ref) -> tuple[str, int]:
+def place(e: Ref) -> tuple[str, Any]:
     """Return what Refs are sorted by."""
     return e.name, -1 if e.index is None else e.index
 

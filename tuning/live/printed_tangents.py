@@ -11,8 +11,8 @@ class PrintedTangents(Printed):
     """The printed functions of a TangentLoop: lead, signals, read, as those of `Printed`, and
 
     aim(q, d) -> [numbers for push, for slope, tangents of c, delay lines], of a direction d with
-    the fourth numbers of lead; push(q, c, L, S, N, k, K, P, D, T, M, G) moves the state and the tangents
-    T of P directions over samples k to K - 1 and adds to G, the Gauss-Newton matrix;
+    the fourth numbers of lead; push(q, c, L, S, N, k, K, P, D, T, M, G) moves the state and the
+    tangents T of P directions over samples k to K - 1 and adds to G, the Gauss-Newton matrix;
     slope(q, c, D, T) -> the measures' derivatives along one direction, with the fifth numbers.
     """
 

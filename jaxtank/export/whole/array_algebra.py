@@ -3,8 +3,8 @@
 Imported by `jaxtank.export.whole.array_text`.
 """
 
-import jax
 import numpy as np
+from jax.core import eval_jaxpr
 
 from jaxtank.export.primitives import REDUCTIONS, no_code
 from jaxtank.export.whole.array_moves import view
@@ -97,7 +97,7 @@ def _block(closed, shape):
     consts = [rng.random(v.aval.shape) for v in closed.jaxpr.invars[:-1]]
 
     def matvec(z):
-        return np.array(jax.core.eval_jaxpr(closed.jaxpr, closed.consts, *consts, z)[0])
+        return np.array(eval_jaxpr(closed.jaxpr, closed.consts, *consts, z)[0])
 
     for across in (False, True):
         z = np.zeros(shape)

@@ -3,6 +3,8 @@
 Imported by `jaxtank.export.whole.array_text`.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from jaxtank.export.primitives import no_code
 from jaxtank.export.whole.array_values import is_literal, listed, strides_of
 
 
-def view(text, operand, shape, strides, start="0"):
+def view(text, operand, shape, strides, start: Any = 0):
     """A view of an array as a new one; itself where nothing moves."""
     return text.let(f"view({operand},{listed(shape)},{listed(strides)},{start})")
 

@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Literal
 
 from jaxtank.export.lowering import Writer
@@ -199,7 +199,7 @@ class _Scalar:
     """A variable of a scalar program that stands for an array's element."""
 
     def __init__(self, aval):
-        self.aval = jax.core.ShapedArray((), aval.dtype)
+        self.aval = ShapedArray((), aval.dtype)
 
 
 def _scalar(v):

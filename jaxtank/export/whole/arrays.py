@@ -93,7 +93,7 @@ class ArrayWriter(Writer):
         """The name of an array with these elements: a result, a part of one, or a new one."""
         entries = tuple(operand.ravel())
         first = entries[0] if entries else None
-        if isinstance(first, Ref) and first.index is not None and first.name in self.sizes:
+        if isinstance(first, Ref) and isinstance(first.index, int) and first.name in self.sizes:
             follows = tuple(Ref(first.name, first.index + i) for i in range(len(entries)))
             if entries == follows:
                 if first.index == 0 and len(entries) == self.sizes[first.name]:

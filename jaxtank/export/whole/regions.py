@@ -216,8 +216,9 @@ def kept_in_time(
         if rank[ref.name] == 0 or ref in kept or ref.name == "k":
             return True
         s = made.get(ref.name)
-        cheap = s is not None and s.op in CHEAP and depth > 0
-        return cheap and all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
+        if s is None or s.op not in CHEAP or depth == 0:
+            return False
+        return all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
 
     for ref in sorted(wanted, key=lambda r: order(timed, r), reverse=True):
         s = made.get(ref.name)

@@ -29,6 +29,9 @@ from jaxtank.export.whole.loop import (
 )
 from jaxtank.loop.closed_loop import run_of
 
+LINEAR = ("product", "forward", "backward", "solve")
+"""Matrix operations that give 0 for a last operand of 0."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TangentLoop:
@@ -240,17 +243,12 @@ def pruned(
         elif isinstance(s, Array):
             arrays[s.name] = entries = tuple(known.get(a, a) for a in s.entries)
             kept.append(s._replace(entries=entries))
-        elif _is_linear(s) and _is_nothing(arrays.get(s.operands[-1])):
+        elif isinstance(s, Matrix) and s.op in LINEAR and _is_nothing(arrays.get(s.operands[-1])):
             for i in range(s.sizes[0] * s.sizes[-1]):
                 known[Ref(s.name, i)] = 0.0
         else:
             kept.append(_put_in(s, known))
     return kept, known
-
-
-def _is_linear(s):
-    """Whether a statement is an operation that gives 0 for a last operand of 0."""
-    return isinstance(s, Matrix) and s.op in ("product", "forward", "backward", "solve")
 
 
 def _is_nothing(entries):

@@ -1,4 +1,4 @@
-"""The engine of a live page, run by node, against the library: runs, noise, derivatives, searches."""
+"""The engine of a live page, run by node, against the library: runs, noise, slopes, searches."""
 
 import json
 import shutil
@@ -26,7 +26,8 @@ SHORT = {
 LONG = [n for n in presets.names() if n not in ("cascaded/pi", "gouta2015/backstepping")]
 
 RUN = """
-const text = (m) => Object.fromEntries(Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]));
+const entries = (m) => Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]);
+const text = (m) => Object.fromEntries(entries(m));
 const d = JSON.parse(require("fs").readFileSync(0)), e = makeEngine();
 console.log(JSON.stringify(d.settings.map((s) => {
   const r = e.run(s, { every: d.every, seed: d.seed, filter: d.filter });
@@ -42,7 +43,7 @@ console.log(JSON.stringify([e.info.free, jacobian, Array.from(r.gauss_newton)]))
 """
 SEARCH = """
 const e = makeEngine();
-console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 1 })));
+console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 3 })));
 """
 
 
@@ -147,26 +148,28 @@ def test_derivatives_are_those_of_the_library(name):
 def test_a_search_ends_where_a_scan_has_its_minimum():
     """Of one gain, within 0.5 % of the cost of the best of 60 values."""
     case = presets.find("cascaded/pi").replace(limits={})
-    case = case.replace(free={"controller.Kc": case.free["controller.Kc"]})
+    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
     search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     scan = []
-    for gain in np.geomspace(0.01, 5.0, 60):
+    for gain in np.geomspace(0.05, 3.3, 60):
         loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
-        scan.append(float(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"]))
+        scan.append(
+            float(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"])
+        )
     assert found["status"] == "converged" and found["violation"] == 0
     assert found["objective"] <= 1.005 * min(scan)
 
 
 def test_a_search_keeps_the_limits():
     """The answer, run by the library: no limit is passed."""
-    case = short("gouta2015/backstepping")
+    case = short("gouta2015/backstepping").replace(limits={"max_level": 17.0})
     search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     loop = jaxtank.with_values(case.loop, found["values"])
     levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
     start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
-    assert np.max(start) > 30.0 >= np.max(levels) > 29.9
+    assert np.max(start) > 17.0 >= np.max(levels) > 16.9
 
 
 def test_names_of_a_rig_stay_text():

@@ -62,10 +62,10 @@ def _add_export(commands, parents):
     one = commands.add_parser(
         "export",
         parents=parents,
-        help="the controller and its observer as one C99 file or MATLAB function",
+        help="the controller and its observer as one C99 or JavaScript file or MATLAB function",
     )
     one.set_defaults(run=export)
-    option(one, "--lang", "LANG", "c (default) or m", "c")
+    option(one, "--lang", "LANG", "c (default), m or js", "c")
     option(one, "--precision", "TYPE", "double (default) or float, of C", "double")
     option(one, "--name", "NAME", "of the functions (default: the case's)")
     option(one, "--out", "DIR", "folder for the file (default: print it)")
