@@ -17,7 +17,9 @@ function tune(engine, values, free, limits, onProgress, shouldStop, options) {
   const report = () => onProgress && onProgress(search.found());
   const stop = () => Boolean(shouldStop && shouldStop());
   let status = local(search, search.start, most, report, stop);
-  for (const z of status === "stopped" ? [] : others(search, starts, stop)) {
+  // where no point that keeps the limits was found, the least violation may be far from here
+  const wanted = search.found().violation > 0 ? Math.max(starts, 4) : starts;
+  for (const z of status === "stopped" ? [] : others(search, wanted, stop)) {
     const next = local(search, z, most, report, stop);
     if (next === "stopped") status = next;
     if (stop()) break;
