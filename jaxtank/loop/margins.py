@@ -70,7 +70,7 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     >>> case = presets.find("cascaded/pi")
     >>> first = jaxtank.stability_margins(case.loop, case.clock)[0]
     >>> first.stable, round(float(first.margins.sensitivity_peak), 2)
-    (True, 1.44)
+    (True, 1.86)
     """
     if not serves(loop):
         return ()

@@ -16,6 +16,10 @@ import time
 
 SIGNALS = {_signal.SIGINT: b"interrupted", _signal.SIGTERM: b"terminated"}
 
+SAME = 0.3
+"""Time within which a signal that comes twice is one [s]: `timeout` sends it to the program and to
+its group."""
+
 _searches = []  # the Interrupts that takes the signals, if any
 _before = []  # what is called before the process ends
 _leaving = _thread.allocate_lock()
@@ -125,7 +129,7 @@ class Interrupts:
 
     def __init__(self):
         self.stop = self.taken = False
-        self.number = _signal.SIGINT
+        self.number, self.since = _signal.SIGINT, 0.0
 
     @property
     def code(self):
@@ -134,9 +138,11 @@ class Interrupts:
 
     def interrupt(self, number=_signal.SIGINT, *_):
         """The handler of a signal."""
+        if self.stop and number == self.number and time.monotonic() - self.since < SAME:
+            return
         if self.stop:
             leave(number, b"stopped at once")
-        self.stop, self.number = True, number
+        self.stop, self.number, self.since = True, number, time.monotonic()
         again = b"Ctrl-C again" if number == _signal.SIGINT else b"a second signal"
         say(SIGNALS[number] + b", finishing with the best point so far (%b stops at once)" % again)
 

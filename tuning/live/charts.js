@@ -47,7 +47,7 @@ function makeChart(host, spec, view, on) {
         y: { range: () => state.range },
       },
       axes: [
-        { ...axis, size: 24, space: 48, gap: 3, values: (u, at) => at.map((t) => shown(t, 6)) },
+        { ...axis, size: 24, space: 48, gap: 3, values: (u, at) => at.map((t, i) => shown(t, 6) + (i === at.length - 1 ? " s" : "")) },
         { ...axis, size: 46, space: 26, gap: 4, values: (u, at) => at.map((v) => shown(v, 5)) },
       ],
       series,

@@ -80,9 +80,9 @@ function readLink(text, leaves, hasFilter) {
     } else if (known.has(name) && Number.isFinite(value)) {
       const s = scaleOf(known.get(name));
       found.values[name] = clamp(value, s.low, s.high);
-      if (found.values[name] !== value) found.notes.push(`${name} was brought into its range.`);
+      if (found.values[name] !== value) found.notes.push(`${name} was moved to the end of its range.`);
     } else {
-      found.notes.push(`The link sets ${name.slice(0, 60) || "something"}, which this page has not.`);
+      found.notes.push(`The link sets ${name.slice(0, 60) || "something"}, which this page does not have.`);
     }
   }
   return found;

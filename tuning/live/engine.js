@@ -176,7 +176,7 @@ function makeEngine() {
     const [forSignals, forPush, forRead, forAim, forSlope, state, lines] = program.lead(p);
     const P = names.length, aims = names.map((name) => {
       const d = new Float64Array(program.along.length), i = program.along.indexOf(name);
-      if (i < 0) throw new Error(`${name}: this text has no derivatives by it`);
+      if (i < 0) throw new Error(`no derivative with respect to ${name} in this page`);
       d[i] = 1;
       return program.aim(forAim, d);
     });

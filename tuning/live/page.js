@@ -188,7 +188,7 @@ function showTables() {
     const which = `${limitWords(worst.limit)}: ${shown(worst.value)} ${worst.limit.unit}`;
     verdict = good
       ? `Every limit holds, smallest margin ${shown(worst.margin, 3)} ${worst.limit.unit}`
-      : `Limit passed by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`;
+      : `Limit exceeded by ${shown(-worst.margin, 3)} ${worst.limit.unit}: ${which}`;
   }
   $("verdict").textContent = verdict;
   $("verdict").className = good ? "good" : "bad";
@@ -442,7 +442,7 @@ function tuneNow() {
   }
   pin("before tuning");
   const words = (found) => `objective ${shown(found.objective)}${
-    found.violation > 0 ? `, limits passed by ${shown(100 * found.violation, 3)} %` : ""}`;
+    found.violation > 0 ? `, limits exceeded by ${shown(100 * found.violation, 3)} %` : ""}`;
   ask({ kind: "tune", values: start, free: names, limits: info.limits, ...options() }, {
     progress(now) {
       if (!best || now.values) best = now;
