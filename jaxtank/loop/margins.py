@@ -114,10 +114,11 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     one = functools.partial(_compiled, bare, dataclasses.replace(clock, duration=clock.dt))
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((bare, r))):
         # one after the other: a program for one of them is compiled in half the time
-        return r, *jax.lax.map(one, r)
+        each: tuple[Any, ...] = jax.lax.map(one, r)
+        return (r, *each)
     rows = [one(v) for v in r]  # by one program, however many there are
-    stacked: Any = jax.tree.map(_stacked, *rows)
-    return r, *stacked
+    stacked: tuple[Any, ...] = jax.tree.map(_stacked, *rows)
+    return (r, *stacked)
 
 
 def _stacked(*values: Any) -> Any:
