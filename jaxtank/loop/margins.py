@@ -8,7 +8,7 @@ May import `loop.operating_point` and the folders below `jaxtank.loop`.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -114,11 +114,9 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     one = functools.partial(_compiled, bare, dataclasses.replace(clock, duration=clock.dt))
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((bare, r))):
         # one after the other: a program for one of them is compiled in half the time
-        each: tuple[Any, ...] = jax.lax.map(one, r)
-        return (r, *each)
+        return (r, *cast(tuple[Any, ...], jax.lax.map(one, r)))
     rows = [one(v) for v in r]  # by one program, however many there are
-    stacked: tuple[Any, ...] = jax.tree.map(_stacked, *rows)
-    return (r, *stacked)
+    return (r, *cast(tuple[Any, ...], jax.tree.map(_stacked, *rows)))
 
 
 def _stacked(*values: Any) -> Any:
