@@ -28,7 +28,7 @@ LONG = [n for n in presets.names() if n not in ("cascaded/pi", "gouta2015/backst
 RUN = """
 const entries = (m) => Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]);
 const text = (m) => Object.fromEntries(entries(m));
-const d = JSON.parse(require("fs").readFileSync(0)), e = makeEngine();
+const d = GIVEN, e = makeEngine();
 console.log(JSON.stringify(d.settings.map((s) => {
   const r = e.run(s, { every: d.every, seed: d.seed, filter: d.filter });
   const part = (a) => a.map((column) => Array.from(column, String));
@@ -36,7 +36,7 @@ console.log(JSON.stringify(d.settings.map((s) => {
 })));
 """
 SLOPES = """
-const d = JSON.parse(require("fs").readFileSync(0)), e = makeEngine();
+const d = GIVEN, e = makeEngine();
 const r = e.tangents(d.values, e.info.free, { seed: d.seed });
 const jacobian = Object.entries(r.jacobian).map(([k, v]) => [k, Array.from(v)]);
 console.log(JSON.stringify([e.info.free, jacobian, Array.from(r.gauss_newton)]));
@@ -48,14 +48,9 @@ console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, {
 
 
 def node(script, given=None):
-    """What a script prints, as JSON; it reads `given` as JSON."""
-    done = subprocess.run(
-        [NODE, "-"] if given is None else [NODE, "-e", script],
-        input=script if given is None else json.dumps(given),
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+    """What a script prints, as JSON; it knows `given` as GIVEN."""
+    text = f"const GIVEN = {json.dumps(given)};\n{script}"
+    done = subprocess.run([NODE, "-"], input=text, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
