@@ -33,8 +33,8 @@ def text(loop, plateaus):
     >>> jax.config.update("jax_enable_x64", True)
     >>> case = presets.find("cascaded/pi")
     >>> found = jaxtank.stability_margins(case.loop, case.clock)
-    >>> print(text(case.loop, found).splitlines()[3])
-    4 V                   1.86  17.3              37.9                35.9
+    >>> print(*text(case.loop, found).splitlines()[3].split())
+    4 V 1.86 17.3 37.9 35.9
     """
     if not plateaus:
         return "no stability margins: the reference holds no setpoints"
