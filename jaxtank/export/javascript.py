@@ -44,6 +44,7 @@ class JavaScript(Printer):
     constant, variable = "const {name} = {value};", "let {name} = {value};"
     open_array = "const {name} = ["
     matrix_call = "const {name} = {op}({arguments});"
+    matrices = ("product", "cholesky", "forward", "backward", "solve")
     counted, endless, end = "for (let i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
     until = "if (!({0})) break;"
 

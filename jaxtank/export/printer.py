@@ -66,6 +66,8 @@ class Printer:
     open_array, close_array, line_break = "{name} = [", "];", ""
     matrix_call = ""
     """A Matrix statement, of name, op, size and arguments; "": the language has none."""
+    matrices = ("product", "cholesky", "forward", "backward")
+    """Operations of Matrix statements that the language has."""
     counted, endless, end = "for i = 1:{0}", "while true", "end"
     until = "if not ({0}) break"
 
@@ -121,7 +123,7 @@ class Printer:
         return [*rows, line.rstrip(", ") + self.close_array]
 
     def _matrix(self, s):
-        if not self.matrix_call:
+        if not self.matrix_call or s.op not in self.matrices:
             raise InputError(f"--lang: this language has no counterpart of the operation {s.op}")
         rows = {"product": lambda m, k, n: m * n, "cholesky": lambda n: n * n}
         size = rows.get(s.op, lambda n, k: n * k)(*s.sizes)

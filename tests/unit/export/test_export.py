@@ -22,7 +22,11 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
+from jaxtank.export.c import C
+from jaxtank.export.javascript import JavaScript
+from jaxtank.export.matlab import Matlab
 from jaxtank.export.source import export
+from jaxtank.export.statements import Matrix
 from jaxtank.plants.network import network
 from jaxtank.rig import lines as rig_lines
 from tuning.cli import main
@@ -733,3 +737,14 @@ def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
         ["export", "cascaded/pi", f"--name={name}", "--out", str(tmp_path / "out")]
     ) == (2 if name else 0)
     assert (tmp_path / "out").exists() is not bool(name)
+
+
+@pytest.mark.parametrize("language", [C, Matlab, JavaScript])
+def test_a_matrix_operation_without_counterpart_is_refused(language):
+    """A linear solve with any matrix: JavaScript has it, C and MATLAB have not."""
+    solve = Matrix("m1", "solve", ("a1", "a2"), (2, 1))
+    if language is JavaScript:
+        assert "solve(2, 1, a1, a2)" in "\n".join(language().lines([solve]))
+    else:
+        with pytest.raises(InputError, match="no counterpart of the operation solve"):
+            language().lines([solve])
