@@ -80,8 +80,11 @@ def _why(measure, values):
 
 
 def _unserved():
-    """{measure: why a case has none} of those that are reported where they are not computed."""
-    return {m: spec.unserved for m, spec in ms.MEASURES.items() if spec.unserved}
+    """{measure: why a case has none} of those that are reported where they are not computed; not
+    those of the linearised loop, which are computed only where they are named.
+    """
+    named = ms.linear()
+    return {m: s.unserved for m, s in ms.MEASURES.items() if s.unserved and m not in named}
 
 
 def measures_json(measures):

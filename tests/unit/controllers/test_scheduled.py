@@ -301,7 +301,9 @@ def test_names_units_and_ranges_are_those_of_the_gains():
     assert describe(loop, "controller.law.Tt")["unit"] == "s"
     with pytest.raises(InputError, match=r"free controller.values\[2,0\] = 0 s: must be above 0 s"):
         rig.check_free(loop, "controller.values[2,0]", 0.0, 3.0)
-    with pytest.raises(InputError, match=r"free controller.values = -1 V/cm"):
+    # a gain Kc may be negative, a time may not
+    rig.check_free(loop, "controller.values[0,0]", -1.0, 3.0)
+    with pytest.raises(InputError, match=r"free controller.values = -1 s: must be above 0 s"):
         rig.check_free(loop, "controller.values", -1.0, 3.0)
     in_metres = on(presets.find("calofir/backstepping"), ("K_phi",), "r1", (0.1, 0.2)).loop
     assert describe(in_metres, "controller.knots")["unit"] == "m"
