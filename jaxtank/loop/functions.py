@@ -62,11 +62,25 @@ def needed_by(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> tuple[s
     return tuple(dict.fromkeys([*(n for n in names if n not in own), *read]))
 
 
+_PROGRAMS: dict[Any, str] = {}
+"""{(name, structure of the loop, clock): program of the function as it was last compiled}."""
+
+
 def check_functions(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> None:
     """Raise InputError for a function among `names` that jax cannot trace, that reads a measure
     which this rig does not have, or that does not return one real number.
+
+    A function whose program is another than at the last call, because a number that it closes over
+    or a global one has changed, is compiled again: jax would run the first one.
     """
     needed_by(loop, clock, names)
+    for name in ms.functions(names):
+        where = name, jax.tree.structure(loop), clock
+        text = program_of(loop, clock, name)
+        if _PROGRAMS.setdefault(where, text) != text:
+            jax.clear_caches()
+            _PROGRAMS.clear()
+            _PROGRAMS[where] = text
 
 
 def values_of(

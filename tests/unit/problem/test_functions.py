@@ -412,3 +412,21 @@ def test_a_measure_of_an_installed_package_is_known_by_its_name(watertank, monke
     values = jaxtank.evaluate(watertank.loop, watertank.clock, ["theirs", "input_travel"])
     assert values["theirs"] > values["input_travel"].sum()
     assert ms.unreadable(["theirs"]) == ()
+
+
+def test_a_number_that_a_function_reads_may_change_between_calls(four_tanks):
+    """jax keeps a compiled program by the identity of the function, not by what it closes over."""
+    price = [1.0]
+
+    def cost(measures, trajectory):
+        return price[0] * jnp.mean(jnp.abs(trajectory.e))
+
+    def before():
+        problem = tuning.Problem(four_tanks, objective=cost, limits={})
+        return problem.point(problem.start()).cost
+
+    first = before()
+    price[0] = 10.0
+    assert before() == pytest.approx(10.0 * first, rel=1e-12)
+    price[0] = 1.0
+    assert before() == pytest.approx(first, rel=1e-12)
