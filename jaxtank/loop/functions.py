@@ -75,7 +75,7 @@ def check_functions(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> N
     """
     needed_by(loop, clock, names)
     for name in ms.functions(names):
-        where = name, jax.tree.structure(loop), clock
+        where: Any = (name, jax.tree.structure(loop), clock)
         text = program_of(loop, clock, name)
         if _PROGRAMS.setdefault(where, text) != text:
             jax.clear_caches()
