@@ -2,6 +2,7 @@
 gouta2022 notes S4.5).
 """
 
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.vectors import each, is_array, take
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Signal
 
@@ -22,12 +24,12 @@ LOWEST, HIGHEST, SECTIONS = 1e-3, 1e2, 5  # Oustaloup's band [rad/s] and N: 2N +
 
 
 class Memory(NamedTuple):
-    """State of the loops: tuples with one entry per pump."""
+    """State of the loops: vectors with one entry per pump."""
 
-    integral: tuple  # integral action I [V]
-    slow: tuple  # filtered level [cm], empty without derivative action
+    integral: Any  # integral action I [V]
+    slow: Any  # filtered level [cm], empty without derivative action
     sections: tuple  # states of the fractional filter, a tuple per loop, empty without
-    error: tuple  # r - y of this sample [cm]
+    error: Any  # r - y of this sample [cm]
 
 
 def oustaloup(g):
@@ -115,6 +117,11 @@ class PID(Controller):
         "-", "add the model's input on the reference", choices=(False, True), default=False
     )
 
+    @property
+    def arrays(self) -> bool:
+        """Vectors of many tanks may be arrays, but with feed-forward and of fractional order."""
+        return not self.feed_forward and self.order is None
+
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         if not self.feed_forward:
@@ -128,50 +135,66 @@ class PID(Controller):
         return self.feed_forward
 
     def init(self, x0: tuple, u0: tuple) -> Any:
-        zero, loops = 0.0 * u0[0], range(len(u0))
+        none = 0.0 * u0 if is_array(u0) else (0.0 * u0[0],) * len(u0)
         return Memory(
-            integral=(zero,) * len(u0),
-            slow=() if self.Td is None else tuple(x0[i] for i in self.model.outputs),
-            sections=(
-                () if self.order is None else tuple((zero,) * (2 * SECTIONS + 1) for _ in loops)
-            ),
-            error=(zero,) * len(u0),
+            integral=none,
+            slow=() if self.Td is None else take(x0, self.model.outputs),
+            sections=() if self.order is None else tuple((z,) * (2 * SECTIONS + 1) for z in none),
+            error=none,
         )
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        base = tick.plan if self.feed_forward else tuple(self.bias[i] for i in range(len(tick.r)))
-        y = tuple(estimate.x[i] for i in self.model.outputs)
-        e = tuple(r - level for r, level in zip(tick.r, y))
-        v = tuple(base[i] + self.Kc[i] * e[i] + state.integral[i] for i in range(len(e)))
+        base = tick.plan if self.feed_forward else self.bias
+        y = take(estimate.x, self.model.outputs)
+        e = each(operator.sub, tick.r, y)
+        v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
         slow = state.slow
         if self.Td is not None:
             # (y - slow)/Tf is the filtered derivative; the lag is exact for a level held over the
             # sample
-            v = tuple(v[i] - (FILTER * self.Kc[i]) * (y[i] - slow[i]) for i in range(len(v)))
-            slow = tuple(
-                slow[i] + (1.0 - jnp.exp(-tick.dt * FILTER / self.Td[i])) * (y[i] - slow[i])
-                for i in range(len(v))
+            v = each(lambda v, k, y, s: v - (FILTER * k) * (y - s), v, self.Kc, y, slow)
+            slow = each(
+                lambda y, s, Td: s + (1.0 - jnp.exp(-tick.dt * FILTER / Td)) * (y - s),
+                y,
+                slow,
+                self.Td,
             )
         return v, state._replace(slow=slow, error=e)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        loops, integral, sections = range(len(command)), [], []
-        for i in loops:
-            w = state.error[i] + (self.Ti[i] / (self.Tt[i] * self.Kc[i])) * (
-                applied[i] - command[i]
+        w = each(
+            lambda v, u, e, Ti, Tt, Kc: e + (Ti / (Tt * Kc)) * (u - v),
+            command,
+            applied,
+            state.error,
+            self.Ti,
+            self.Tt,
+            self.Kc,
+        )
+        if self.order is None:
+            integral = each(
+                lambda w, i, Kc, Ti: i + (tick.dt * Kc / Ti) * w,
+                w,
+                state.integral,
+                self.Kc,
+                self.Ti,
             )
-            if self.order is None:
-                integral.append(state.integral[i] + (tick.dt * self.Kc[i] / self.Ti[i]) * w)
-                continue
+            return state._replace(integral=integral)
+        return self._fractional(state, tick, w)
+
+    def _fractional(self, state, tick, w):
+        """The state after errors w (m,) at the input of fractional integrals."""
+        integral, sections = [], []
+        for i, error in enumerate(w):
             gain, poles, residues = oustaloup(1.0 - self.order[i])
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
-            rate = gain * w + sum(state.sections[i])
+            rate = gain * error + sum(state.sections[i])
             integral.append(
                 state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -self.order[i] * rate
             )
             sections.append(
-                tuple(keep[j] * s + enter[j] * w for j, s in enumerate(state.sections[i]))
+                tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))
             )
         return state._replace(integral=tuple(integral), sections=tuple(sections))
 

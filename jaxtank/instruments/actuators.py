@@ -14,6 +14,7 @@ from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip, lower_clip
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.vectors import each, is_array, unzipped
 from jaxtank.instruments.base import Actuator
 
 SATURATIONS = ("clip", "boxqp")
@@ -21,12 +22,12 @@ DEAD_ZONES = ("plain", "offset", "hysteresis", "pulse")
 
 
 class ActuatorState(NamedTuple):
-    """Memory of the pumps: tuples with one entry per pump, empty where a feature is not in use."""
+    """Memory of the pumps: vectors with one entry per pump, () where a feature is not in use."""
 
-    running: tuple  # 1.0 while a pump with hysteresis turns
-    owed: tuple  # volt-seconds the pulse compensation still owes [V s]
-    lagged: tuple  # voltage behind the lag [V]
-    line: tuple  # (delay samples,) ring buffer of each pump [V]
+    running: Any  # 1.0 while a pump with hysteresis turns
+    owed: Any  # volt-seconds the pulse compensation still owes [V s]
+    lagged: Any  # voltage behind the lag [V]
+    line: Any  # (delay samples,) ring buffer of each pump [V]; one (delay samples, m) of arrays
     head: Any  # where the ring buffers are read and written
 
 
@@ -118,16 +119,29 @@ class PumpBank(Actuator):
         """Whether there is a dead zone of one of these kinds."""
         return self.dead_zone is not None and self.dead_zone_kind in kinds
 
+    arrays = True
+
     def init(self, clock: Clock) -> ActuatorState:
         """Return the state before the first sample: pumps turning steadily at `initial`."""
-        start = tuple(self.initial[i] for i in range(self.pumps))
-        zero = tuple(0.0 * s for s in start)
+        return self._begin(tuple(self.initial[i] for i in range(self.pumps)), clock)
+
+    def init_arrays(self, clock: Clock) -> ActuatorState:
+        """Return that state for vectors that are arrays."""
+        return self._begin(jnp.asarray(self.initial), clock)
+
+    def _begin(self, start, clock):
+        zero = each(lambda s: 0.0 * s, start)
         delay = round(self.delay / clock.dt)
+        line = ()
+        if delay and is_array(start):
+            line = jnp.broadcast_to(start, (delay, self.pumps))
+        elif delay:
+            line = tuple(jnp.broadcast_to(s, (delay,)) for s in start)
         return ActuatorState(
-            running=tuple(z + 1.0 for z in zero) if self._has_dead_zone("hysteresis") else (),
+            running=each(lambda z: z + 1.0, zero) if self._has_dead_zone("hysteresis") else (),
             owed=zero if self._has_dead_zone("pulse") else (),
             lagged=self._turning(start) if self.lag is not None else (),
-            line=tuple(jnp.broadcast_to(s, (delay,)) for s in start) if delay else (),
+            line=line,
             head=jnp.int32(0),
         )
 
@@ -142,7 +156,7 @@ class PumpBank(Actuator):
             u, state = self._dead_zone(state, u, dt)
         if self.lag is not None:
             u, state = self._lagged(state, self._turning(u), dt)
-        return _delayed(state, u) if state.line else (u, state)
+        return _delayed(state, u) if len(state.line) else (u, state)
 
     def driving(self, u: tuple) -> tuple:
         """Return the part of the inputs `u` (m,) [V] at the plant that moves liquid: u less an
@@ -150,7 +164,7 @@ class PumpBank(Actuator):
         """
         if not self._has_dead_zone("offset"):
             return u
-        return tuple(lower_clip(v - self.dead_zone[i], 0.0) for i, v in enumerate(u))
+        return each(lambda v, least: lower_clip(v - least, 0.0), u, self.dead_zone)
 
     def _turning(self, u):
         """Input of the lag: with an "offset" dead zone nothing below it, so that noise is rectified
@@ -158,57 +172,66 @@ class PumpBank(Actuator):
         """
         if not self._has_dead_zone("offset"):
             return u
-        return tuple(lower_clip(v, self.dead_zone[i]) for i, v in enumerate(u))
+        return each(lower_clip, u, self.dead_zone)
 
     def _lagged(self, state, u, dt):
         """(means of the lagged inputs over a sample, new state) for inputs u held over it."""
-        # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
-        slow = [self.lag[i] > 0 for i in range(self.pumps)]
-        keep = [
-            jnp.where(s, jnp.exp(-dt / jnp.where(s, self.lag[i], 1.0)), 0.0)
-            for i, s in enumerate(slow)
-        ]
-        # distance of the lagged input from its target at the start of the sample
-        short = [v - u[i] for i, v in enumerate(state.lagged)]
-        state = state._replace(lagged=tuple(u[i] + keep[i] * s for i, s in enumerate(short)))
-        return (
-            tuple(u[i] + self.lag[i] / dt * (1.0 - keep[i]) * s for i, s in enumerate(short)),
-            state,
-        )
+
+        def follow(v, lag, lagged):
+            # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
+            slow = lag > 0
+            keep = jnp.where(slow, jnp.exp(-dt / jnp.where(slow, lag, 1.0)), 0.0)
+            short = lagged - v  # from its target at the start of the sample
+            return v + keep * short, v + lag / dt * (1.0 - keep) * short
+
+        lagged, mean = unzipped(u, each(follow, u, self.lag, state.lagged))
+        return mean, state._replace(lagged=lagged)
 
     def _dead_zone(self, state, u, dt):
         """(inputs behind a "plain", "hysteresis" or "pulse" dead zone, new state)."""
         if self.dead_zone_kind == "hysteresis":
-            running = tuple(
-                jnp.where(jnp.where(r > 0.5, v >= self.stop[i], v > self.dead_zone[i]), 1.0, 0.0)
-                for i, (v, r) in enumerate(zip(u, state.running))
+            running = each(
+                lambda v, r, stop, start: jnp.where(
+                    jnp.where(r > 0.5, v >= stop, v > start), 1.0, 0.0
+                ),
+                u,
+                state.running,
+                self.stop,
+                self.dead_zone,
             )
-            return tuple(jnp.where(r > 0.5, v, 0.0) for v, r in zip(u, running)), state._replace(
-                running=running
-            )
+            turned = each(lambda v, r: jnp.where(r > 0.5, v, 0.0), u, running)
+            return turned, state._replace(running=running)
         if self.dead_zone_kind == "pulse":
-            paid, owed = [], []
-            for i, v in enumerate(u):
-                due = v + state.owed[i] / dt
-                turning = v > self.dead_zone[i]
-                pay = jnp.where(turning, v, jnp.where(due >= self.pulse[i], self.pulse[i], 0.0))
-                owed.append(
-                    jax.lax.stop_gradient(jnp.where(turning, state.owed[i], (due - pay) * dt))
-                )
-                paid.append(v + jax.lax.stop_gradient(pay - v))
-            return tuple(paid), state._replace(owed=tuple(owed))
-        return tuple(jnp.where(v > self.dead_zone[i], v, 0.0) for i, v in enumerate(u)), state
+
+            def pay(v, owed, least, pulse):
+                due = v + owed / dt
+                turning = v > least
+                paid = jnp.where(turning, v, jnp.where(due >= pulse, pulse, 0.0))
+                left = jax.lax.stop_gradient(jnp.where(turning, owed, (due - paid) * dt))
+                return v + jax.lax.stop_gradient(paid - v), left
+
+            paid, owed = unzipped(u, each(pay, u, state.owed, self.dead_zone, self.pulse))
+            return paid, state._replace(owed=owed)
+        return each(lambda v, least: jnp.where(v > least, v, 0.0), u, self.dead_zone), state
 
 
 def _delayed(state, u):
     """(inputs that entered the ring buffers a delay ago, new state)."""
     head = state.head
+    if is_array(state.line):
+        out = jax.lax.dynamic_index_in_dim(state.line, head, keepdims=False)
+        line = jax.lax.dynamic_update_index_in_dim(state.line, u, head, 0)
+        return out, state._replace(line=line, head=_next(head, line))
     out = tuple(jax.lax.dynamic_index_in_dim(line, head, keepdims=False) for line in state.line)
     line = tuple(
         jax.lax.dynamic_update_index_in_dim(line, v, head, 0) for line, v in zip(state.line, u)
     )
-    head = jnp.where(head + 1 == line[0].shape[0], 0, head + 1)
-    return out, state._replace(line=line, head=head)
+    return out, state._replace(line=line, head=_next(head, line[0]))
+
+
+def _next(head, line):
+    """The place after `head` in a ring buffer."""
+    return jnp.where(head + 1 == line.shape[0], 0, head + 1)
 
 
 def allocate(command, metric, low, high):

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 
 from jaxtank.core.clock import CHUNK, Clock
 from jaxtank.core.numerics import clip
+from jaxtank.core.vectors import each
 from jaxtank.xla.barrier import materialised
 from jaxtank.xla.normal import is_fast, normal, normal_at
 
@@ -89,36 +90,43 @@ class Sensor(abc.ABC):
         -------
         (n,) arrays (samples,); None without a key, and for a sensor without noise
         """
+        found = self.deviates(key, samples, piece)
+        return None if found is None else tuple(found[i] for i in range(np.shape(self.noise)[-1]))
+
+    def deviates(
+        self, key: jax.Array | None, samples: int, piece: ArrayLike | None = None
+    ) -> jax.Array | None:
+        """Return what `draw` returns, as one array (n, samples)."""
         if key is None or np.ndim(self.noise) == 0:
             return None
         tanks = np.shape(self.noise)[-1]
         if jnp.issubdtype(key.dtype, jnp.floating):
-            return tuple(key[i] for i in range(tanks))
+            return key
         drawn = lambda key, count: normal(key, (tanks, count))
         if piece is not None:
-            deviates = drawn(jax.random.fold_in(key, piece), samples)
-        elif samples <= CHUNK:
-            deviates = drawn(key, samples)
-        else:
-            whole, last = divmod(samples, CHUNK)
-            chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), CHUNK))(jnp.arange(whole))
-            remainder = drawn(jax.random.fold_in(key, whole), last)
-            deviates = jnp.concatenate(
-                [jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1
-            )
-        return tuple(deviates[i] for i in range(tanks))
+            return drawn(jax.random.fold_in(key, piece), samples)
+        if samples <= CHUNK:
+            return drawn(key, samples)
+        whole, last = divmod(samples, CHUNK)
+        chunks = jax.vmap(lambda b: drawn(jax.random.fold_in(key, b), CHUNK))(jnp.arange(whole))
+        remainder = drawn(jax.random.fold_in(key, whole), last)
+        return jnp.concatenate([jnp.moveaxis(chunks, 1, 0).reshape(tanks, -1), remainder], axis=1)
 
     def draws_in_loop(self, key: Any) -> bool:
         """Return whether `draw_sample` gives the deviates of `draw`, for a key of a run."""
         own = type(self).draw is not Sensor.draw
         return key is not None and np.ndim(self.noise) > 0 and not own and is_fast(key)
 
-    def draw_sample(self, key: Any, samples: int, k: Any) -> tuple[Any, ...]:
-        """Return the (n,) deviates that `draw` gives sample k of `samples`, and those alone.
+    def draw_sample(self, key: Any, samples: int, k: Any, arrays: bool = False) -> Any:
+        """Return the (n,) deviates that `draw` gives sample k of `samples`, and those alone, as a
+        tuple or as an array.
 
         A batch of long runs then holds no noise in memory, which costs more time than to draw it.
         """
         tanks = np.shape(self.noise)[-1]
+        if arrays:
+            first = jnp.asarray(np.arange(tanks, dtype=np.uint64) * np.uint64(samples))
+            return materialised(normal_at(key, jnp.asarray(k, jnp.uint64) + first))
         places = [jnp.asarray(k, jnp.uint64) + np.uint64(i * samples) for i in range(tanks)]
         return materialised(tuple(normal_at(key, place) for place in places))
 
@@ -211,7 +219,7 @@ class Actuator(abc.ABC):
         -------
         (m,) inputs within [low, high] [V]
         """
-        return tuple(clip(command[i], self.low[i], self.high[i]) for i in range(self.pumps))
+        return each(clip, command, self.low, self.high)
 
     @abc.abstractmethod
     def step(self, state: Any, applied: tuple[Any, ...], dt: Any) -> tuple[tuple[Any, ...], Any]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, quantise
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.vectors import each
 from jaxtank.instruments.base import Sensor
 
 
@@ -54,6 +55,8 @@ class LevelSensor(Sensor):
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
 
+    arrays = True
+
     def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
         return self.read(x, xi), state
 
@@ -69,12 +72,11 @@ class LevelSensor(Sensor):
         -------
         (n,) readings [cm]
         """
-        y = x if self.offset is None else tuple(h + self.offset[i] for i, h in enumerate(x))
-        y = y if xi is None else tuple(y[i] + self.noise[i] * xi[i] for i in range(len(x)))
+        y = x if self.offset is None else each(lambda h, offset: h + offset, x, self.offset)
+        y = y if xi is None else each(lambda h, noise, z: h + noise * z, y, self.noise, xi)
         if self.bits == 0:
             return y
-        step = self.full_scale / 2**self.bits
-        return tuple(
-            quantise(clip(y[i] / self.gain[i], 0.0, self.full_scale), step) * self.gain[i]
-            for i in range(len(y))
+        full_scale, step = self.full_scale, self.full_scale / 2**self.bits
+        return each(
+            lambda h, gain: quantise(clip(h / gain, 0.0, full_scale), step) * gain, y, self.gain
         )

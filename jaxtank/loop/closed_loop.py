@@ -17,23 +17,25 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
+from jaxtank.core import vectors
 from jaxtank.core.clock import CHUNK, Chunk, Clock, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
+from jaxtank.core.vectors import columns, given, is_array, scalars, serves_arrays, take, total
 from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.prediction import line_of
-from jaxtank.signals.base import Signal
+from jaxtank.signals.base import Signal, sampled
 
 AWAY = 0.01
 """Distance of the first level from a constant setpoint above which it counts as a change, as a
 share of the setpoint [-]."""
 
-Group = tuple[Any, ...]
-"""Numbers or arrays, one per tank, pump or output."""
+Group = Any
+"""Vector: a tuple of numbers, one per tank, pump or output, or an array (jaxtank.core.vectors)."""
 
 
 @component
@@ -96,7 +98,9 @@ class State(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """What is known of every sample before the loop starts: arrays (samples,)."""
+    """What is known of every sample before the loop starts: tuples of arrays (samples,), or arrays
+    (samples, n).
+    """
 
     r: Group  # setpoints [cm]
     dr: Group  # their rates [cm/s]
@@ -109,6 +113,20 @@ class Inputs(NamedTuple):
     fault: Group | None  # 1 while a fault lasts
 
 
+def takes_arrays(loop: ClosedLoop) -> bool:
+    """Return whether the vectors of a run of this loop are arrays: those of many tanks, of a plant
+    and faults that take them.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> takes_arrays(presets.load("cascaded/pi").loop)
+    False
+    """
+    parts = [part for part in (loop.plant, loop.faults) if part is not None]
+    return loop.plant.tanks >= vectors.FROM and all(map(serves_arrays, parts))
+
+
 def inputs(
     loop: ClosedLoop,
     clock: Clock,
@@ -116,27 +134,46 @@ def inputs(
     key: jax.Array | None,
     batch: Any = None,
     samples: int = 0,
+    arrays: bool = False,
 ) -> Inputs:
     """Return the samples of references, disturbances and noise, and what the measures `names` refer
-    to; of a long run's `batch`, a number, its `samples` alone.
+    to; of a long run's `batch`, a number, its `samples` alone. arrays: the form of vectors.
 
     Raises InputError for a measure that means nothing for this loop.
     """
     times: Any = clock
     if batch is not None:
         times = Chunk(first=batch * CHUNK, samples=samples, dt=clock.dt)
-    return inputs_at(loop, times, names, loop.sensor.draw(key, times.samples, batch))
+    return inputs_at(loop, times, names, _drawn(loop.sensor, key, times, batch, arrays), arrays)
+
+
+def _drawn(sensor: Sensor, key: Any, times: Any, batch: Any, arrays: bool) -> Group | None:
+    """The deviates of the sensor noise (`Sensor.draw`)."""
+    if not arrays:
+        return sensor.draw(key, times.samples, batch)
+    if type(sensor).draw is Sensor.draw:
+        found = sensor.deviates(key, times.samples, batch)
+        return None if found is None else found.T
+    drawn = sensor.draw(key, times.samples, batch)
+    return None if drawn is None else columns(drawn)
 
 
 def inputs_at(
-    loop: ClosedLoop, times: Clock | Chunk, names: tuple[str, ...], xi: Group | None
+    loop: ClosedLoop,
+    times: Clock | Chunk,
+    names: tuple[str, ...],
+    xi: Group | None,
+    arrays: bool = False,
 ) -> Inputs:
     """Return `inputs` of a clock or of a chunk of one, with deviates xi of the sensor noise, (n,)
     arrays (samples,), that were drawn before; None: none.
     """
     moments: Any = times
-    r, dr, ddr = loop.reference.sample(moments)
-    d = None if loop.disturbance is None else loop.disturbance.sample(moments)[0]
+    r, dr, ddr = sampled(loop.reference, moments, arrays)
+    d = None if loop.disturbance is None else sampled(loop.disturbance, moments, arrays)[0]
+    known: tuple[Any, ...] = (r, dr, ddr)
+    if not serves_arrays(loop.controller):
+        known = tuple(_rows_of(v) for v in known)
     return Inputs(
         r=r,
         dr=dr,
@@ -144,17 +181,22 @@ def inputs_at(
         d=d,
         xi=xi,
         context=_context(loop, moments, names, r),
-        plan=loop.controller.prepare(r, dr, ddr),
+        plan=loop.controller.prepare(*known),
         own=loop.controller.inputs(moments),
         fault=None if loop.faults is None else loop.faults.sample(moments),
     )
+
+
+def _rows_of(signals: Group) -> tuple[Any, ...]:
+    """Arrays (samples,) of an array (samples, n); a tuple of them as it is."""
+    return scalars(signals.T) if is_array(signals) else signals
 
 
 def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> ms.Context:
     """What the measures `names` refer to besides the sample, for setpoints `r`."""
     wanted, window = ms.refers_to(names), None
     if "window" in wanted:
-        window = windows(loop, times)
+        window = windows(loop, times, is_array(r))
         if window is None:
             raise InputError(
                 "overshoot, rise and settling need a reference that changes (signals.Ramps)"
@@ -166,15 +208,15 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
         )
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
-        window = tuple(
-            tuple(jnp.where(since >= 0.0, 0.0, v) for v in channel) for channel in window
-        )
+        recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0
+        window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
     steady = _steady_inputs(loop, r) if "steady" in wanted else None
     return ms.Context(window=window, since=since, steady=steady)
 
 
-def windows(loop: ClosedLoop, times: Any) -> Group | None:
+def windows(loop: ClosedLoop, times: Any, arrays: bool = False) -> Group | None:
     """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
+    With `arrays`, a tuple of four arrays (samples, outputs).
 
     A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has none
     of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY of the
@@ -187,15 +229,31 @@ def windows(loop: ClosedLoop, times: Any) -> Group | None:
     >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
     [1, 2.0]
     """
-    found, reference = loop.reference.windows(times), loop.reference
+    reference: Any = loop.reference
+    if arrays and serves_arrays(reference):
+        return _array_windows(loop, times)
+    found = reference.windows(times)
     band = getattr(reference, "band", None)
-    if found is None or band is None:
-        return found
-    moved, t = {channel for _, channel in reference.changes}, sample_times(times)
-    return tuple(
-        window if i in moved else _from_start(window, t, loop.x0[output], band)
-        for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
-    )
+    if found is not None and band is not None:
+        moved, t = {channel for _, channel in reference.changes}, sample_times(times)
+        found = tuple(
+            window if i in moved else _from_start(window, t, loop.x0[output], band)
+            for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
+        )
+    return found if found is None or not arrays else tuple(columns(v) for v in zip(*found))
+
+
+def _array_windows(loop: ClosedLoop, times: Any) -> Group | None:
+    """`windows` of a reference that serves arrays."""
+    reference: Any = loop.reference
+    if reference.changes is None:
+        return None
+    found = reference.window_arrays(times)
+    still = np.ones(reference.channels, dtype=bool)
+    still[[channel for _, channel in reference.changes]] = False
+    level = take(jnp.asarray(loop.x0), loop.plant.outputs)
+    first = _from_start(found, sample_times(times)[:, None], level, reference.band)
+    return tuple(jnp.where(still, a, b) for a, b in zip(first, found))
 
 
 def _from_start(window: Group, t: Any, level: Any, band: float) -> Group:
@@ -208,26 +266,32 @@ def _from_start(window: Group, t: Any, level: Any, band: float) -> Group:
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
     if not ms.serves("input_deviation", loop):
         raise InputError("input_deviation needs a rig without pipes, with as many pumps as outputs")
-    return steady_along(loop.plant, r)[1]
+    held = steady_along(loop.plant, _rows_of(r))[1]
+    return columns(held) if is_array(r) else held
 
 
-def initial(loop: ClosedLoop, clock: Clock) -> State:
-    """Return the state before the first sample."""
-    zero = zero_of(loop)
+def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
+    """Return the state before the first sample. arrays: the form of vectors."""
+    zero, actuator = zero_of(loop), loop.actuator
 
     def same_type(v: Any) -> Any:
         return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
 
-    x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks))
-    u0 = tuple(loop.actuator.initial[i] + zero for i in range(loop.plant.pumps))
+    x0 = tuple(loop.x0[i] + zero for i in range(loop.plant.tanks)) if not arrays else ()
+    u0 = tuple(actuator.initial[i] + zero for i in range(loop.plant.pumps)) if not arrays else ()
+    excess: Any = (zero,) * loop.plant.tanks
+    if arrays:
+        x0, u0 = jnp.asarray(loop.x0) + zero, jnp.asarray(actuator.initial) + zero
+        excess = jnp.zeros_like(x0)
+    start: Any = actuator.init_arrays if arrays and serves_arrays(actuator) else None
     return State(
         k=jnp.int32(0),
         x=x0,
-        observer=jax.tree.map(same_type, loop.observer.init(x0)),
+        observer=jax.tree.map(same_type, loop.observer.init(given(loop.observer, x0))),
         controller=jax.tree.map(same_type, control_state(loop, x0, u0)),
-        actuator=jax.tree.map(same_type, loop.actuator.init(clock)),
-        sensor=jax.tree.map(same_type, loop.sensor.init(x0)),
-        excess=(zero,) * loop.plant.tanks if zero.dtype == jnp.float32 else (),
+        actuator=jax.tree.map(same_type, (start or actuator.init)(clock)),
+        sensor=jax.tree.map(same_type, loop.sensor.init(given(loop.sensor, x0))),
+        excess=excess if zero.dtype == jnp.float32 else (),
     )
 
 
@@ -235,10 +299,11 @@ def control_state(loop: ClosedLoop, x0: Group, u0: Group) -> Any:
     """Return the state of the controller before the first sample, from the levels x0 (n) [cm] and
     the inputs u0 (m) [V]; a pair with the inputs under way where the safety filter predicts.
     """
-    state, guard = loop.controller.init(x0, u0), loop.safety_filter
+    x0, u = given(loop.controller, x0), given(loop.controller, u0)
+    state, guard = loop.controller.init(x0, u), loop.safety_filter
     if guard is None or not guard.predicted:
         return state
-    return state, line_of(u0, guard.predicted)
+    return state, line_of(scalars(u0), guard.predicted)
 
 
 def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
@@ -255,19 +320,24 @@ def keyed(loop: ClosedLoop, key: jax.Array | None) -> ClosedLoop:
     return dataclasses.replace(loop, x0=start)
 
 
-def run_of(loop: ClosedLoop, clock: Clock) -> ms.Run:
-    """Return sizes and constants of a run, for its measures."""
+def run_of(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> ms.Run:
+    """Return sizes and constants of a run, for its measures. arrays: the form of vectors."""
     plant, actuator = loop.plant, loop.actuator
+
+    def vector(leaf: Any, size: int) -> Group:
+        return jnp.asarray(leaf) if arrays else tuple(leaf[i] for i in range(size))
+
     return ms.Run(
         tanks=plant.tanks,
         outputs=len(plant.outputs),
         pumps=plant.pumps,
         samples=clock.samples,
         dt=clock.dt,
-        low=tuple(actuator.low[i] for i in range(plant.pumps)),
-        high=tuple(actuator.high[i] for i in range(plant.pumps)),
-        rim=tuple(plant.rim[i] for i in range(plant.tanks)),
+        low=vector(actuator.low, plant.pumps),
+        high=vector(actuator.high, plant.pumps),
+        rim=vector(plant.rim, plant.tanks),
         zero=zero_of(loop),
+        arrays=arrays,
     )
 
 
@@ -298,4 +368,4 @@ def is_broken(state: State) -> Any:
     """Return True if the run diverged: a level that is not finite stays so, so the last state is
     enough.
     """
-    return ~jnp.isfinite(sum(state.x))
+    return ~jnp.isfinite(total(state.x))

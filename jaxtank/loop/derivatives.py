@@ -16,7 +16,15 @@ from jax.typing import ArrayLike
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import with_values
-from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.closed_loop import (
+    ClosedLoop,
+    initial,
+    inputs,
+    is_broken,
+    keyed,
+    run_of,
+    takes_arrays,
+)
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
 from jaxtank.loop.step import step
@@ -69,6 +77,9 @@ def sensitivities_compiled(
     if ms.functions(names):
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
+    arrays = takes_arrays(loop)
+    # the axis of the directions: in front of arrays, whose entries then stay side by side
+    axis, axis_of_samples = (0, 1) if arrays else (-1, -1)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
 
@@ -76,18 +87,19 @@ def sensitivities_compiled(
         return with_values(loop, dict(zip(order, unflatten(theta))))
 
     def sampled(theta: Any) -> Any:
-        return inputs(at(theta), clock, kept, key)
+        return inputs(at(theta), clock, kept, key, arrays=arrays)
 
     known = _dependent(sampled, flat)
-    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept)))
+    carried = _floats_of(jax.eval_shape(lambda: _start(loop, clock, kept, arrays)))
 
     def begin(theta: Any) -> Any:
-        floats, rest = carried.split(_start(keyed(at(theta), key), clock, kept))
+        floats, rest = carried.split(_start(keyed(at(theta), key), clock, kept, arrays))
         moving, fixed = known.split(sampled(theta))
         return (floats, moving), (rest, fixed)
 
-    (floats, moving), (dfloats, dmoving), (rest, fixed) = _pushed(begin, (flat,), basis)
-    weights = ms.residual_weights(run_of(loop, clock), squares)
+    begun = _pushed(begin, (flat,), basis, outs=(axis, axis_of_samples))
+    (floats, moving), (dfloats, dmoving), (rest, fixed) = begun
+    weights = ms.residual_weights(run_of(loop, clock, arrays), squares)
 
     def body(carry: Any, now: Any) -> Any:
         floats, dfloats, rest, matrix = carry
@@ -95,7 +107,7 @@ def sensitivities_compiled(
 
         def advance(floats: Any, theta: Any, moving: Any) -> Any:
             here = at(theta)
-            run, now = run_of(here, clock), known.join(moving, fixed)
+            run, now = run_of(here, clock, arrays), known.join(moving, fixed)
             state, acc = carried.join(floats, rest)
             state, sample = step(here, clock, state, now)
             errors = ms.residuals(run, acc, sample, now.context, squares)
@@ -103,17 +115,18 @@ def sensitivities_compiled(
             return (floats, errors), others
 
         push, point = _pushed_stored if batched else _pushed, (floats, flat, moving)
-        (floats, _), (dfloats, derrors), rest = push(advance, point, dfloats, basis, dmoving)
+        tangents = dfloats, basis, dmoving
+        (floats, _), (dfloats, derrors), rest = push(advance, point, *tangents, ins=axis, outs=axis)
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros_like(basis))
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        run, (_, acc) = run_with(at(theta), clock, names), carried.join(floats, rest)
+        run, (_, acc) = run_with(at(theta), clock, names, arrays), carried.join(floats, rest)
         return ms.read(run, acc, names), None
 
-    results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis)
+    results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis, ins=axis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
 
 
@@ -147,9 +160,9 @@ def _with_functions(
     return found, rates, matrix, broken
 
 
-def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...]) -> Any:
+def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...], arrays: bool) -> Any:
     """(state, accumulators of the measures) before the first sample."""
-    return initial(loop, clock), ms.start(run_of(loop, clock), names)
+    return initial(loop, clock, arrays), ms.start(run_of(loop, clock, arrays), names)
 
 
 def _floats_of(tree: Any) -> Partition:
@@ -169,16 +182,20 @@ def _dependent(f: Callable[[Any], Any], flat: jax.Array) -> Partition:
     return Partition(jax.tree.structure(jax.eval_shape(f, flat)), tuple(depends))
 
 
-def _pushed(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any) -> Any:
-    """(f(point), tangents of f with the P directions as the last axis, auxiliary output of f)."""
+def _pushed(
+    f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
+) -> Any:
+    """(f(point), its tangents, auxiliary output of f); ins, outs: the axis of the P directions."""
 
     def push(*t: Any) -> Any:
         return jax.jvp(f, point, t, has_aux=True)
 
-    return jax.vmap(push, in_axes=-1, out_axes=(None, -1, None))(*tangents)
+    return jax.vmap(push, in_axes=ins, out_axes=(None, outs, None))(*tangents)
 
 
-def _pushed_stored(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any) -> Any:
+def _pushed_stored(
+    f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
+) -> Any:
     """`_pushed`, where what the tangents are multiplied by is computed once and stored. For many
     runs side by side: of one alone, fetching costs more.
     """
@@ -190,11 +207,17 @@ def _pushed_stored(f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any
     def push(*t: Any) -> Any:
         return function(*t, *slopes)
 
-    return value, jax.vmap(push, in_axes=-1, out_axes=-1)(*tangents), rest
+    return value, jax.vmap(push, in_axes=ins, out_axes=outs)(*tangents), rest
 
 
 def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
-    """`matrix` (P, P) with sum_k weight_k slope_k slope_k' added, of slopes (P,)."""
+    """`matrix` (P, P) with sum_k weight_k slope_k slope_k' added, of slopes (P,); or of arrays of
+    them (P, k), with one weight each.
+    """
+    if derrors and derrors[0].ndim > 1:
+        for slopes, weight in zip(derrors, weights):
+            matrix = matrix + weight * jnp.sum(slopes[:, None] * slopes[None, :], axis=-1)
+        return matrix
     if len(matrix) > OUTER:
         rows = jnp.stack(derrors)
         return matrix + (rows.T * jnp.asarray(weights, rows.dtype)) @ rows

@@ -154,8 +154,8 @@ def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
     )
 
 
-def run_with(loop: ClosedLoop, clock: Clock, names: Sequence[str]) -> ms.Run:
+def run_with(loop: ClosedLoop, clock: Clock, names: Sequence[str], arrays: bool = False) -> ms.Run:
     """Return `run_of` with the margins that the measures `names` read."""
-    run = run_of(loop, clock)
+    run = run_of(loop, clock, arrays)
     wanted = any(ms.MEASURES[name].linear for name in names)
     return run._replace(margins=worst(loop, clock)) if wanted else run

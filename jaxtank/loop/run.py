@@ -20,7 +20,16 @@ from jaxtank import measures as ms
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.errors import InputError, NonFiniteError
 from jaxtank.core.tree import parameters, with_values
-from jaxtank.loop.closed_loop import ClosedLoop, Inputs, initial, inputs, is_broken, keyed, run_of
+from jaxtank.loop.closed_loop import (
+    ClosedLoop,
+    Inputs,
+    initial,
+    inputs,
+    is_broken,
+    keyed,
+    run_of,
+    takes_arrays,
+)
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
@@ -228,8 +237,8 @@ def evaluate_compiled(
             loop, clock, needed_by(loop, clock, names), key, checkpoint
         )
         return values_of(loop, clock, names, key, values, checkpoint), broken
-    loop = keyed(loop, key)
-    run = run_of(loop, clock)
+    loop, arrays = keyed(loop, key), takes_arrays(loop)
+    run = run_of(loop, clock, arrays)
     pointwise = clock.samples > CHUNK and is_pointwise(loop)
     drawn = not checkpoint and (clock.samples <= CHUNK or pointwise)
     drawn = drawn and loop.sensor.draws_in_loop(key)  # else before the loop
@@ -240,11 +249,12 @@ def evaluate_compiled(
         def body(carry: Any, now: Inputs) -> Any:
             state, acc = carry
             if drawn:
-                now = now._replace(xi=loop.sensor.draw_sample(here, samples, state.k - first))
+                drawn_now = loop.sensor.draw_sample(here, samples, state.k - first, arrays)
+                now = now._replace(xi=drawn_now)
             state, sample = step(loop, clock, state, now)
             return (state, ms.update(run, acc, sample, now.context)), None
 
-        xs = inputs(loop, clock, names, None if drawn else key, number, samples)
+        xs = inputs(loop, clock, names, None if drawn else key, number, samples, arrays)
         if checkpoint:
             return checkpointed_scan(body, carry, xs, samples)
         return scan(body, carry, xs, samples)[0]
@@ -252,7 +262,7 @@ def evaluate_compiled(
     def batch(carry: Any, number: Any, samples: int = CHUNK) -> Any:
         return scanned(carry, number, samples, number * CHUNK), None
 
-    carry: Any = (initial(loop, clock), ms.start(run, names))
+    carry: Any = (initial(loop, clock, arrays), ms.start(run, names))
     if pointwise and not checkpoint:
         whole, left = divmod(clock.samples, CHUNK)
         carry = jax.lax.scan(batch, carry, jnp.arange(whole))[0]
@@ -260,7 +270,7 @@ def evaluate_compiled(
     else:
         carry = scanned(carry, None, clock.samples)
     state, acc = carry
-    return ms.read(run_with(loop, clock, names), acc, names), is_broken(state)
+    return ms.read(run_with(loop, clock, names, arrays), acc, names), is_broken(state)
 
 
 def _report_broken(

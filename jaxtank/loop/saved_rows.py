@@ -4,13 +4,23 @@ call. May import `loop.closed_loop`, `loop.step`, `loop.trajectory` and the fold
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
+import operator
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 
 from jaxtank.core.clock import Clock
-from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, keyed, zero_of
+from jaxtank.core.vectors import each, is_array, zeros
+from jaxtank.loop.closed_loop import (
+    ClosedLoop,
+    initial,
+    inputs,
+    is_broken,
+    keyed,
+    takes_arrays,
+    zero_of,
+)
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import COLUMNS, Trajectory
 from jaxtank.xla.hoist import scan
@@ -25,18 +35,19 @@ def simulate_compiled(
 
     checkpoint: for reverse mode, each row is recomputed on the way back.
     """
-    loop = keyed(loop, key)
+    loop, arrays = keyed(loop, key), takes_arrays(loop)
     rows = (clock.samples - 1) // save_every + 1
     spare = rows * save_every - clock.samples  # steps after the last row: run, but not kept
 
     def in_rows(a: Any) -> Any:
-        padded = jnp.pad(a, (0, max(spare, 0)), mode="edge")
-        return padded[: rows * save_every].reshape(rows, save_every)
+        ends = [(0, max(spare, 0)), *[(0, 0)] * (a.ndim - 1)]
+        padded = jnp.pad(a, ends, mode="edge")
+        return padded[: rows * save_every].reshape(rows, save_every, *a.shape[1:])
 
     def one(carry: Any, now: Any) -> Any:
         state, spilled = carry
         state, sample = step(loop, clock, state, now)
-        return (state, tuple(a + b for a, b in zip(spilled, sample.spilled))), sample
+        return (state, each(operator.add, spilled, sample.spilled)), sample
 
     def unsaved(carry: Any, now: Any) -> Any:
         return one(carry, now)[0], None
@@ -50,14 +61,15 @@ def simulate_compiled(
         return carry, sample._replace(spilled=spilled)
 
     zero = zero_of(loop)
-    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key))
-    start = (initial(loop, clock), (zero,) * loop.plant.tanks)
+    xs = jax.tree.map(in_rows, inputs(loop, clock, (), key, arrays=arrays))
+    first = initial(loop, clock, arrays)
+    start = (first, zeros(first.x) if arrays else (zero,) * loop.plant.tanks)
     kept = cast(Any, jax.checkpoint)(row) if checkpoint else row
     (state, _), saved = scan(kept, start, xs, length=rows)
     columns: dict[str, Any] = {}
     for name in COLUMNS:
         value: Any = getattr(saved, name)
-        columns[name] = value if name == "t" else jnp.stack(value, axis=-1)
+        columns[name] = value if is_array(value) else jnp.stack(value, axis=-1)
     return Trajectory(**columns, units=loop.units), is_broken(state)
 
 

@@ -6,6 +6,7 @@ below `jaxtank.loop`.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -16,6 +17,8 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.tree import is_real
+from jaxtank.core.vectors import each, given, is_array, like, scalars, zeros
+from jaxtank.instruments.base import Sensor
 from jaxtank.loop.closed_loop import ClosedLoop, Group, Inputs, State
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.safety.prediction import moved_on
@@ -37,17 +40,17 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     """Return (state after a sample, Sample of it). now: this sample's slice of Inputs."""
     t = time_of(state, clock)
     tick = Tick(t=t, r=now.r, dr=now.dr, ddr=now.ddr, dt=clock.dt, plan=now.plan, own=now.own)
-    y, sensor = loop.sensor.step(state.sensor, state.x, now.xi, clock.dt)
+    y, sensor = readings(loop.sensor, state, now, clock)
     made = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = made.estimate, made.command, made.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
-    e = tuple(z - r for z, r in zip(loop.plant.output(state.x), now.r))
+    e = each(operator.sub, loop.plant.output(state.x), now.r)
     sample = Sample(
         t=t,
         x=state.x,
         y=y,
         x_hat=estimate.x,
-        d_hat=estimate.d or (jnp.zeros_like(state.x[0]),) * loop.plant.tanks,
+        d_hat=estimate.d if len(estimate.d) else _nothing(state.x),
         r=now.r,
         e=e,
         command=command,
@@ -86,19 +89,49 @@ def decide(
     guard, line = loop.safety_filter, None
     if guard is not None and guard.predicted:
         controller, line = controller
-    estimate, observer = loop.observer.step(observer, tick, y)
+    observed = _seen_by(loop.observer, tick)
+    estimate, observer = loop.observer.step(observer, observed, given(loop.observer, y))
+    estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
     allocates = loop.actuator.allocates or guard is not None
-    metric = loop.controller.input_metric(estimate) if allocates else None
+    metric = loop.controller.input_metric(_seen(loop, estimate)) if allocates else None
     if guard is None:
-        applied, filtered = loop.actuator.limit(command, metric), 0.0
+        applied, filtered = loop.actuator.limit(given(loop.actuator, command), metric), 0.0
     else:
-        applied, filtered = guard.apply(loop.actuator, command, metric, y, tick.dt, line)
-    observer = loop.observer.predict(observer, tick, command, applied)
-    controller = loop.controller.track(controller, tick, command, applied)
+        entries = scalars(command)
+        applied, filtered = guard.apply(loop.actuator, entries, metric, scalars(y), tick.dt, line)
+    applied = like(applied, y)
+    watched, acting = given(loop.observer, command), given(loop.observer, applied)
+    observer = loop.observer.predict(observer, observed, watched, acting)
+    seen = _seen_by(loop.controller, tick)
+    asked, held = given(loop.controller, command), given(loop.controller, applied)
+    controller = loop.controller.track(controller, seen, asked, held)
     if line is not None:
-        controller = controller, moved_on(line, applied)
+        controller = controller, moved_on(line, scalars(applied))
     return Decision(estimate, command, applied, observer, controller, filtered)
+
+
+def readings(sensor: Sensor, state: State, now: Inputs, clock: Clock) -> tuple[Group, Any]:
+    """Return ((n,) readings of a state [cm], the sensor's state after them)."""
+    x, xi = given(sensor, state.x), given(sensor, now.xi)
+    y, after = sensor.step(state.sensor, x, xi, clock.dt)
+    return like(y, state.x), after
+
+
+def _seen_by(part: Any, tick: Tick) -> Tick:
+    """`tick` with setpoints in the form that a component takes."""
+    r, dr, ddr = (given(part, v) for v in (tick.r, tick.dr, tick.ddr))
+    return tick._replace(r=r, dr=dr, ddr=ddr)
+
+
+def _seen(loop: ClosedLoop, estimate: Estimate) -> Estimate:
+    """`estimate` in the form that the controller takes."""
+    return Estimate(given(loop.controller, estimate.x), given(loop.controller, estimate.d))
+
+
+def _nothing(x: Group) -> Group:
+    """Zeros of the type of the levels."""
+    return zeros(x) if is_array(x) else (jnp.zeros_like(x[0]),) * len(x)
 
 
 def move(
@@ -110,11 +143,14 @@ def move(
     are.
     """
     t = time_of(state, clock)
-    u, actuator = loop.actuator.step(state.actuator, applied, clock.dt)
+    u, actuator = loop.actuator.step(state.actuator, given(loop.actuator, applied), clock.dt)
     plant = loop.plant
     if loop.faults is not None and now.fault is not None:
-        plant = loop.faults.apply(plant, now.fault)
-    driving = materialised(loop.actuator.driving(u))
+        faults: Any = loop.faults
+        change = faults.apply_arrays if is_array(state.x) else faults.apply
+        plant = change(plant, now.fault)
+    driving = materialised(like(loop.actuator.driving(u), state.x))
+    u = like(u, state.x)
     found = advance(
         plant,
         clock.integrator,
@@ -132,7 +168,8 @@ def move(
 
 def time_of(state: State, clock: Clock) -> Any:
     """Return t [s] of a state."""
-    return state.k.astype(state.x[0].dtype) * clock.dt
+    kind = state.x.dtype if is_array(state.x) else state.x[0].dtype
+    return state.k.astype(kind) * clock.dt
 
 
 def commanded(
@@ -143,9 +180,10 @@ def commanded(
     Raises InputError, while the loop is traced, for a number of inputs that is not that of the
     pumps, and for an input that is no single real number.
     """
-    command, state = loop.controller.step(state, tick, estimate)
+    seen = _seen_by(loop.controller, tick)
+    command, state = loop.controller.step(state, seen, _seen(loop, estimate))
     _check_command(command, loop.plant.pumps, type(loop.controller).__name__)
-    return command, state
+    return like(command, estimate.x), state
 
 
 def _check_command(command: Any, pumps: int, name: str) -> None:

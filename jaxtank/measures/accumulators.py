@@ -3,6 +3,7 @@
 `measures.catalogue` names what it reads of them. May import `jaxtank.core` only.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from jaxtank.core.kahan import nothing, plus
 from jaxtank.core.numerics import lower_clip, magnitude
 from jaxtank.core.records import Sample
+from jaxtank.core.vectors import each
 
 BAND = 0.05
 """Half width of the recovery band, as a share of the setpoint [-]."""
@@ -24,10 +26,11 @@ class Run(NamedTuple):
     pumps: int
     samples: int
     dt: float  # [s]
-    low: tuple[Any, ...]  # lower limit of each pump [V]
-    high: tuple[Any, ...]  # upper limit of each pump [V]
-    rim: tuple[Any, ...]  # rim of each tank [cm]
+    low: Any  # (m,) lower limit of each pump [V]
+    high: Any  # (m,) upper limit of each pump [V]
+    rim: Any  # (n,) rim of each tank [cm]
     zero: Any  # 0.0 of the run's type
+    arrays: bool = False  # whether the vectors of the run are arrays (jaxtank.core.vectors)
     margins: Any = None  # Worst margins of the linearised loop, where a measure reads them
 
 
@@ -74,11 +77,28 @@ class Accumulator(NamedTuple):
     start: Callable[[Run], Any]
     update: Callable[[Run, Any, Sample, Context], Any]
     refers_to: str = ""
-    residual: Callable[[Run, Any, Sample, Context], tuple[Any, ...]] | None = None
+    residual: Callable[[Run, Any, Sample, Context], Any] | None = None
+    arrays: bool = False  # whether it takes vectors in either form; else tuples of scalars
+    rows: bool = False  # whether the state is a tuple of numbers for each entry; of arrays a tuple
+
+
+def _filled(run, size, value=0.0):
+    """A vector of the run with one number for each output, tank or pump."""
+    if run.arrays:
+        return jnp.full(getattr(run, size), value, run.zero.dtype)
+    return (run.zero + value,) * getattr(run, size)
+
+
+def _rows(run, size, *values):
+    """A state of `rows`, with these numbers for each output, tank or pump."""
+    columns = tuple(_filled(run, size, value) for value in values)
+    return columns if run.arrays else tuple(zip(*columns))
 
 
 def _sums(run, size):
     """Empty sums, one per output, tank or pump."""
+    if run.arrays:
+        return nothing(_filled(run, size))
     return (nothing(run.zero),) * getattr(run, size)
 
 
@@ -88,7 +108,7 @@ def _sum(size, term):
     """
 
     def update(run, state, sample, context):
-        return tuple(plus(s, v) for s, v in zip(state, term(run, sample)))
+        return each(lambda v, s: plus(s, v), term(run, sample), state)
 
     return Accumulator(lambda run: _sums(run, size), update)
 
@@ -97,13 +117,13 @@ def _sum_of_squares(size, term, refers_to=""):
     """Accumulator of sums of the squares of the numbers that `term(run, sample, context)` gives."""
 
     def update(run, state, sample, context):
-        return tuple(plus(s, v * v) for s, v in zip(state, term(run, sample, context)))
+        return each(lambda v, s: plus(s, v * v), term(run, sample, context), state)
 
     return Accumulator(
         lambda run: _sums(run, size),
         update,
         refers_to,
-        lambda run, state, sample, context: tuple(term(run, sample, context)),
+        lambda run, state, sample, context: term(run, sample, context),
     )
 
 
@@ -113,38 +133,39 @@ def _extreme(size, pick, better, worst, refers_to=""):
     """
 
     def update(run, state, sample, context):
-        new = []
-        for (value, time), v in zip(state, pick(sample, context)):
+        def extreme(v, now):
+            value, time = now
             take = better(v, value)
-            new.append((jnp.where(take, v, value), jnp.where(take, sample.t, time)))
-        return tuple(new)
+            return jnp.where(take, v, value), jnp.where(take, sample.t, time)
 
-    return Accumulator(
-        lambda run: tuple((run.zero + worst, run.zero) for _ in range(getattr(run, size))),
-        update,
-        refers_to,
-    )
+        return each(extreme, pick(sample, context), state)
+
+    return Accumulator(lambda run: _rows(run, size, worst, 0.0), update, refers_to, rows=True)
 
 
 def _excess(run, command):
     """How far a command is outside its limits [V], 0 inside."""
-    return tuple(
-        jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0))
-        for v, low, high in zip(command, run.low, run.high)
+    return each(
+        lambda v, low, high: jnp.where(v > high, v - high, jnp.where(v < low, low - v, 0.0)),
+        command,
+        run.low,
+        run.high,
     )
 
 
 def _saturation_excess(run, sample):
     # x/(1+x) of x = excess / span: gouta2015 notes S10; bounded, so that one outlier does not
     # dominate a cost
-    span = tuple(high - low for low, high in zip(run.low, run.high))
-    return tuple(x / (s + x) for x, s in zip(_excess(run, sample.command), span))
+    span = each(lambda low, high: high - low, run.low, run.high)
+    return each(lambda x, s: x / (s + x), _excess(run, sample.command), span)
 
 
 def _outside(run, sample):
-    return tuple(
-        jnp.where((v < low) | (v > high), 1.0, 0.0)
-        for v, low, high in zip(sample.command, run.low, run.high)
+    return each(
+        lambda v, low, high: jnp.where((v < low) | (v > high), 1.0, 0.0),
+        sample.command,
+        run.low,
+        run.high,
     )
 
 
@@ -152,31 +173,30 @@ def _overshoot(sample, context):
     """Level past the target in the direction of the step, as a share of the step [-]; -1 where
     there is no step yet.
     """
-    return tuple(
-        jnp.where(step == 0.0, -1.0, (r + e - target) / jnp.where(step == 0.0, 1.0, step))
-        for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
-    )
 
+    def share(r, e, window):
+        target, step, _, _ = window
+        whole = jnp.where(step == 0.0, 1.0, step)
+        return jnp.where(step == 0.0, -1.0, (r + e - target) / whole)
 
-def _start_settling(run):
-    return tuple((run.zero, run.zero - 1e9, run.zero, run.zero - 1e9) for _ in range(run.outputs))
+    return each(share, sample.r, sample.e, context.window)
 
 
 def _update_settling(run, state, sample, context):
     """Per output (target now, time since its change ended at the last sample outside the band [s],
     1 if still outside, worst so far).
     """
-    new = []
-    for (old, last, outside, worst), (target, step, since, band), r, e in zip(
-        state, context.window, sample.r, sample.e
-    ):
+
+    def update(r, e, window, before):
+        (target, step, since, band), (old, last, outside, worst) = window, before
         worst = jnp.where(
             (target != old) & (settled(last, outside) > worst), settled(last, outside), worst
         )
         last = jnp.where(target != old, -1e9, last)
         out = (step != 0.0) & (jnp.abs(r + e - target) > band)
-        new.append((target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst))
-    return tuple(new)
+        return target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst
+
+    return each(update, sample.r, sample.e, context.window, state)
 
 
 def settled(last, outside):
@@ -184,16 +204,11 @@ def settled(last, outside):
     return jnp.where(outside > 0, jnp.inf, last)
 
 
-def _start_rise(run):
-    return tuple((run.zero, run.zero - 1.0, run.zero - 1.0, run.zero) for _ in range(run.outputs))
-
-
 def _update_rise(run, state, sample, context):
     """Per output (target now, time of the first 10 %, that of the first 90 %, longest rise)."""
-    new = []
-    for (old, t10, t90, longest), (target, step, _, _), r, e in zip(
-        state, context.window, sample.r, sample.e
-    ):
+
+    def update(r, e, window, before):
+        (target, step, _, _), (old, t10, t90, longest) = window, before
         fresh = target != old
         t10, t90 = jnp.where(fresh, -1.0, t10), jnp.where(fresh, -1.0, t90)
         done = jnp.where(
@@ -203,83 +218,93 @@ def _update_rise(run, state, sample, context):
         reached = (t90 < 0) & (done >= 0.9)
         t90 = jnp.where(reached, sample.t, t90)
         longest = jnp.where(reached & (sample.t - t10 > longest), sample.t - t10, longest)
-        new.append((target, t10, t90, longest))
-    return tuple(new)
+        return target, t10, t90, longest
+
+    return each(update, sample.r, sample.e, context.window, state)
 
 
 def _update_recovery(run, state, sample, context):
     """Per output (time since the inflow pulse at the last sample outside the band [s], 1 if that
     was the last one watched, worst so far).
     """
-    new, since = [], context.since
-    for (last, outside, worst), r, e in zip(state, sample.r, sample.e):
+    since = context.since
+
+    def update(r, e, before):
+        last, outside, worst = before
         fresh = since < last
         done = settled(last, outside)
         worst = jnp.where(fresh & (done > worst), done, worst)
         out, watched = jnp.abs(e) > BAND * jnp.abs(r), since >= 0.0
         last = jnp.where(watched, jnp.where(out, since, jnp.where(fresh, 0.0, last)), last)
-        new.append((last, jnp.where(watched, jnp.where(out, 1.0, 0.0), outside), worst))
-    return tuple(new)
+        return last, jnp.where(watched, jnp.where(out, 1.0, 0.0), outside), worst
+
+    return each(update, sample.r, sample.e, state)
 
 
 def _deviation(run, sample, context):
     """Distance of each input from the one that holds the setpoint [V]."""
-    return tuple(u - held for u, held in zip(sample.u, context.steady))
+    return each(operator.sub, sample.u, context.steady)
 
 
 def _past(run, sample, context):
     """Level past the target in the direction of the step [cm], one per output; 0 before the first
     step.
     """
-    return tuple(
-        lower_clip(
-            jnp.where(step > 0, r + e - target, jnp.where(step < 0, target - r - e, 0.0)), 0.0
-        )
-        for (target, step, _, _), r, e in zip(context.window, sample.r, sample.e)
-    )
+
+    def past(r, e, window):
+        target, step, _, _ = window
+        up, down = r + e - target, target - r - e
+        return lower_clip(jnp.where(step > 0, up, jnp.where(step < 0, down, 0.0)), 0.0)
+
+    return each(past, sample.r, sample.e, context.window)
 
 
 def _over_rim(run, sample, context):
     """Rise past the rim [cm], one per tank."""
-    return tuple(lower_clip(x - h, 0.0) for x, h in zip(sample.x, run.rim))
+    return each(lambda x, rim: lower_clip(x - rim, 0.0), sample.x, run.rim)
 
 
 def _estimation_error(run, sample):
-    return tuple((a - b) * (a - b) for a, b in zip(sample.x_hat, sample.x))
+    return each(lambda a, b: (a - b) * (a - b), sample.x_hat, sample.x)
 
 
 def _changes(state, sample):
     """Changes of the inputs since the last sample; 0 at the first."""
     previous, _, first = state
-    return tuple(jnp.where(first, 0.0, v - p) for v, p in zip(sample.u, previous))
+    return each(lambda v, p: jnp.where(first, 0.0, v - p), sample.u, previous)
 
 
 def _update_changes(run, state, sample, context):
+    changes = _changes(state, sample)
     return (
         sample.u,
-        tuple(plus(s, d * d) for s, d in zip(state[1], _changes(state, sample))),
+        each(lambda d, s: plus(s, d * d), changes, state[1]),
         jnp.zeros_like(state[2]),
     )
 
 
 def _start_travel(run):
-    return (run.zero + 0.0,) * run.pumps, _sums(run, "pumps"), run.zero == 0.0
+    return _filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0
 
 
 def _update_travel(run, state, sample, context):
     previous, total, first = state
-    step = tuple(magnitude(v - p) for v, p in zip(sample.u, previous))
+    step = each(lambda v, p: magnitude(v - p), sample.u, previous)
     return (
         sample.u,
-        tuple(plus(s, jnp.where(first, 0.0, d)) for s, d in zip(total, step)),
+        each(lambda d, s: plus(s, jnp.where(first, 0.0, d)), step, total),
         jnp.zeros_like(first),
     )
 
 
-ACCUMULATORS: dict[str, Accumulator] = {
+def _magnitudes(vector):
+    return each(magnitude, vector)
+
+
+_BUILT_IN: dict[str, Accumulator] = {
     "e2": _sum_of_squares("outputs", lambda run, s, context: s.e),
-    "abs_e": _sum("outputs", lambda run, s: tuple(magnitude(e) for e in s.e)),
-    "u2": _sum("pumps", lambda run, s: tuple(u * u for u in s.u)),
+    "abs_e": _sum("outputs", lambda run, s: _magnitudes(s.e)),
+    "u2": _sum("pumps", lambda run, s: each(lambda u: u * u, s.u)),
     "estimate2": _sum("tanks", _estimation_error),
     "outside": _sum("pumps", _outside),
     "saturation_excess": _sum("pumps", _saturation_excess),
@@ -293,13 +318,20 @@ ACCUMULATORS: dict[str, Accumulator] = {
     "max_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a > b, -jnp.inf),
     "min_level": _extreme("tanks", lambda s, context: s.x, lambda a, b: a < b, jnp.inf),
     "max_error": _extreme(
-        "outputs", lambda s, context: tuple(magnitude(e) for e in s.e), lambda a, b: a > b, -jnp.inf
+        "outputs", lambda s, context: _magnitudes(s.e), lambda a, b: a > b, -jnp.inf
     ),
     "overshoot": _extreme("outputs", _overshoot, lambda a, b: a > b, -1.0, "window"),
-    "settling": Accumulator(_start_settling, _update_settling, "window"),
-    "rise": Accumulator(_start_rise, _update_rise, "window"),
+    "settling": Accumulator(
+        lambda run: _rows(run, "outputs", 0.0, -1e9, 0.0, -1e9),
+        _update_settling,
+        "window",
+        rows=True,
+    ),
+    "rise": Accumulator(
+        lambda run: _rows(run, "outputs", 0.0, -1.0, -1.0, 0.0), _update_rise, "window", rows=True
+    ),
     "recovery": Accumulator(
-        lambda run: ((run.zero, run.zero, run.zero),) * run.outputs, _update_recovery, "since"
+        lambda run: _rows(run, "outputs", 0.0, 0.0, 0.0), _update_recovery, "since", rows=True
     ),
     "past2": _sum_of_squares("outputs", _past, "window"),
     "deviation2": _sum_of_squares("pumps", _deviation, "steady"),
@@ -310,4 +342,6 @@ ACCUMULATORS: dict[str, Accumulator] = {
         residual=lambda run, state, sample, context: _changes(state, sample),
     ),
 }
+
+ACCUMULATORS: dict[str, Accumulator] = {a: v._replace(arrays=True) for a, v in _BUILT_IN.items()}
 """{name: Accumulator}; `jaxtank.measures.register` adds those of a user's own."""

@@ -7,6 +7,7 @@ modules of `measures` that it imports only.
 import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
+from jaxtank.core.vectors import each, is_array, total
 from jaxtank.measures.accumulators import settled
 from jaxtank.measures.margins import MARGINS
 from jaxtank.measures.measure import Measure
@@ -15,11 +16,11 @@ NO_CHANGES = "the reference has no changes that end"
 
 
 def _stacked(values):
-    return jnp.stack([jnp.asarray(v) for v in values])
+    return values if is_array(values) else jnp.stack([jnp.asarray(v) for v in values])
 
 
 def _means(run, values):
-    return tuple(v / run.samples for v in values)
+    return each(lambda v: v / run.samples, values)
 
 
 def _root_mean(name):
@@ -37,7 +38,7 @@ def _integral(run):
 
 
 def _scaled(name, scale):
-    return lambda run, acc: _stacked([s * scale(run) for s in acc[name]])
+    return lambda run, acc: _stacked(each(lambda s: s * scale(run), acc[name]))
 
 
 def _sum_of_squares(unit, per, name, scale, doc, read=None):
@@ -54,25 +55,34 @@ def _sum_of_squares(unit, per, name, scale, doc, read=None):
     )
 
 
+def _column(run, state, read):
+    """The vector of read(*numbers) of a state of `rows`."""
+    return read(*state) if run.arrays else _stacked([read(*row) for row in state])
+
+
 def _extremes(name, index=0):
-    return lambda run, acc: _stacked([pair[index] for pair in acc[name]])
+    return lambda run, acc: _column(run, acc[name], lambda *pair: pair[index])
 
 
 def _settling(run, acc):
-    worst = _stacked(
-        [jnp.maximum(worst, settled(last, outside)) for _, last, outside, worst in acc["settling"]]
+    worst = _column(
+        run,
+        acc["settling"],
+        lambda _, last, outside, worst: jnp.maximum(worst, settled(last, outside)),
     )
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
 def _rise(run, acc):
-    longest = _stacked([state[3] for state in acc["rise"]])
+    longest = _column(run, acc["rise"], lambda *state: state[3])
     return jnp.where(longest > 0, longest, jnp.nan)
 
 
 def _recovery(run, acc):
-    return _stacked(
-        [jnp.maximum(worst, settled(last, outside)) for last, outside, worst in acc["recovery"]]
+    return _column(
+        run,
+        acc["recovery"],
+        lambda last, outside, worst: jnp.maximum(worst, settled(last, outside)),
     )
 
 
@@ -80,7 +90,7 @@ def _overshoot_percent(run, acc):
     return 100.0 * lower_clip(_extremes("overshoot")(run, acc), 0.0)
 
 
-MEASURES: dict[str, Measure] = {
+_BUILT_IN: dict[str, Measure] = {
     "rms_error": Measure(
         "cm",
         "output",
@@ -95,7 +105,7 @@ MEASURES: dict[str, Measure] = {
         "cm",
         "run",
         ("e2",),
-        lambda run, acc: root_of_mean(sum(_means(run, acc["e2"]))),
+        lambda run, acc: root_of_mean(total(_means(run, acc["e2"]))),
         "root of the mean squared errors of all outputs, summed",
         by_input=True,
         shown=20,
@@ -189,7 +199,7 @@ MEASURES: dict[str, Measure] = {
         "-",
         "run",
         ("saturation_excess",),
-        lambda run, acc: sum(acc["saturation_excess"]) / (run.samples * run.pumps),
+        lambda run, acc: total(acc["saturation_excess"]) / (run.samples * run.pumps),
         "mean of x/(1+x), x = input commanded outside the limits over their span",
         high=1.0,
         by_input=True,
@@ -219,7 +229,7 @@ MEASURES: dict[str, Measure] = {
         "cm",
         "run",
         ("over_rim2",),
-        lambda run, acc: root_of_mean(sum(_means(run, acc["over_rim2"]))),
+        lambda run, acc: root_of_mean(total(_means(run, acc["over_rim2"]))),
         "root of the mean squared rise past the rims, summed over tanks",
         by_input=True,
     ),
@@ -315,4 +325,6 @@ MEASURES: dict[str, Measure] = {
     ),
     **MARGINS,
 }
+
+MEASURES: dict[str, Measure] = {m: spec._replace(arrays=True) for m, spec in _BUILT_IN.items()}
 """{name: Measure}; `register` adds those of a user's own."""

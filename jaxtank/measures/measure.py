@@ -43,6 +43,7 @@ class Measure(NamedTuple):
     unserved: str = ""  # why a case has none, reported where it is not computed
     nan_holds: str = ""  # what NaN means where a limit holds with it; "": NaN breaks a limit
     linear: bool = False  # of the linearised loop (`Run.margins`): computed where it is named only
+    arrays: bool = False  # whether `read` takes states of either form; else of tuples of scalars
 
     def cause(self, value: float) -> str:
         """Return why a value is not a finite number.

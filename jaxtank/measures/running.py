@@ -6,9 +6,12 @@ May import `jaxtank.core` and the other modules of `measures` only.
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
+import jax.numpy as jnp
+
 from jaxtank.core.kahan import totals
 from jaxtank.core.records import Sample
-from jaxtank.measures.accumulators import ACCUMULATORS, Context, Run
+from jaxtank.core.vectors import scalars
+from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context, Run
 from jaxtank.measures.catalogue import MEASURES
 
 States = dict[str, Any]
@@ -25,29 +28,46 @@ def needs(names: Sequence[str]) -> tuple[str, ...]:
 
 def start(run: Run, names: Sequence[str]) -> States:
     """Return {accumulator: state} before the first sample."""
-    return {a: ACCUMULATORS[a].start(run) for a in needs(names)}
+    return {a: ACCUMULATORS[a].start(_run_for(run, ACCUMULATORS[a])) for a in needs(names)}
 
 
 def update(run: Run, states: States, sample: Sample, context: Context) -> States:
     """Return {accumulator: state} after `sample`."""
-    return {a: ACCUMULATORS[a].update(run, s, sample, context) for a, s in states.items()}
+    found: States = {}
+    for a, s in states.items():
+        accumulator = ACCUMULATORS[a]
+        known = run, s, sample, context
+        if run.arrays and not accumulator.arrays:
+            known = _run_for(run, accumulator), s, *_in_scalars(sample, context)
+        found[a] = accumulator.update(*known)
+    return found
 
 
 def residuals(
     run: Run, states: States, sample: Sample, context: Context, squares: Weights
 ) -> tuple[Any, ...]:
-    """Return the residuals of one sample, a flat tuple, of the sums of squares in `squares`."""
+    """Return the residuals of one sample of the sums of squares in `squares`: a flat tuple, or a
+    tuple of arrays, one for each of `squares`.
+    """
     found: list[Any] = []
     for measure, _ in squares:
         name = MEASURES[measure].residual
-        of = cast(Callable[..., tuple[Any, ...]], ACCUMULATORS[name].residual)
-        found.extend(of(run, states[name], sample, context))
+        of = cast(Callable[..., Any], ACCUMULATORS[name].residual)
+        if run.arrays and not ACCUMULATORS[name].arrays:
+            here = _run_for(run, ACCUMULATORS[name])
+            found.append(jnp.stack(list(of(here, states[name], *_in_scalars(sample, context)))))
+        elif run.arrays:
+            found.append(of(run, states[name], sample, context))
+        else:
+            found.extend(of(run, states[name], sample, context))
     return tuple(found)
 
 
 def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
     """Return what the square of each of `residuals` counts in the weighted sum of the measures."""
     counts = {"output": run.outputs, "tank": run.tanks, "pump": run.pumps}
+    if run.arrays:
+        counts = dict.fromkeys(counts, 1)  # one array each
     found: list[Any] = []
     for measure, weight in squares:
         spec = MEASURES[measure]
@@ -59,4 +79,39 @@ def residual_weights(run: Run, squares: Weights) -> tuple[Any, ...]:
 def read(run: Run, states: States, names: Sequence[str]) -> dict[str, Any]:
     """Return {measure: value} at the end of a run."""
     states = totals(states)
-    return {name: MEASURES[name].read(run, states) for name in names}
+    found: dict[str, Any] = {}
+    for name in names:
+        spec = MEASURES[name]
+        if run.arrays and not spec.arrays:
+            rows = {
+                a: _rows_of(states[a]) if ACCUMULATORS[a].rows else states[a] for a in spec.needs
+            }
+            found[name] = spec.read(_in_tuples(run), rows)
+        else:
+            found[name] = spec.read(run, states)
+    return found
+
+
+def _rows_of(state: Any) -> tuple[Any, ...]:
+    """A tuple of numbers for each entry, of a tuple of arrays."""
+    return tuple(zip(*(scalars(column) for column in state)))
+
+
+def _run_for(run: Run, accumulator: Accumulator) -> Run:
+    """`run` in the form that an accumulator takes."""
+    return run if accumulator.arrays or not run.arrays else _in_tuples(run)
+
+
+def _in_tuples(run: Run) -> Run:
+    """`run` with tuples of scalars as vectors."""
+    low, high, rim = (scalars(v) for v in (run.low, run.high, run.rim))
+    return run._replace(low=low, high=high, rim=rim, arrays=False)
+
+
+def _in_scalars(sample: Sample, context: Context) -> tuple[Sample, Context]:
+    """The same with tuples of scalars as vectors."""
+    window = None if context.window is None else _rows_of(context.window)
+    context = context._replace(window=window, steady=scalars(context.steady))
+    alone = {"t": sample.t, "filtered": sample.filtered}
+    vectors = {f: scalars(v) for f, v in sample._asdict().items() if f not in alone}
+    return Sample(**alone, **vectors), context

@@ -51,5 +51,7 @@ class Direct(Observer):
     (8.9,)
     """
 
+    arrays = True
+
     def step(self, state: Any, tick: Tick, y: Sequence[Any]) -> tuple[Estimate, Any]:
         return Estimate(x=y), state

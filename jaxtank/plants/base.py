@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 
 from jaxtank.core.units import DEFAULT
+from jaxtank.core.vectors import take, zeros
 
 
 class Plant(abc.ABC):
     """A vector field over levels, held inputs and disturbing inflows. Vectors are tuples of
-    scalars.
+    scalars; where a class says `arrays = True`, those of many tanks are arrays.
 
     A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs
     no more than its vector field (notebook 10).
@@ -86,7 +87,7 @@ class Plant(abc.ABC):
     def shortfall(self, x: Sequence) -> tuple:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty
         tank: what a negative inflow could not take. Zeros where a level has no lower clip."""
-        return (0.0,) * len(x)
+        return zeros(x)
 
     def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """Return `derivative` of arrays x (n,) and u (m,), without time and inflows, as an array
@@ -98,8 +99,8 @@ class Plant(abc.ABC):
         """Return (levels held at their rims, overflow of each tank [cm^3]); unchanged and zeros
         where rims are not physics.
         """
-        return x, (0.0,) * len(x)
+        return x, zeros(x)
 
-    def output(self, x: Sequence[Any]) -> tuple[Any, ...]:
+    def output(self, x: Sequence[Any]) -> Sequence[Any]:
         """Return the levels that are controlled: those of the tanks in `outputs`, in that order."""
-        return tuple(x[i] for i in self.outputs)
+        return take(x, self.outputs)

@@ -50,6 +50,20 @@ class Faults:
             for _, start, end in self.windows
         )
 
+    arrays = True
+
+    def apply_arrays(self, plant: Plant, active: Sequence) -> Plant:
+        """Return `apply` with arrays as leaves of the plant."""
+        changed: dict[str, Any] = {}
+        for k, (name, _, _) in enumerate(self.windows):
+            field, (index,) = split_index(name)
+            entries = changed.get(field, jnp.asarray(getattr(plant, field)))
+            faulty = (
+                entries * (1.0 + (self.factor[k] - 1.0) * active[k]) + self.extra[k] * active[k]
+            )
+            changed[field] = jnp.where(np.arange(entries.shape[0]) == index, faulty, entries)
+        return dataclasses.replace(cast(Any, plant), **changed)
+
     def apply(self, plant: Plant, active: Sequence) -> Plant:
         """Return the plant of a sample; active: one number per fault, 1 while it lasts."""
         changed = {}

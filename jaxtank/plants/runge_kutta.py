@@ -3,6 +3,7 @@
 Imports core and xla only.
 """
 
+import operator
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank.core.kahan import added
+from jaxtank.core.vectors import each, unzipped, zeros
 from jaxtank.plants.base import Plant
 from jaxtank.xla.barrier import materialised
 
@@ -19,9 +21,9 @@ class Advanced(NamedTuple):
 
     x: Sequence[Any]  # levels [cm]
     # what rounding has added to each level too much [cm]; () where not compensated
-    excess: tuple[Any, ...]
-    spilled: tuple[Any, ...]  # overflow over each rim [cm^3]
-    shortfall: tuple[Any, ...]  # volume that a negative inflow could not take [cm^3]
+    excess: Sequence[Any]
+    spilled: Sequence[Any]  # overflow over each rim [cm^3]
+    shortfall: Sequence[Any]  # volume that a negative inflow could not take [cm^3]
 
 
 def advance(
@@ -34,7 +36,7 @@ def advance(
     dt: Any,
     substeps: Any,
     *,
-    excess: tuple[Any, ...] = (),
+    excess: Sequence[Any] = (),
     rolled: bool = False,
 ) -> Advanced:
     """Return the plant's levels a sample later, with overflow after each of its substeps.
@@ -71,20 +73,19 @@ def advance(
 
     def substep(j, before):
         x, excess, spilled, shortfall = before
-        if excess:
+        if len(excess):
             changes = change(plant, integrator, t + j * h, x, u, d, h)
-            x, excess = zip(*(added(*each) for each in zip(x, excess, changes)))
+            x, excess = unzipped(x, each(added, x, excess, changes))
         else:
             x = integrate(plant, integrator, t + j * h, x, u, d, h)
-        shortfall = tuple(a + b for a, b in zip(shortfall, plant.shortfall(x)))
+        shortfall = each(operator.add, shortfall, plant.shortfall(x))
         x, over = plant.spill(x)
-        return Advanced(x, excess, tuple(a + b for a, b in zip(spilled, over)), shortfall)
+        return Advanced(x, excess, each(operator.add, spilled, over), shortfall)
 
     if rolled and not (isinstance(substeps, int) and substeps == 1):
-        zeros = (jnp.zeros_like(x[0]),) * plant.tanks
-        return jax.lax.fori_loop(0, substeps, substep, Advanced(tuple(x), excess, zeros, zeros))
-    zeros = (0.0,) * plant.tanks
-    found = Advanced(x, excess, zeros, zeros)
+        none = (jnp.zeros_like(x[0]),) * plant.tanks
+        return jax.lax.fori_loop(0, substeps, substep, Advanced(tuple(x), excess, none, none))
+    found = Advanced(x, excess, zeros(x), zeros(x))
     for j in range(substeps):
         found = substep(j, found)
     return found
@@ -98,8 +99,8 @@ def integrate(plant, integrator, t, x, u, d, h):
     if integrator == "midpoint":
         return _along(x, rates, h)
     # k4 is ready last, so it is added last
-    return tuple(
-        (a + (h / 6.0) * (p + 2.0 * (q + r))) + (h / 6.0) * s for a, p, q, r, s in zip(x, *rates)
+    return each(
+        lambda a, p, q, r, s: (a + (h / 6.0) * (p + 2.0 * (q + r))) + (h / 6.0) * s, x, *rates
     )
 
 
@@ -107,12 +108,12 @@ def change(plant, integrator, t, x, u, d, h):
     """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
     rates = _rates(plant, integrator, t, x, u, d, h)
     if integrator == "midpoint":
-        return tuple(h * k for k in rates)
-    return tuple((h / 6.0) * (p + 2.0 * (q + r) + s) for p, q, r, s in zip(*rates))
+        return each(lambda k: h * k, rates)
+    return each(lambda p, q, r, s: (h / 6.0) * (p + 2.0 * (q + r) + s), *rates)
 
 
 def _along(x, rates, by):
-    return tuple(a + by * b for a, b in zip(x, rates))
+    return each(lambda a, b: a + by * b, x, rates)
 
 
 def _rates(plant, integrator, t, x, u, d, h):

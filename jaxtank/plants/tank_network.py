@@ -22,8 +22,11 @@ from jaxtank.core.numerics import (
 )
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.core.units import DEFAULT
+from jaxtank.core.vectors import each, is_array, zeros
+from jaxtank.plants import array_flows
 from jaxtank.plants.base import Plant
 from jaxtank.plants.hydraulics import efflux
+from jaxtank.plants.overflow import downwards, overflowed
 
 
 @component
@@ -97,6 +100,8 @@ class TankNetwork(Plant):
         "cm", "level, or difference of levels, below which flow turns laminar", low=1e-15
     )
 
+    arrays = True
+
     @property
     def tanks(self) -> int:
         return np.shape(self.rim)[-1]
@@ -159,6 +164,8 @@ class TankNetwork(Plant):
         ]
 
     def _flows(self, t, x, u, d, step=None):
+        if is_array(x):
+            return array_flows.flows(self, x, u, d, step)
         # Coefficients that do not depend on the state (the c_i of gouta2015 eq. 7) are computed
         # once by the loop. What u and d bring
         # comes first in each sum: within a Runge-Kutta step it is ready before the roots are.
@@ -229,16 +236,17 @@ class TankNetwork(Plant):
     def shortfall(self, x: Sequence[Any]) -> tuple[Any, ...]:
         if not self.bottom:
             return super().shortfall(x)
-        return tuple(self.area[i] * (lower_clip(h, 0.0) - h) for i, h in enumerate(x))
+        return each(lambda h, area: area * (lower_clip(h, 0.0) - h), x, self.area)
 
     def spill(self, x: Sequence) -> tuple[Sequence, Sequence]:
-        overflow: list[Any] = [0.0] * self.tanks
         if self.bottom:
-            x = tuple(lower_clip(h, 0.0) for h in x)
+            x = each(lambda h: lower_clip(h, 0.0), x)
         if not self.overflow:
-            return x, tuple(overflow)
-        x = list(x)
-        order, ring = _downwards(self.spills, self.tanks)
+            return x, zeros(x)
+        if is_array(x):
+            return overflowed(self, x)
+        x, overflow = list(x), [0.0] * self.tanks
+        order, ring = downwards(self.spills, self.tanks)
         for i in order:
             held = clip(x[i], -self.rim[i], self.rim[i])
             over = self.area[i] * (x[i] - held)
@@ -251,17 +259,3 @@ class TankNetwork(Plant):
             held = clip(x[i], -self.rim[i], self.rim[i])
             overflow[i], x[i] = overflow[i] + self.area[i] * (x[i] - held), held
         return tuple(x), tuple(overflow)
-
-
-def _downwards(spills, tanks):
-    """(every tank, after those that overflow into it; the tanks of rings, where there is no such
-    order): what a tank receives must be in it before its own overflow is computed.
-    """
-    order, left = [], list(range(tanks))
-    while left:
-        free = [i for i in left if not any(sink == i and source in left for source, sink in spills)]
-        if not free:
-            return [*order, *left], left
-        order += free
-        left = [i for i in left if i not in free]
-    return order, []

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.vectors import columns, serves_arrays
 
 
 class Signal(abc.ABC):
@@ -77,6 +78,22 @@ class Signal(abc.ABC):
         return None
 
 
+def sampled(signal: Signal, clock: Clock, arrays: bool = False) -> tuple[Any, Any, Any]:
+    """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`.
+
+    Examples
+    --------
+    >>> sampled(Constant(level=[4.0]), Clock(dt=1.0, duration=2.0), arrays=True)[0].shape
+    (3, 1)
+    """
+    if arrays and serves_arrays(signal):
+        return cast(Any, signal).sample_arrays(clock)
+    value, rate, second = signal.sample(clock)
+    if not arrays:
+        return value, rate, second
+    return columns(value), columns(rate), columns(second)
+
+
 @component
 class Constant(Signal):
     """A signal that does not change.
@@ -103,6 +120,13 @@ class Constant(Signal):
         zero = jnp.zeros(clock.samples)
         flat = (zero,) * self.channels
         return tuple(self.level[i] + zero for i in range(self.channels)), flat, flat
+
+    arrays = True
+
+    def sample_arrays(self, clock: Clock) -> tuple[Any, Any, Any]:
+        """Return `sample` as three arrays (samples, channels)."""
+        flat = jnp.zeros((clock.samples, self.channels))
+        return self.level + flat, flat, flat
 
     def held(self) -> tuple[tuple[Any, ...], ...]:
         return (tuple(self.level[i] for i in range(self.channels)),)

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxtank.core.clock import Chunk, indices, sample_times
 from jaxtank.xla.barrier import materialised
@@ -19,7 +20,10 @@ TOLERANCE = 5e-7
 
 
 def index(time, clock):
-    """Return the first sample at or after `time` [s]."""
+    """Return the first sample at or after `time` [s]; of an array of times, an array."""
+    if np.ndim(time):
+        samples = np.ceil(np.minimum(time / clock.dt, 2.0**53) - TOLERANCE)
+        return np.maximum(samples, 0.0).astype(np.int64)
     return max(0, math.ceil(min(time / clock.dt, 2.0**53) - TOLERANCE))
 
 
@@ -29,12 +33,16 @@ def channel(clock, initial, changes, duration, shape, lag=None):
     Parameters
     ----------
     clock : Clock or Chunk
-    initial : value before the first change
-    changes : [(time [s], target)] in order of time; a change that begins before the last one has
-        ended starts from the value reached by then
+    initial : value before the first change; of several channels with as many changes, an array (g,)
+    changes : [(time [s], target)] in order of time, of several channels arrays (g,); a change that
+        begins before the last one has ended starts from the value reached by then
     duration : of every change [s]
     shape : "linear" or "quintic"
     lag : time constant of a first-order filter behind [s], 0 for none; or None
+
+    Returns
+    -------
+    Three arrays (samples,), or (samples, g)
     """
     pieces: list[Any] = [(0, functools.partial(_flat, initial))]
     for start, target in changes:
@@ -127,10 +135,16 @@ def _flat(level, k, t):
 
 def _join(pieces, clock):
     """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Chunk`,
-    which may lie anywhere, on all.
+    which may lie anywhere, and of several channels, which change at other times each, on all.
     """
+    k, t = indices(clock), sample_times(clock)
+    if any(np.ndim(first) for first, _ in pieces):
+        k, t = k[:, None], t[:, None]
+        found = pieces[0][1](k, t)
+        for first, f in pieces[1:]:
+            found = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), found))
+        return found
     if isinstance(clock, Chunk):
-        k, t = indices(clock), sample_times(clock)
         found = pieces[0][1](k, t)
         for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):
             if after > first:

@@ -4,6 +4,7 @@ Imports core; may be imported by every folder above.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.signals.base import Signal
+from jaxtank.xla.gather import gathered
 
 
 @component
@@ -31,7 +33,7 @@ class InflowPulses(Signal):
 
     volume: np.ndarray = leaf("cm^3", "(pulses,) volume of each inflow pulse; negative: taken out")
     events: tuple = static(doc="((time [s], duration [s], tank), ...) one per inflow pulse")
-    width: int = static("-", "number of tanks", low=1, high=100)
+    width: int = static("-", "number of tanks", low=1, high=5000)
     window: float = static(
         "s",
         "time after an inflow pulse in which the recovery of its tank is measured",
@@ -59,6 +61,22 @@ class InflowPulses(Signal):
             flow[tank] = flow[tank] + self.volume[j] * jnp.maximum(share, 0.0)
         still = (jnp.zeros_like(t),) * self.width
         return tuple(flow), still, still
+
+    arrays = True
+
+    def sample_arrays(self, clock: Clock) -> tuple[Any, Any, Any]:
+        """Return `sample` as three arrays (samples, tanks)."""
+        t = sample_times(clock)[:, None]
+        still = jnp.zeros((clock.samples, self.width))
+        if not self.events:
+            return still, still, still
+        start, duration = (np.array([event[i] for event in self.events]) for i in (0, 1))
+        end = start + duration
+        share = (jnp.minimum(t + clock.dt, end) - jnp.maximum(t, start)) / (duration * clock.dt)
+        tanks = tuple(tank for *_, tank in self.events)
+        weights = jnp.asarray(self.volume)
+        sums = jax.vmap(lambda row: gathered(weights, row, tanks, self.width))
+        return sums(jnp.maximum(share, 0.0)), still, still
 
     @pointwise
     def since(self, clock: Clock) -> jax.Array:

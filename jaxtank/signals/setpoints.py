@@ -71,11 +71,7 @@ class Ramps(Signal):
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
-        if self.filter is not None and self.shape != "linear":
-            raise InputError(
-                f"reference.filter: is for ramps, and reference.shape = {self.shape!r}: set the"
-                " shape to 'linear', or leave the filter out"
-            )
+        self._check_filter()
         columns = []
         for i in range(self.channels):
             own = [(t, self.targets[j]) for j, (t, c) in enumerate(self.changes) if c == i]
@@ -94,17 +90,70 @@ class Ramps(Signal):
         arrays (samples,) each
         """
         t = sample_times(clock)
-        last = [self.initial[i] for i in range(self.channels)]
-        target = [level + jnp.zeros_like(t) for level in last]
-        step = [jnp.zeros_like(t) for _ in last]
-        since = [jnp.zeros_like(t) for _ in last]
+        own = [[] for _ in range(self.channels)]
         for j, (start, i) in enumerate(self.changes):
+            own[i].append((start, self.targets[j]))
+        return tuple(
+            self._window(clock, t, self.initial[i], changes) for i, changes in enumerate(own)
+        )
+
+    def _window(self, clock, t, last, changes):
+        """(target, step, time since, band) at times t of one channel, or of several: arrays."""
+        still = jnp.zeros_like(t)
+        target, step, since = last + still, still, still
+        for start, level in changes:
             after = t >= start - 1e-7 * clock.dt
-            target[i] = jnp.where(after, self.targets[j], target[i])
-            step[i] = jnp.where(after, self.targets[j] - last[i], step[i])
-            since[i] = jnp.where(after, t - (start + self.ramp), since[i])
-            last[i] = self.targets[j]
-        return tuple((a, b, c, self.band * jnp.abs(b)) for a, b, c in zip(target, step, since))
+            target = jnp.where(after, level, target)
+            step = jnp.where(after, level - last, step)
+            since = jnp.where(after, t - (start + self.ramp), since)
+            last = level
+        return target, step, since, self.band * jnp.abs(step)
+
+    arrays = True
+
+    def sample_arrays(self, clock: Clock) -> tuple[Any, Any, Any]:
+        """Return `sample` as three arrays (samples, channels)."""
+        self._check_filter()
+
+        def course(which, initial, changes):
+            lag = None if self.filter is None else jnp.asarray(self.filter)[which]
+            return channel(clock, initial, changes, self.ramp, self.shape, lag)
+
+        return self._by_count(clock, course)
+
+    def window_arrays(self, clock: Clock) -> tuple[Any, Any, Any, Any]:
+        """Return `windows` as four arrays (samples, channels)."""
+        t = sample_times(clock)[:, None]
+        return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
+
+    def _by_count(self, clock, made):
+        """The arrays (samples, channels) of made(which, initial (g,), [(times (g,), targets (g,))])
+        for the channels `which` that have as many changes.
+        """
+        own = [[] for _ in range(self.channels)]
+        for j, (_, i) in enumerate(self.changes):
+            own[i].append(j)
+        initial, targets = jnp.asarray(self.initial), jnp.asarray(self.targets)
+        order, parts = [], []
+        for count in sorted({len(mine) for mine in own}):
+            which = np.array([i for i, mine in enumerate(own) if len(mine) == count])
+            places = np.array([own[i] for i in which], dtype=int).reshape(-1, count)
+            changes = [
+                (np.array([self.changes[j][0] for j in column]), targets[column])
+                for column in places.T
+            ]
+            found = made(which, initial[which], changes)
+            parts.append(tuple(jnp.broadcast_to(v, (clock.samples, len(which))) for v in found))
+            order += list(which)
+        back = np.argsort(order)
+        return tuple(jnp.concatenate(part, axis=1)[:, back] for part in zip(*parts))
+
+    def _check_filter(self):
+        if self.filter is not None and self.shape != "linear":
+            raise InputError(
+                f"reference.filter: is for ramps, and reference.shape = {self.shape!r}: set the"
+                " shape to 'linear', or leave the filter out"
+            )
 
     def plateaus(self, until: float = math.inf) -> np.ndarray:
         """Return (plateaus, channels) values held between changes [cm], as host numbers.
@@ -160,8 +209,8 @@ class Sine(Signal):
     zero: float = static("s", "a time at which the sine rises through its mean")
     start: float = static("s", "when it begins", low=0.0)
     end: float = static("s", "when it ends", low=0.0)
-    channel: int = static("-", "the channel that moves", low=0, high=100)
-    width: int = static("-", "number of channels", low=1, high=100)
+    channel: int = static("-", "the channel that moves", low=0, high=5000)
+    width: int = static("-", "number of channels", low=1, high=5000)
 
     @property
     def channels(self) -> int:

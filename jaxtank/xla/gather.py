@@ -1,0 +1,105 @@
+"""Which orifices, pipes, spills and pumps end at which tank, as index arrays of a fixed width.
+
+What meets at a tank is summed by gathers: each row reads at most `width` values, padded with ones
+of weight 0. A scatter would break the time loop's compilation to one function (five times slower
+with 100 tanks); so would a sparse matrix. Imports core only.
+"""
+
+import functools
+import operator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.vectors import take
+
+WIDEST = 8
+"""Values that a row reads at most: a tank that more of them meet has several rows."""
+
+
+class Round(NamedTuple):
+    """Rows of partial sums: row r reads values[index[r, j]], those with present[r, j] = 1."""
+
+    index: np.ndarray[Any, Any]  # (rows, width)
+    present: np.ndarray[Any, Any]  # (rows, width) 1 or 0
+
+
+@functools.lru_cache(maxsize=256)
+def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
+    """Return what sums values, each of which ends at a tank, over the values of each tank.
+
+    Parameters
+    ----------
+    ends : (values,) tank of each value
+    tanks : number n of tanks
+
+    Returns
+    -------
+    (Round, ...) the first reads the values, each further one the rows of the one before; the last
+    one has a row for each tank. () without values.
+
+    Examples
+    --------
+    >>> one, = rounds((0, 2, 2), 3)
+    >>> one.index.tolist(), one.present.tolist()
+    ([[0, 0], [0, 0], [1, 2]], [[1.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    """
+    if not ends:
+        return ()
+    groups: list[list[int]] = [[] for _ in range(tanks)]
+    for value, tank in enumerate(ends):
+        groups[tank].append(value)
+    sizes = np.array([len(group) for group in groups])
+    most = min(WIDEST, int(sizes.max()))
+    # as few reads as possible in all: rows times width
+    width = min(
+        range(1 if sizes.max() == 1 else 2, most + 1),
+        key=lambda w: w * int(np.maximum(1, -(-sizes // w)).sum()),
+    )
+    rows: list[list[int]] = []
+    owners: list[int] = []
+    for tank, group in enumerate(groups):
+        for start in range(0, max(1, len(group)), width):
+            rows.append(group[start : start + width])
+            owners.append(tank)
+    index, present = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width))
+    for r, row in enumerate(rows):
+        index[r, : len(row)], present[r, : len(row)] = row, 1.0
+    first = Round(index, present)
+    return (first,) if len(rows) == tanks else (first, *rounds(tuple(owners), tanks))
+
+
+def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: Any = None) -> Any:
+    """Return (n,) sums over what ends at each tank of weight times value; None without any.
+
+    Parameters
+    ----------
+    weights : (k,) of each value
+    values : (k,) or, with `of`, an array from which value k is read at of[k]; None: ones
+    ends : (k,) tank at which each ends
+    tanks : number n of tanks
+    of : (k,) places in `values`, where k of them are read from another array
+
+    Examples
+    --------
+    >>> gathered(jnp.ones(3), jnp.array([1.0, 2.0, 4.0]), (0, 2, 2), 3).tolist()
+    [1.0, 0.0, 6.0]
+    """
+    found: Any = None
+    for level, (index, present) in enumerate(rounds(ends, tanks)):
+        terms: list[Any] = []
+        for column, there in zip(index.T, present.T):
+            if level:
+                terms.append(_kept(there, take(found, column)))
+                continue
+            weight = _kept(there, take(weights, column))
+            read = column if of is None else np.asarray(of)[column]
+            terms.append(weight if values is None else weight * take(values, read))
+        found = functools.reduce(operator.add, terms)
+    return found
+
+
+def _kept(present: np.ndarray[Any, Any], values: Any) -> Any:
+    """`values` (rows,), 0 where they only pad a row."""
+    return values if present.all() else jnp.where(present > 0.0, values, 0.0)
