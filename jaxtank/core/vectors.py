@@ -93,7 +93,9 @@ def take(vector: Any, indices: Sequence[int]) -> Any:
     first, count = (int(places[0]), len(places)) if len(places) else (0, 0)
     if np.array_equal(places, np.arange(first, first + count)):
         return vector if count == vector.shape[0] else vector[first : first + count]
-    return vector.at[places].get(mode="promise_in_bounds")
+    along = jax.lax.GatherDimensionNumbers((), (0,), (0,))
+    inside = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    return jax.lax.gather(vector, places[:, None], along, (1,), mode=inside)
 
 
 def total(vector: Any) -> Any:

@@ -100,7 +100,7 @@ def decide(
     else:
         entries = scalars(command)
         applied, filtered = guard.apply(loop.actuator, entries, metric, scalars(y), tick.dt, line)
-    applied = like(applied, y)
+    applied = materialised(like(applied, y)) if is_array(y) else like(applied, y)
     watched, acting = given(loop.observer, command), given(loop.observer, applied)
     observer = loop.observer.predict(observer, observed, watched, acting)
     seen = _seen_by(loop.controller, tick)
@@ -149,8 +149,9 @@ def move(
         faults: Any = loop.faults
         change = faults.apply_arrays if is_array(state.x) else faults.apply
         plant = change(plant, now.fault)
-    driving = materialised(like(loop.actuator.driving(u), state.x))
-    u = like(u, state.x)
+    driving, u = like(loop.actuator.driving(u), state.x), like(u, state.x)
+    if not is_array(u):  # arrays have been so since `decide`
+        driving = materialised(driving)
     found = advance(
         plant,
         clock.integrator,

@@ -73,25 +73,23 @@ def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
     enters = pumped(net, u) if d is None else pumped(net, u) + d
     most = None if step is None else supply(net, step)
     q = smooth_sqrt(x, net.knee) if step is None else limited_sqrt(x, net.knee, most)
-    rate = enters * per_area - (outlets(net) * w * per_area) * q
+    v = w * q
     if net.links:
-        area, ends = jnp.asarray(net.orifice), second_of(net.links)
-        poured = gathered(area, materialised(q), ends, net.tanks, of=first_of(net.links))
-        rate = rate + poured * (w * per_area)
-    if net.pipes:
-        rate = rate + piped(net, x, most) * (w * per_area)
-    return rate
+        v = materialised(v)  # read by every orifice
+        orifice, ends = jnp.asarray(net.orifice), second_of(net.links)
+        enters = enters + gathered(orifice, v, ends, net.tanks, of=first_of(net.links))
+    rate = (enters - outlets(net) * v) * per_area
+    return rate + piped(net, x, most) * per_area if net.pipes else rate
 
 
 def piped(net: Any, x: Any, most: Any) -> Any:
-    """Return (n,) what the pipes bring to each tank, over sqrt(2 g) [cm^2.5]."""
+    """Return (n,) what the pipes bring to each tank [cm^3/s]."""
     one, other = first_of(net.pipes), second_of(net.pipes)
     held = x if most is None else lower_clip(x, 0.0)
     s = smooth_signed_sqrt(take(held, one) - take(held, other), net.knee)
     if most is not None:
         s = limited_flow(s, take(most * held, one), take(most * held, other))
-    s = materialised(s)  # read twice: where each pipe ends
-    pipe = jnp.asarray(net.pipe)
-    signed = jnp.concatenate([-pipe, pipe])
-    both = (*range(len(one)), *range(len(one)))
-    return gathered(signed, s, one + other, net.tanks, of=both)
+    flow = materialised(jnp.asarray(net.pipe) * jnp.sqrt(2.0 * net.gravity) * s)
+    pipes = range(len(one))
+    signs = np.repeat([-1.0, 1.0], len(one))
+    return gathered(signs, flow, one + other, net.tanks, of=(*pipes, *pipes))

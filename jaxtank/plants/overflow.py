@@ -87,13 +87,12 @@ def overflowed(net: Any, x: Any) -> tuple[Any, Any]:
     found = cascade(net.spills, net.tanks)
 
     def over(levels: Any) -> Any:
-        return area * (levels - clip(levels, -rim, rim))
+        return materialised(area * (levels - clip(levels, -rim, rim)))
 
     def caught_of(volumes: Any, which: np.ndarray[Any, Any]) -> Any:
         """(n,) what the spills `which` bring to each tank, as a rise of its level [cm]."""
         source = [net.spills[k][0] for k in which]
         sink = tuple(net.spills[k][1] for k in which)
-        volumes = materialised(volumes)
         return gathered(caught[which], volumes, sink, net.tanks, of=source) / area
 
     def further(volumes: Any, _: Any) -> Any:

@@ -137,7 +137,7 @@ class Ramps(Signal):
         order, parts = [], []
         for count in sorted({len(mine) for mine in own}):
             which = np.array([i for i, mine in enumerate(own) if len(mine) == count])
-            places = np.array([own[i] for i in which], dtype=int).reshape(-1, count)
+            places = np.array([own[i] for i in which], dtype=int).reshape(len(which), count)
             changes = [
                 (np.array([self.changes[j][0] for j in column]), targets[column])
                 for column in places.T

@@ -8,6 +8,11 @@ a stage's rates by the next stage and by the sum), so left alone each
 fusion repeats most of the chain: for a batch of 256 runs of the four-tank 1028 operations where
 312 suffice. Fusion does not cross a call that must not be inlined; such a call computes nothing and
 costs nothing, for its result shares the memory of its operand.
+
+An array must be read through the call alone: in a loop that is compiled to one function another
+reader may write its own result over it, before the call's result is read (a wrong number, seen with
+jaxlib 0.10 and 0.11). Scalars are safe. So must derivatives: the operand is best a product with a
+coefficient, whose derivative does not read the product.
 """
 
 from typing import TypeVar

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.vectors import take
+from jaxtank.xla.barrier import materialised
 
 WIDEST = 8
 """Values that a row reads at most: a tank that more of them meet has several rows."""
@@ -89,11 +90,13 @@ def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: A
     found: Any = None
     for level, (index, present) in enumerate(rounds(ends, tanks)):
         terms: list[Any] = []
+        found = materialised(found) if level else None
         for column, there in zip(index.T, present.T):
             if level:
                 terms.append(_kept(there, take(found, column)))
                 continue
-            weight = _kept(there, take(weights, column))
+            known = isinstance(weights, np.ndarray)
+            weight = _kept(there, weights[column] if known else take(weights, column))
             read = column if of is None else np.asarray(of)[column]
             terms.append(weight if values is None else weight * take(values, read))
         found = functools.reduce(operator.add, terms)
@@ -102,4 +105,6 @@ def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: A
 
 def _kept(present: np.ndarray[Any, Any], values: Any) -> Any:
     """`values` (rows,), 0 where they only pad a row."""
+    if isinstance(values, np.ndarray):
+        return values * present
     return values if present.all() else jnp.where(present > 0.0, values, 0.0)
