@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.analysis.sparse_balance import balanced
+from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.numerics import smooth_sqrt
 
@@ -77,6 +79,9 @@ def _from_known_speeds(plant, known, xp=jnp):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
         )
+    if n >= vectors.FROM:
+        speeds, inputs = _responses(plant, xp)
+        return speeds @ known, inputs @ known
     eye, (efflux, pumps) = np.eye(n), _balance(plant, xp)
     free = [i for i in range(n) if i not in plant.outputs]
     columns = xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
@@ -85,6 +90,39 @@ def _from_known_speeds(plant, known, xp=jnp):
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]
     return speeds, solution[len(free) :]
+
+
+def _responses(plant, xp):
+    """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
+    a network of many tanks: `_from_known_speeds` for all of them at once, by matrices that are
+    filled and not added up.
+    """
+    n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
+    free = np.setdiff1d(np.arange(n), outputs)
+    source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
+    first = np.array([a for a, _ in plant.feeds])
+    second = np.array([a if b is None else b for a, b in plant.feeds])
+    alone, pump = np.array([b is None for _, b in plant.feeds]), np.arange(m)
+    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
+    share = xp.where(alone, 1.0, xp.asarray(plant.split))
+    efflux = _filled(xp, -xp.diag(xp.asarray(plant.drain)), (source, source), -orifice)
+    efflux = _filled(xp, efflux, (sink, source), orifice)
+    pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
+    pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
+    columns = xp.concatenate([efflux[:, free], pumps], axis=1)
+    solution = xp.linalg.solve(columns, -efflux[:, outputs])
+    order = np.argsort(np.concatenate([outputs, free]))
+    speeds = xp.concatenate([xp.eye(m), solution[: len(free)]])[order]
+    return speeds, solution[len(free) :]
+
+
+def _filled(xp, matrix, places, values):
+    """`matrix` with values added at places, some of which may be the same."""
+    if xp is jnp:
+        return matrix.at[places].add(values)
+    matrix = np.array(matrix)
+    np.add.at(matrix, places, values)
+    return matrix
 
 
 def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -112,6 +150,10 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
     [2.949, 3.297]
     """
     roots = [smooth_sqrt(v, plant.knee) for v in r]
+    if plant.tanks >= vectors.FROM:
+        speeds, inputs = (part @ jnp.stack(roots) for part in _responses(plant, jnp))
+        w = jnp.sqrt(2.0 * plant.gravity)
+        return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
     parts = [
         _from_known_speeds(plant, jnp.sqrt(2.0 * plant.gravity) * one) for one in np.eye(len(r))
     ]
@@ -234,12 +276,32 @@ def _balanced(plant, y, words):
     """(levels, inputs) at which a network with pipes stands still, by damped Gauss-Newton in the
     roots of the unknown levels.
     """
-    free = [i for i in range(plant.tanks) if i not in plant.outputs]
     if plant.pumps != len(plant.outputs):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {plant.pumps} and"
             f" {len(plant.outputs)}"
         )
+    speed = (
+        float(np.max(np.abs(plant.drain)))
+        / float(np.min(plant.area))
+        * np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
+    )
+    tolerance = 1e-9 * max(speed, 1e-12)
+    try:
+        # an area of 1e-300, say, overflows on the way: the check below reports it
+        with np.errstate(all="ignore"):
+            many = plant.tanks >= vectors.FROM
+            x, u, left = balanced(plant, y, 1e-5 * tolerance) if many else _by_dense(plant, y)
+    except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
+        raise EquilibriumError(f"{words} have no steady state") from None
+    if not np.max(np.abs(left)) < tolerance:
+        raise EquilibriumError(f"{words} have no steady state")
+    return x, u
+
+
+def _by_dense(plant, y):
+    """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
+    free = [i for i in range(plant.tanks) if i not in plant.outputs]
     scale = float(np.max(y)) or 1.0
     # level rate per unit of input
     gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
@@ -259,26 +321,14 @@ def _balanced(plant, y, words):
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
     start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
-    try:
-        # an area of 1e-300, say, overflows on the way: the check below reports it
-        with np.errstate(all="ignore"):
-            found = scipy.optimize.least_squares(
-                residual,
-                start,
-                jac=jacobian,
-                xtol=1e-15,
-                ftol=1e-15,
-                gtol=1e-15,
-                x_scale="jac",
-                max_nfev=500,
-            )
-    except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
-        raise EquilibriumError(f"{words} have no steady state") from None
-    speed = (
-        float(np.max(np.abs(plant.drain)))
-        / float(np.min(plant.area))
-        * np.sqrt(2.0 * float(plant.gravity) * scale)
+    found = scipy.optimize.least_squares(
+        residual,
+        start,
+        jac=jacobian,
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+        x_scale="jac",
+        max_nfev=500,
     )
-    if not np.max(np.abs(found.fun)) < 1e-9 * max(speed, 1e-12):
-        raise EquilibriumError(f"{words} have no steady state")
-    return split(found.x)
+    return (*split(found.x), found.fun)

@@ -56,11 +56,12 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
     """
     try:
         out, joined = np.array(plant.drain, dtype=float), np.zeros(plant.tanks)
+        orifice, pipe = np.asarray(plant.orifice), np.asarray(plant.pipe)
         for k, (source, _) in enumerate(plant.links):
-            out[source] += np.asarray(plant.orifice)[k]
+            out[source] += orifice[k]
         for k, ends in enumerate(plant.pipes):
             for i in ends:
-                joined[i] += np.asarray(plant.pipe)[k]
+                joined[i] += pipe[k]
         with np.errstate(all="ignore"):
             speed = np.sqrt(2.0 * np.asarray(plant.gravity, dtype=float) / plant.knee)
             rates = speed * (orifices * out + pipes * joined) / np.asarray(plant.area, dtype=float)
@@ -104,11 +105,12 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
     near a bottom are wrong.
     """
     plant, step = loop.plant, clock.dt / clock.substeps
+    rates = emptying_rates(plant)
     for found in unstable_tanks(loop, clock):
         # from a full tank: T = 2 A sqrt(h) / (sqrt(2 g) sum a), with the rate of laminar flow in
         # place of its factors
         full = math.sqrt(plant.rim[found.tank] / _threshold(loop))
-        empty = 3.0 * full / emptying_rates(plant)[found.tank]
+        empty = 3.0 * full / rates[found.tank]
         if empty < step:
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: tank {found.tank + 1} runs empty in {empty:.2g} s,"

@@ -17,7 +17,7 @@ from jaxtank.core.numerics import (
     smooth_sqrt,
 )
 from jaxtank.core.vectors import take
-from jaxtank.xla.barrier import materialised
+from jaxtank.xla.barrier import materialised, with_one_slope
 from jaxtank.xla.gather import gathered
 
 
@@ -72,7 +72,8 @@ def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
     w, per_area = jnp.sqrt(2.0 * net.gravity), 1.0 / jnp.asarray(net.area)
     enters = pumped(net, u) if d is None else pumped(net, u) + d
     most = None if step is None else supply(net, step)
-    q = smooth_sqrt(x, net.knee) if step is None else limited_sqrt(x, net.knee, most)
+    root = with_one_slope(lambda h: smooth_sqrt(h, net.knee))
+    q = root(x) if step is None else limited_sqrt(x, net.knee, most)
     v = w * q
     if net.links:
         v = materialised(v)  # read by every orifice
@@ -86,7 +87,8 @@ def piped(net: Any, x: Any, most: Any) -> Any:
     """Return (n,) what the pipes bring to each tank [cm^3/s]."""
     one, other = first_of(net.pipes), second_of(net.pipes)
     held = x if most is None else lower_clip(x, 0.0)
-    s = smooth_signed_sqrt(take(held, one) - take(held, other), net.knee)
+    root = with_one_slope(lambda h: smooth_signed_sqrt(h, net.knee))
+    s = root(take(held, one) - take(held, other))
     if most is not None:
         s = limited_flow(s, take(most * held, one), take(most * held, other))
     flow = materialised(jnp.asarray(net.pipe) * jnp.sqrt(2.0 * net.gravity) * s)

@@ -23,7 +23,7 @@ from jaxtank.rig.schema import SECTIONS
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 
-MOST = 100
+MOST = 5000
 """Tanks that a rig file may have; as many pumps, orifices, pipes and spills."""
 
 LISTS = tuple(name for name, section in SECTIONS.items() if section.per)

@@ -116,6 +116,9 @@ class Ramps(Signal):
         self._check_filter()
 
         def course(which, initial, changes):
+            if not changes:
+                still = jnp.zeros((clock.samples, 1))
+                return initial + still, still, still
             lag = None if self.filter is None else jnp.asarray(self.filter)[which]
             return channel(clock, initial, changes, self.ramp, self.shape, lag)
 
