@@ -110,8 +110,10 @@ def random_loop(seed, tanks):
 
 
 def measures_of(loop):
-    """Every measure of a run that means something for a loop."""
-    return tuple(m for m in (*ms.reported(), *ms.times()) if ms.serves(m, loop))
+    """Every measure of a run that means something for a loop; but times at which an extreme was
+    reached, of which rounding decides where a level stays at a bound.
+    """
+    return tuple(m for m in ms.reported() if ms.serves(m, loop))
 
 
 def in_form(monkeypatch, arrays, function, *args, **static):
@@ -122,8 +124,8 @@ def in_form(monkeypatch, arrays, function, *args, **static):
     return jax.tree.map(np.asarray, jax.jit(plain)(*args))
 
 
-def compare(monkeypatch, loop, names):
-    """Assert that both forms give the same run, measures, slopes and Gauss-Newton matrix."""
+def compare_runs(monkeypatch, loop):
+    """Assert that both forms give the same run."""
     kept = {"clock": CLOCK, "save_every": 3}
     one, many = (
         in_form(monkeypatch, arrays, simulate_compiled, loop, key=KEY, **kept)[0]
@@ -131,8 +133,12 @@ def compare(monkeypatch, loop, names):
     )
     for name in ("t", "x", "y", "r", "e", "command", "applied", "u", "spilled", "d_hat"):
         np.testing.assert_allclose(getattr(many, name), getattr(one, name), rtol=0, atol=1e-9)
+
+
+def compare_measures(monkeypatch, loop, names, clock=CLOCK):
+    """Assert that both forms give the same measures, slopes and Gauss-Newton matrix."""
     values = {"controller.Kc": loop.controller.Kc[0], "plant.gravity": loop.plant.gravity}
-    static = {"clock": CLOCK, "names": names, "order": tuple(values)}
+    static = {"clock": clock, "names": names, "order": tuple(values)}
     point = {"values": tuple(values.values()), "key": KEY}
     one, many = (
         in_form(monkeypatch, arrays, sensitivities_compiled, loop, **static, **point)
@@ -144,14 +150,95 @@ def compare(monkeypatch, loop, names):
             np.testing.assert_allclose(y, x, rtol=0, atol=tolerance * size)
 
 
-@pytest.mark.parametrize(("seed", "tanks"), [(0, 3), (1, 5), (2, 8)])
-def test_arrays_and_scalars_give_the_same_run(monkeypatch, seed, tanks):
-    loop = random_loop(seed, tanks)
-    compare(monkeypatch, loop, measures_of(loop))
+def row(tanks):
+    """Tanks in a row with every kind of part, whose structure is the same for any number."""
+    ends = [(i, i + 1) for i in range(tanks - 1)]
+    plant = network(
+        area=15.0 + np.arange(tanks) % 3,
+        drain=0.05,
+        links=ends[::2],
+        orifice=0.05,
+        pipes=ends,
+        pipe=0.2,
+        pump_gain=8.0,
+        feeds=[(0, 1), (tanks // 2, None)],
+        split=0.5,
+        spills=ends,
+        caught=0.5,
+        rim=20.0,
+        outputs=(0, tanks // 2),
+        overflow=True,
+        bottom=True,
+    )
+    two = {name: [value] * 2 for name, value in {"Kc": 1.0, "Ti": 10.0, "Tt": 10.0}.items()}
+    return ClosedLoop(
+        plant=plant,
+        sensor=LevelSensor(noise=np.full(tanks, 0.01)),
+        observer=Direct(),
+        controller=PID(model=plant, Td=[1.0, 1.0], bias=[1.0, 1.0], **two),
+        actuator=PumpBank(low=[0.0] * 2, high=[9.0] * 2, lag=[1.0] * 2, delay=2.0),
+        reference=ramps([5.0, 5.0], [(5.0, 0, 8.0), (9.0, 1, 6.0)]),
+        disturbance=inflow_pulses(tanks, [(9.0, 4.0, 0, 120.0)]),
+        faults=faults(plant, [("drain[1]", 25.0, 50.0, 1.0, 0.1)]),
+        x0=np.full(tanks, 5.0),
+    )
+
+
+def programs_in(jaxpr):
+    """A program and all those that it calls."""
+    yield jaxpr
+    for equation in jaxpr.eqns:
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else [value]:
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from programs_in(inner)
+
+
+def loop_of(tanks):
+    """The programs of the body of the time loop of a run with its measures."""
+    loop = row(tanks)
+    plain = functools.partial(
+        evaluate_compiled.__wrapped__, clock=CLOCK, names=measures_of(loop), checkpoint=False
+    )
+    whole = jax.make_jaxpr(lambda loop: plain(loop, key=KEY))(loop).jaxpr
+    bodies = [e.params["jaxpr"].jaxpr for e in whole.eqns if e.primitive.name == "scan"]
+    (body,) = [b for b in bodies if len(b.eqns) > 100]
+    return list(programs_in(body))
+
+
+def test_the_body_of_the_loop_does_not_grow_with_the_number_of_tanks():
+    """What makes the time to compile a rig grow is the number of operations in the loop."""
+    few, many = loop_of(16), loop_of(200)
+    assert sum(len(p.eqns) for p in few) == sum(len(p.eqns) for p in many)
+    names = {e.primitive.name for p in many for e in p.eqns}
+    assert not {name for name in names if "scatter" in name or name in ("sort", "while")}
+    assert "gather" in names
+
+
+def test_what_is_computed_once_is_read_through_its_barrier_alone():
+    """An array that is read beside its barrier may have been overwritten by then."""
+    walls = 0
+    for program in loop_of(16):
+        for wall in program.eqns:
+            if wall.params.get("name") != "_as_it_is":
+                continue
+            walls += 1
+            for v in (v for v in wall.invars if getattr(v.aval, "ndim", 0)):
+                readers = [e for e in program.eqns if e is not wall and v in list(e.invars)]
+                assert not readers and v not in list(program.outvars)
+    assert walls >= 12
+
+
+def test_arrays_and_scalars_give_the_same_measures_and_slopes(monkeypatch):
+    clock = Clock(dt=1.0, duration=60.0)
+    names = ("rms_error", "max_level", "overflow_volume", "input_travel", "settling_time")
+    compare_measures(monkeypatch, random_loop(0, 3), names, clock)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3, 23))
+@pytest.mark.parametrize("seed", range(20))
 def test_arrays_and_scalars_give_the_same_run_on_many_rigs(monkeypatch, seed):
     loop = random_loop(seed, 3 + seed % 28)
-    compare(monkeypatch, loop, measures_of(loop))
+    compare_runs(monkeypatch, loop)
+    compare_measures(monkeypatch, loop, measures_of(loop))
