@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxtank.core.errors import InputError
 from jaxtank.plots.effects import BARS, elementary, panels, shares, tornado
+from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.search import contours, convergence, curve
 from jaxtank.plots.style import (
     AFTER,
@@ -61,7 +62,7 @@ COLUMNS = 4
 """Panels beside each other."""
 
 SHOWN = 16
-"""Tanks that are neither outputs nor above a limit which are drawn at most."""
+"""Tanks between, outputs and pumps that are drawn each; of more, those that matter."""
 
 
 def _example() -> Any:
@@ -227,7 +228,8 @@ def responses(loop, trajectories, title="", limits=None):
         for (name, run), style in zip(trajectories.items(), _styles(trajectories))
     }
     others, note = _other_tanks(loop, trajectories)
-    rows = _rows(loop, drawn, others, limits)
+    outputs, pumps, more = _worst_outputs(loop, trajectories)
+    rows, note = _rows(loop, drawn, (outputs, pumps, others), limits), note + more
     columns = max(len(row) for row in rows)
     width = max(4.6 * columns, 6.4)
     with styled():
@@ -272,12 +274,27 @@ def _other_tanks(loop, trajectories):
     return sorted(sorted(others, key=near.__getitem__)[-SHOWN:]), note
 
 
-def _rows(loop, drawn, others, limits):
-    """Rows of functions that draw one panel each."""
-    length, drive = loop.units
+def _worst_outputs(loop, trajectories):
+    """([(output, its tank)], pumps, a line of the title on those left out): of many, the outputs
+    with the largest errors and the pumps that move most.
+    """
+    outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
+    note = ""
+    if len(outputs) > SHOWN:
+        off = [np.sqrt(np.mean(run.e**2, axis=0)) for run in trajectories.values()]
+        note += f"\nof {len(outputs)} outputs, the {NAMED} with the largest errors"
+        outputs = [outputs[k] for k in worst(np.max(off, axis=0))]
+    if len(pumps) > SHOWN:
+        moved = [np.sum(np.abs(np.diff(run.u, axis=0)), axis=0) for run in trajectories.values()]
+        note += f"\nof {len(pumps)} pumps, the {NAMED} that move most"
+        pumps = worst(np.max(moved, axis=0))
+    return outputs, pumps, note
+
+
+def _rows(loop, drawn, which, limits):
+    """Rows of functions that draw one panel each, of (outputs, pumps, other tanks)."""
+    (outputs, pumps, others), (length, drive) = which, loop.units
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
-    outputs = list(enumerate(loop.plant.outputs))
-    pumps = range(loop.plant.pumps)
 
     def level_of(i, k=None):
         return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length)

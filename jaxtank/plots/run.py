@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxtank.plots import responses
 from jaxtank.plots.layout import place
+from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
 
 
@@ -32,14 +33,21 @@ def figures(run: Any) -> dict[str, Any]:
             len(groups), figsize=(6.4, 7.5), sharex=True, layout="constrained"
         )
         for ax, (title, symbol, values, unit) in zip(axes, groups):
-            for i in range(values.shape[1]):
-                colour, style = colours[i % len(colours)], "-" if i < len(colours) else "--"
+            named, note = range(values.shape[1]), ""
+            if len(named) > responses.SHOWN:  # the range of all, and those that go highest
+                named = worst(np.max(np.abs(values), axis=0))
+                note = f": range of {values.shape[1]}, and the {len(named)} largest"
+                low, high = values.min(axis=1), values.max(axis=1)
+                ax.fill_between(run.t, low, high, color="0.85", linewidth=0)
+            for k, i in enumerate(named):
+                colour, style = colours[k % len(colours)], "-" if k < len(colours) else "--"
                 ax.plot(
                     run.t, values[:, i], color=colour, linestyle=style, label=f"{symbol}{i + 1}"
                 )
-            ax.set(title=title, ylabel=f"[{unit}]")
-            if values.shape[1] <= responses.SHOWN:
-                ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))  # beside the lines
+            ax.set(title=title + note, ylabel=f"[{unit}]")
+            columns = 1 + (len(named) > 6)
+            # beside the lines
+            ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), ncols=columns)
         axes[-1].set_xlabel("time [s]")
     return {"run": figure}
 
@@ -50,10 +58,14 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
     """
     if not hasattr(plant, "links"):
         return {}
-    where = place(plant)
-    wide, high = where.right - where.left, where.top - where.bottom
+    if plant.tanks > LARGEST:
+        extent = size(plant.tanks)
+    else:
+        where = place(plant)
+        wide, high = where.right - where.left, where.top - where.bottom
+        extent = (4.8, min(7.0, 4.8 * high / wide + 0.35))
     with responses.styled():
-        figure = plt.figure(figsize=(4.8, min(7.0, 4.8 * high / wide + 0.35)))
+        figure = plt.figure(figsize=extent)
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
         if run is not None and np.all(np.isfinite(run.x[-1])):
             schematic(ax, plant, run.x[-1], run.r[-1])

@@ -8,6 +8,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from jaxtank.plots.layout import jets, overflows, pipes, place
+from jaxtank.plots.overview import LARGEST, overview
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -21,7 +22,8 @@ def schematic(ax, plant, levels=None, setpoints=None):
     """Draw a rig: each tank above those that it flows into, heights to scale.
 
     Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
-    are free jets, dotted lines overflow, double lines pipes below the surface.
+    are free jets, dotted lines overflow, double lines pipes below the surface. A rig of more than
+    24 tanks is drawn by `overview.overview`.
 
     Parameters
     ----------
@@ -42,6 +44,8 @@ def schematic(ax, plant, levels=None, setpoints=None):
     >>> [text.get_text() for text in ax.texts if "tank" in text.get_text()]
     ['tank 1\\n4 V', 'tank 2\\n5 V']
     """
+    if plant.tanks > LARGEST:
+        return overview(ax, plant, levels)
     where, unit = place(plant), plant.units[0]
     _basin(ax, where)
     for pump, _, path in where.risers:

@@ -10,6 +10,9 @@ from tuning.report.panel import panel
 CAPTIONS = {"responses": "Levels with setpoints and rims, and the inputs of the pumps."}
 """{picture: what it shows}."""
 
+WORST = 12
+"""Limits that are listed where there are many: the tightest ones."""
+
 
 def page_of(case, values, drawn, command=None, provenance=None):
     """Return the page of a run: whether the limits hold, the live page, pictures, measures.
@@ -57,6 +60,13 @@ def _limits(case, values):
         most = f"{tables.number(float(limit.value))} {unit}"
         words = f"{limit.label}: {tables.number(value)} {unit}, the limit of {most} {side}"
         found.append((words, margin))
+    if len(found) > tables.MANY:  # the tightest ones
+        found = sorted(found, key=lambda one: one[1])
+        found, rest = found[:WORST], found[WORST:]
+        passed = sum(not margin >= 0.0 for _, margin in rest)
+        words = f"{len(rest)} further limits have larger margins"
+        words += f", and {passed} of them are passed" if passed else ""
+        found.append((words, rest[0][1]))
     return found
 
 
@@ -66,7 +76,7 @@ def _facts(case, values):
     for name in case.objective:
         if name in values:
             unit = ms.unit(name, case.loop.units)
-            found.append((name, f"{tables.numbers(values[name])} {unit}".strip()))
+            found.append((name, f"{tables.entries(name, values[name])} {unit}".strip()))
     return [
         *found,
         ("length", f"{case.clock.duration:g} s"),

@@ -41,6 +41,30 @@ def numbers(value, digits=5):
     return "  ".join(number(v, digits) if math.isfinite(v) else "none" for v in values)
 
 
+MANY = 16
+"""Entries of a measure that are printed side by side; of more, the worst."""
+
+
+def entries(measure, value):
+    """Return the entries of a measure; of more than 16, the four worst with their numbers.
+
+    Examples
+    --------
+    >>> entries("max_level", [1.0, 2.5])
+    '1  2.5'
+    >>> entries("max_level", range(20))
+    'worst of 20: 19 (tank 20), 18 (tank 19), 17 (tank 18), 16 (tank 17)'
+    """
+    values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
+    if len(values) <= MANY:
+        return numbers(values)
+    # what is undefined first
+    worse = spec.sense * np.where(np.isnan(values), spec.sense * np.inf, values)
+    order = np.argsort(-worse, kind="stable")
+    found = ", ".join(f"{numbers(values[i])} ({spec.per} {i + 1})" for i in order[:4])
+    return f"worst of {len(values)}: {found}"
+
+
 def undefined(measures):
     """Return sentences: why entries of {measure: value} are printed as "none".
 
@@ -150,7 +174,7 @@ def table(rows, head=None):
 def measure_table(values, rig_units=DEFAULT):
     """Return the Table of {measure: value}: unit, entries and what the measure is."""
     rows = [
-        [m, ms.unit(m, rig_units), numbers(values[m]), spec.doc]
+        [m, ms.unit(m, rig_units), entries(m, values[m]), spec.doc]
         for m, spec in ms.MEASURES.items()
         if m in values and m not in ms.times()
     ]

@@ -28,6 +28,10 @@ SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
 """What is kept of a sample: fields of a Trajectory."""
 
 
+LARGEST = 24
+"""Tanks of a loop that is written as code."""
+
+
 @dataclasses.dataclass(frozen=True)
 class WholeLoop:
     """The statements of one sample, in order, and what they lead to.
@@ -153,7 +157,14 @@ def whole_loop(case: Case, names: Sequence[str] | None = None) -> WholeLoop:
 
 
 def check_pointwise(case: Case) -> None:
-    """Raise InputError for a loop whose signals do not follow from their times alone."""
+    """Raise InputError for a loop whose signals do not follow from their times alone, and for one
+    of too many tanks: their code, a statement for each number, takes minutes to write.
+    """
+    if case.loop.plant.tanks > LARGEST:
+        raise InputError(
+            f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
+            f" most {LARGEST}"
+        )
     if not is_pointwise(case.loop):
         raise InputError(
             f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"

@@ -1,6 +1,5 @@
 """Vectors as arrays against tuples of scalars: the same runs, on random rigs of any topology."""
 
-import dataclasses
 import functools
 
 import jax
@@ -11,7 +10,6 @@ from jaxtank import measures as ms
 from jaxtank.controllers import PID
 from jaxtank.core import vectors
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import with_values
 from jaxtank.instruments import LevelSensor, PumpBank
 from jaxtank.loop.closed_loop import ClosedLoop, takes_arrays
 from jaxtank.loop.derivatives import sensitivities_compiled

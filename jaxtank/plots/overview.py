@@ -1,0 +1,142 @@
+"""A large rig at a glance: tanks as cells in reading order, the fullest ones named.
+
+Draws on given matplotlib axes. Imported by `schematic`, `run` and `responses`.
+"""
+
+import math
+
+import numpy as np
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.patches import Rectangle
+
+from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER
+
+LARGEST = 24
+"""Tanks up to which a rig is drawn part by part."""
+
+NAMED = 12
+"""Tanks, outputs or pumps that a picture of many names at most: the worst ones."""
+
+CELL, PITCH = 0.62, 1.0
+"""Side of a cell, and distance from one to the next."""
+
+
+def worst(values, most=NAMED):
+    """Return the places of the largest of some values, in the order of their places.
+
+    Examples
+    --------
+    >>> worst([3.0, 9.0, 1.0, 5.0], 2)
+    [1, 3]
+    """
+    order = np.argsort(-np.asarray(values, dtype=float), kind="stable")
+    return sorted(int(i) for i in order[:most])
+
+
+def per_line(tanks):
+    """Return the number of cells in a line, for about twice as many as there are lines.
+
+    Examples
+    --------
+    >>> per_line(100), per_line(1000)
+    (15, 45)
+    """
+    return math.ceil(math.sqrt(2.0 * tanks))
+
+
+def size(tanks):
+    """Return (width, height) of the figure of `overview` [inch].
+
+    Examples
+    --------
+    >>> [round(v, 2) for v in size(100)]
+    [7.2, 4.06]
+    """
+    columns = per_line(tanks)
+    lines = math.ceil(tanks / columns)
+    return 7.2, 7.2 * (lines + 1.2) / (columns + 0.6) + 0.35
+
+
+def overview(ax, plant, levels=None):
+    """Draw a rig of many tanks: a cell each, in the order of their numbers, filled as a share of
+    its rim.
+
+    Controlled tanks have a heavier outline, a triangle marks a pump, grey lines are pipes, blue
+    ones orifices, dotted ones overflow. The fullest tanks have their numbers and an outline of
+    their own; at the left are the numbers with which lines begin.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    plant : TankNetwork
+    levels : (tanks,) [cm], or None for empty tanks
+
+    Returns
+    -------
+    The axes.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from jaxtank.plants import network
+    >>> rig = network(
+    ...     area=np.full(30, 15.0), drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=20.0
+    ... )
+    >>> ax = overview(Figure().gca(), rig, np.arange(30.0) / 2.0)
+    >>> sorted(int(t.get_text()) for t in ax.texts if t.get_gid() == "fullest")[:3]
+    [19, 20, 21]
+    """
+    n, columns = plant.tanks, per_line(plant.tanks)
+    corners = np.array([(i % columns, -(i // columns)) for i in range(n)], dtype=float) * PITCH
+    centres = corners + 0.5 * CELL
+    for pairs, colour, style in (
+        (plant.pipes, GLASS, "-"),
+        (plant.links, AFTER, "-"),
+        (plant.spills, AFTER, ":"),
+    ):
+        lines = [(centres[a], centres[b]) for a, b in pairs]
+        ax.add_collection(
+            LineCollection(lines, colors=colour, linestyles=style, linewidths=0.8, zorder=1)
+        )
+    shares = np.zeros(n)
+    if levels is not None:
+        shares = np.clip(np.asarray(levels, dtype=float) / np.asarray(plant.rim), 0.0, 1.0)
+    _cells(ax, corners, np.ones(n), facecolors="white", zorder=2)
+    _cells(ax, corners, shares, facecolors=WATER, zorder=3)
+    widths = np.where(np.isin(np.arange(n), plant.outputs), 1.8, 0.6)
+    _cells(
+        ax, corners, np.ones(n), facecolors="none", edgecolors=GLASS, linewidths=widths, zorder=4
+    )
+    for j, (first, second) in enumerate(plant.feeds):
+        for i in (i for i in (first, second) if i is not None):
+            x, y = corners[i] + (0.5 * CELL, CELL + 0.08)
+            ax.plot(x, y, marker="v", color=PUMPS[j % len(PUMPS)], markersize=4, zorder=5)
+    if levels is not None:
+        fullest = worst(shares)
+        _cells(
+            ax,
+            corners[fullest],
+            np.ones(len(fullest)),
+            facecolors="none",
+            edgecolors=FORBIDDEN,
+            linewidths=1.6,
+            zorder=6,
+        )
+        for i in fullest:
+            x, y = centres[i]
+            style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 7}
+            ax.text(x, y, str(i + 1), gid="fullest", **style)
+    for line in range(math.ceil(n / columns)):
+        y = -line * PITCH + 0.5 * CELL
+        ax.text(-0.2, y, str(line * columns + 1), ha="right", va="center", fontsize=6, color="0.3")
+    ax.set(
+        xlim=(-0.9, columns * PITCH - 0.2), ylim=(corners[:, 1].min() - 0.3, 1.0), aspect="equal"
+    )
+    ax.axis("off")
+    return ax
+
+
+def _cells(ax, corners, heights, **style):
+    """Draw rectangles of the width of a cell; heights: as a share of a cell's."""
+    cells = [Rectangle(corner, CELL, CELL * h) for corner, h in zip(corners, heights)]
+    ax.add_collection(PatchCollection(cells, **{"edgecolors": "none", **style}))
