@@ -19,6 +19,7 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, parameters
+from jaxtank.export.whole.loop import check_pointwise
 from jaxtank.loop.trajectory import stride
 from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
@@ -67,6 +68,7 @@ def page(case, presets=(), source=None):
     >>> text[:15], "http-equiv" in text
     ('<!DOCTYPE html>', True)
     """
+    check_pointwise(case)
     off, on, filtered = both(case)
     data = data_of(case, presets, source)
     text = assemble(_engine(off, on), case.name, data)

@@ -58,6 +58,8 @@ def entries(measure, value):
     values, spec = np.ravel(np.asarray(value, dtype=float)), ms.MEASURES[measure]
     if len(values) <= MANY:
         return numbers(values)
+    if np.all(values == values[0]):
+        return f"{numbers(values[0])} (each of {len(values)})"
     # what is undefined first
     worse = spec.sense * np.where(np.isnan(values), spec.sense * np.inf, values)
     order = np.argsort(-worse, kind="stable")
