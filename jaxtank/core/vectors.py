@@ -6,7 +6,7 @@ same for any number. Formulas that are written with `each`, `take` and `total` s
 Imports jax only; may be imported by every folder.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -79,8 +79,8 @@ def unzipped(vector: Any, results: Any) -> tuple[Any, ...]:
     return results if is_array(vector) else tuple(zip(*results))
 
 
-def take(vector: Any, indices: Sequence[int]) -> Any:
-    """Return the entries of a vector at fixed places.
+def take(vector: Any, indices: Any) -> Any:
+    """Return the entries of a vector at fixed places: numbers, or an array of whole numbers.
 
     Examples
     --------

@@ -18,21 +18,18 @@ from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
 from jaxtank.controllers.base import Controller
 from jaxtank.core import vectors
-from jaxtank.core.clock import CHUNK, Chunk, Clock, sample_times
+from jaxtank.core.clock import CHUNK, Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
-from jaxtank.core.vectors import columns, given, is_array, scalars, serves_arrays, take, total
+from jaxtank.core.vectors import columns, given, is_array, scalars, serves_arrays, total
 from jaxtank.instruments.base import Actuator, Sensor
+from jaxtank.loop.change_windows import windows
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
 from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal, sampled
-
-AWAY = 0.01
-"""Distance of the first level from a constant setpoint above which it counts as a change, as a
-share of the setpoint [-]."""
 
 Group = Any
 """Vector: a tuple of numbers, one per tank, pump or output, or an array (jaxtank.core.vectors)."""
@@ -212,55 +209,6 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
         window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
     steady = _steady_inputs(loop, r) if "steady" in wanted else None
     return ms.Context(window=window, since=since, steady=steady)
-
-
-def windows(loop: ClosedLoop, times: Any, arrays: bool = False) -> Group | None:
-    """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
-    With `arrays`, a tuple of four arrays (samples, outputs).
-
-    A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has none
-    of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY of the
-    setpoint.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> case = presets.load("cascaded/pi")
-    >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
-    [1, 2.0]
-    """
-    reference: Any = loop.reference
-    if arrays and serves_arrays(reference):
-        return _array_windows(loop, times)
-    found = reference.windows(times)
-    band = getattr(reference, "band", None)
-    if found is not None and band is not None:
-        moved, t = {channel for _, channel in reference.changes}, sample_times(times)
-        found = tuple(
-            window if i in moved else _from_start(window, t, loop.x0[output], band)
-            for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
-        )
-    return found if found is None or not arrays else tuple(columns(v) for v in zip(*found))
-
-
-def _array_windows(loop: ClosedLoop, times: Any) -> Group | None:
-    """`windows` of a reference that serves arrays."""
-    reference: Any = loop.reference
-    if reference.changes is None:
-        return None
-    found = reference.window_arrays(times)
-    still = np.ones(reference.channels, dtype=bool)
-    still[[channel for _, channel in reference.changes]] = False
-    level = take(jnp.asarray(loop.x0), loop.plant.outputs)
-    first = _from_start(found, sample_times(times)[:, None], level, reference.band)
-    return tuple(jnp.where(still, a, b) for a, b in zip(first, found))
-
-
-def _from_start(window: Group, t: Any, level: Any, band: float) -> Group:
-    """Return the window at times t of an output with a constant setpoint that starts at `level`."""
-    target, none, _, _ = window
-    step = jnp.where(jnp.abs(target - level) > AWAY * jnp.abs(target), target - level, none)
-    return target, step, t, band * jnp.abs(step)
 
 
 def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:

@@ -4,6 +4,8 @@ A measure reads accumulators at the end of a run. May import `jaxtank.core` and 
 modules of `measures` that it imports only.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
@@ -15,7 +17,7 @@ from jaxtank.measures.measure import Measure
 NO_CHANGES = "the reference has no changes that end"
 
 
-def _stacked(values):
+def _stacked(values) -> Any:
     return values if is_array(values) else jnp.stack([jnp.asarray(v) for v in values])
 
 
@@ -55,7 +57,7 @@ def _sum_of_squares(unit, per, name, scale, doc, read=None):
     )
 
 
-def _column(run, state, read):
+def _column(run, state, read) -> Any:
     """The vector of read(*numbers) of a state of `rows`."""
     return read(*state) if run.arrays else _stacked([read(*row) for row in state])
 

@@ -71,7 +71,7 @@ def flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> Any:
     """
     w, per_area = jnp.sqrt(2.0 * net.gravity), 1.0 / jnp.asarray(net.area)
     enters = pumped(net, u) if d is None else pumped(net, u) + d
-    most = None if step is None else supply(net, step)
+    most: Any = None if step is None else supply(net, step)
     root = with_one_slope(lambda h: smooth_sqrt(h, net.knee))
     q = root(x) if step is None else limited_sqrt(x, net.knee, most)
     v = w * q

@@ -129,7 +129,7 @@ class Ramps(Signal):
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
-    def _by_count(self, clock, made):
+    def _by_count(self, clock, made) -> Any:
         """The arrays (samples, channels) of made(which, initial (g,), [(times (g,), targets (g,))])
         for the channels `which` that have as many changes.
         """

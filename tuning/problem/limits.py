@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
-from jaxtank.loop.closed_loop import ClosedLoop, windows
+from jaxtank.loop.change_windows import windows
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_limits
 from tuning.problem.scenarios import ScenarioRun
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
-from jaxtank.loop.closed_loop import windows
+from jaxtank.loop.change_windows import windows
 from tuning.problem.point import DIVERGED
 from tuning.problem.problem import Problem
 from tuning.problem.status import Status

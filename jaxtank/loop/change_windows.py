@@ -1,0 +1,67 @@
+"""What overshoot, rise and settling of a run refer to: the last change of each setpoint.
+
+May import the folders below `jaxtank.loop` only.
+"""
+# jax leaves the types of its functions partly open.
+# pyright: reportUnknownMemberType=false
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.clock import sample_times
+from jaxtank.core.vectors import columns, serves_arrays, take
+
+AWAY = 0.01
+"""Distance of the first level from a constant setpoint above which it counts as a change, as a
+share of the setpoint [-]."""
+
+
+def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
+    """Return what overshoot, rise and settling refer to, as `Signal.windows`; None without changes.
+    With `arrays`, a tuple of four arrays (samples, outputs).
+
+    A start away from the setpoint counts as a change at t = 0 of an output whose setpoint has none
+    of its own: the step is the setpoint less the level in `loop.x0`, if it is more than AWAY of the
+    setpoint.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = presets.load("cascaded/pi")
+    >>> [len(windows(case.loop, case.clock)), float(windows(case.loop, case.clock)[0][1][-1])]
+    [1, 2.0]
+    """
+    reference: Any = loop.reference
+    if arrays and serves_arrays(reference):
+        return _array_windows(loop, times)
+    found = reference.windows(times)
+    band = getattr(reference, "band", None)
+    if found is not None and band is not None:
+        moved, t = {channel for _, channel in reference.changes}, sample_times(times)
+        found = tuple(
+            window if i in moved else _from_start(window, t, loop.x0[output], band)
+            for i, (output, window) in enumerate(zip(loop.plant.outputs, found))
+        )
+    return found if found is None or not arrays else tuple(columns(v) for v in zip(*found))
+
+
+def _array_windows(loop: Any, times: Any) -> Any:
+    """`windows` of a reference that serves arrays."""
+    reference: Any = loop.reference
+    if reference.changes is None:
+        return None
+    found = reference.window_arrays(times)
+    still = np.ones(reference.channels, dtype=bool)
+    still[[channel for _, channel in reference.changes]] = False
+    level = take(jnp.asarray(loop.x0), loop.plant.outputs)
+    first = _from_start(found, sample_times(times)[:, None], level, reference.band)
+    return tuple(jnp.where(still, a, b) for a, b in zip(first, found))
+
+
+def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
+    """Return the window at times t of an output with a constant setpoint that starts at `level`."""
+    target, none, _, _ = window
+    step = jnp.where(jnp.abs(target - level) > AWAY * jnp.abs(target), target - level, none)
+    return target, step, t, band * jnp.abs(step)
