@@ -4,7 +4,7 @@ gouta2022 notes S4.5).
 
 import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -135,7 +135,7 @@ class PID(Controller):
         return self.feed_forward
 
     def init(self, x0: tuple, u0: tuple) -> Any:
-        none = 0.0 * u0 if is_array(u0) else (0.0 * u0[0],) * len(u0)
+        none: Any = each(lambda u: 0.0 * u, u0) if is_array(u0) else (0.0 * u0[0],) * len(u0)
         return Memory(
             integral=none,
             slow=() if self.Td is None else take(x0, self.model.outputs),
@@ -184,14 +184,14 @@ class PID(Controller):
 
     def _fractional(self, state, tick, w):
         """The state after errors w (m,) at the input of fractional integrals."""
-        integral, sections = [], []
+        integral, sections, order = [], [], cast(Any, self.order)
         for i, error in enumerate(w):
-            gain, poles, residues = oustaloup(1.0 - self.order[i])
+            gain, poles, residues = oustaloup(1.0 - order[i])
             keep = jnp.exp(-poles * tick.dt)
             enter = residues * (1.0 - keep) / poles
             rate = gain * error + sum(state.sections[i])
             integral.append(
-                state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -self.order[i] * rate
+                state.integral[i] + tick.dt * self.Kc[i] * self.Ti[i] ** -order[i] * rate
             )
             sections.append(
                 tuple(keep[j] * s + enter[j] * error for j, s in enumerate(state.sections[i]))

@@ -5,6 +5,8 @@ grows with the number of tanks, and so does the time to compile it. An array kee
 same for any number. Formulas that are written with `each`, `take` and `total` serve both forms.
 Imports jax only; may be imported by every folder.
 """
+# jax leaves the types of its functions partly open.
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
 from collections.abc import Callable
 from typing import Any

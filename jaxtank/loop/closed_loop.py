@@ -8,7 +8,7 @@ May import the folders below `jaxtank.loop` only; the other modules of `loop` im
 import dataclasses
 import functools
 import warnings
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -206,7 +206,11 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Group) -> 
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
         recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0
-        window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
+
+        def waiting(v: Any) -> Any:
+            return jnp.where(recovering, 0.0, v)
+
+        window = jax.tree.map(waiting, window)
     steady = _steady_inputs(loop, r) if "steady" in wanted else None
     return ms.Context(window=window, since=since, steady=steady)
 
@@ -220,7 +224,7 @@ def _steady_inputs(loop: ClosedLoop, r: Group) -> Any:
 
 def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     """Return the state before the first sample. arrays: the form of vectors."""
-    zero, actuator = zero_of(loop), loop.actuator
+    zero, actuator = zero_of(loop), cast(Any, loop.actuator)
 
     def same_type(v: Any) -> Any:
         return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
@@ -231,13 +235,14 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     if arrays:
         x0, u0 = jnp.asarray(loop.x0) + zero, jnp.asarray(actuator.initial) + zero
         excess = jnp.zeros_like(x0)
-    start: Any = actuator.init_arrays if arrays and serves_arrays(actuator) else None
+    whole = arrays and serves_arrays(actuator)
+    begin = actuator.init_arrays if whole else actuator.init
     return State(
         k=jnp.int32(0),
         x=x0,
         observer=jax.tree.map(same_type, loop.observer.init(given(loop.observer, x0))),
         controller=jax.tree.map(same_type, control_state(loop, x0, u0)),
-        actuator=jax.tree.map(same_type, (start or actuator.init)(clock)),
+        actuator=jax.tree.map(same_type, begin(clock)),
         sensor=jax.tree.map(same_type, loop.sensor.init(given(loop.sensor, x0))),
         excess=excess if zero.dtype == jnp.float32 else (),
     )

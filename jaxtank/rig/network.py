@@ -138,10 +138,11 @@ def _units(value):
 
 def _check_names(tanks):
     """Raise InputError where two tanks have the same name."""
-    names = [tank["name"] for tank in tanks if tank["name"]]
-    for name in names:
-        if names.count(name) > 1:
+    seen: set[str] = set()
+    for name in (tank["name"] for tank in tanks if tank["name"]):
+        if name in seen:
             raise InputError(f"two tanks have the same name, {name!r}: give each its own")
+        seen.add(name)
 
 
 def _check_links(table, entries):
@@ -186,10 +187,7 @@ def _list(table, name):
     if not entries and name in ("tank", "pump"):
         raise InputError(f"a rig needs at least one [[{name}]]")
     if len(entries) > MOST:
-        raise InputError(
-            f"[[{name}]]: {len(entries)} {name}s: must be at most {MOST}, for each is a part of the"
-            " compiled loop"
-        )
+        raise InputError(f"[[{name}]]: {len(entries)} {name}s: must be at most {MOST}")
     return entries
 
 

@@ -22,7 +22,7 @@ from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_model
 MOST = 100
 """Parts of a dotted key; the names of a rig have four."""
 
-MOST_WORDS = 100_000
+MOST_WORDS = 250_000
 """Keys (each part of one), numbers (those with a point twice), texts, lists and tables of a file:
 it is parsed and checked in seconds.
 """

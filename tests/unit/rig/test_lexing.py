@@ -94,9 +94,9 @@ def test_what_is_toml_with_short_keys_passes(text):
 @pytest.mark.parametrize("kind", ["pipe", "orifice", "spill", "pump"])
 def test_more_of_a_kind_than_a_loop_can_hold_are_refused(kind):
     tanks = "[[tank]]\narea = 1.0\nrim = 9.0\n" * 2
-    with pytest.raises(InputError, match=rf"\[\[{kind}\]\]: 101 {kind}s: must be at most 100"):
+    with pytest.raises(InputError, match=rf"\[\[{kind}\]\]: 5001 {kind}s: must be at most 5000"):
         rig.loads(
             tanks
             + ("[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n" if kind != "pump" else "")
-            + f"[[{kind}]]\n" * 101
+            + f"[[{kind}]]\n" * 5001
         )
