@@ -77,9 +77,7 @@ def sensitivities_compiled(
     if ms.functions(names):
         return _with_functions(loop, clock, names, order, values, key, squares, batched)
     flat, unflatten = ravel_pytree(values)
-    arrays = takes_arrays(loop)
-    # the axis of the directions: in front of arrays, whose entries then stay side by side
-    axis, axis_of_samples = (0, 1) if arrays else (-1, -1)
+    arrays, axis, axes = _form_of(loop)
     kept = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
     basis = jnp.eye(flat.size, dtype=flat.dtype)
 
@@ -97,13 +95,12 @@ def sensitivities_compiled(
         moving, fixed = known.split(sampled(theta))
         return (floats, moving), (rest, fixed)
 
-    begun = _pushed(begin, (flat,), basis, outs=(axis, axis_of_samples))
+    begun = _pushed(begin, (flat,), basis, outs=axes)
     (floats, moving), (dfloats, dmoving), (rest, fixed) = begun
     weights = ms.residual_weights(run_of(loop, clock, arrays), squares)
 
     def body(carry: Any, now: Any) -> Any:
-        floats, dfloats, rest, matrix = carry
-        moving, dmoving, fixed = now
+        (floats, dfloats, rest, matrix), (moving, dmoving, fixed) = carry, now
 
         def advance(floats: Any, theta: Any, moving: Any) -> Any:
             here = at(theta)
@@ -115,16 +112,15 @@ def sensitivities_compiled(
             return (floats, errors), others
 
         push, point = _pushed_stored if batched else _pushed, (floats, flat, moving)
-        tangents = dfloats, basis, dmoving
-        (floats, _), (dfloats, derrors), rest = push(advance, point, *tangents, ins=axis, outs=axis)
+        moved = push(advance, point, dfloats, basis, dmoving, ins=axis, outs=axis)
+        (floats, _), (dfloats, derrors), rest = moved
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
     carry = (floats, dfloats, rest, jnp.zeros_like(basis))
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
 
     def finish(floats: Any, theta: Any) -> Any:
-        run, (_, acc) = run_with(at(theta), clock, names, arrays), carried.join(floats, rest)
-        return ms.read(run, acc, names), None
+        return _measures(at(theta), clock, names, arrays, carried.join(floats, rest)), None
 
     results, slopes, _ = _pushed(finish, (floats, flat), dfloats, basis, ins=axis)
     return results, slopes, 2.0 * matrix, is_broken(carried.join(floats, rest)[0])
@@ -158,6 +154,20 @@ def _with_functions(
     basis = jnp.eye(flat.size, dtype=flat.dtype)
     found, rates, _ = _pushed(functions, (measures, flat), slopes, basis)
     return found, rates, matrix, broken
+
+
+def _form_of(loop: ClosedLoop) -> tuple[bool, int, tuple[int, int]]:
+    """(whether vectors are arrays, axis of the directions in the loop, that in (a state, samples)):
+    in front of arrays, whose entries then stay side by side.
+    """
+    return (True, 0, (0, 1)) if takes_arrays(loop) else (False, -1, (-1, -1))
+
+
+def _measures(
+    loop: ClosedLoop, clock: Clock, names: tuple[str, ...], arrays: bool, carried: Any
+) -> dict[str, Any]:
+    """The measures of a run that ended with (state, accumulators)."""
+    return ms.read(run_with(loop, clock, names, arrays), carried[1], names)
 
 
 def _start(loop: ClosedLoop, clock: Clock, names: tuple[str, ...], arrays: bool) -> Any:
