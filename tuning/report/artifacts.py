@@ -64,7 +64,7 @@ def earlier(folder, names):
 
 
 def write_result(folder, files, draw, page=None, stale=()):
-    """Write `files` {name: text or bytes} of a result to `folder`, all or none, then its pictures,
+    """Write `files` {name: text, its parts, or bytes} of a result to `folder`, all or none, then its pictures,
     all or none; returns the paths.
 
     draw: function that returns {name: figure}, called once the files are written; page: function of

@@ -20,14 +20,15 @@ from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage.batch_store import BatchStore
 from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.needs import infeasible
+from tuning.uncertainty.needs import BLOCK, infeasible
 from tuning.uncertainty.result import Ensemble
-from tuning.uncertainty.sampling import check_whole, probabilities, spread_of
+from tuning.uncertainty.sampling import Points, check_whole, spread_of
 
 FAN_DRAWS = 512
 """Draws of a fan chart."""
@@ -123,25 +124,21 @@ def ensemble(
         origin = shards.origin_of(case, case.limits if limits is None else limits)
         shared = shard is not None or jax.process_count() > 1
         store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
-    batches = _batches(plan, store, Runner(case, names, plan.seed, devices), shard, merge, progress)
+    runner = Runner(case, names, plan.seed, devices)
     if shard is not None:
+        _batches(plan, store, runner, shard, merge, progress, lambda k, batch: None)
         return None
-    if jax.process_count() > 1:
-        batches = gather(batches, plan.count)
-    joined = {
-        name: np.concatenate([batches[k][name] for k in range(plan.count)])[:samples]
-        for name in batches[0]
-    }
-    values = plan.space.values(plan.points)
-    first = {n: v[:FAN_DRAWS] for n, v in values.items()}
+    joined = _joined(plan, store, runner, merge, progress)
+    values, beyond = _drawn(case, plan, folder)
+    first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
     return Ensemble(
         case=case,
         distributions=distributions,
         labels=plan.space.labels,
         values=values,
-        measures={m: joined[m] for m in names},
-        failed=joined["failed"] > 0,
-        infeasible=infeasible(case, values),
+        measures=joined[0],
+        failed=joined[1],
+        infeasible=beyond,
         limits=limited,
         fan=fan_of(case, first, plan.seed) if fan else None,
         wall_s=time.perf_counter() - began,
@@ -177,11 +174,21 @@ class _Plan(NamedTuple):
     """What the batches of an ensemble are made of."""
 
     space: Draws
-    points: np.ndarray  # (samples, dimensions) probabilities
+    points: Points  # probabilities
     seed: int | None  # of the sensor noise
     batch: int  # draws in a batch
     count: int  # of batches
     shapes: dict  # {name: shape} of what a batch holds
+
+    def rows(self, k):
+        """Return ({name: (batch, ...)} values, (batch,) numbers) of the draws of batch k.
+
+        The last draw is repeated to fill the last batch.
+        """
+        indices = np.arange(k * self.batch, (k + 1) * self.batch)
+        inside = indices[indices < self.points.samples]
+        points = self.points.rows(int(inside[0]), int(inside[-1]) + 1)
+        return self.space.values(points[np.minimum(indices - indices[0], len(points) - 1)]), indices
 
 
 def _plan(case, space, names, samples, key, draws, batch):
@@ -189,7 +196,7 @@ def _plan(case, space, names, samples, key, draws, batch):
     random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
     batch = batch or batch_size(case, random, samples)
-    points = probabilities(draws, space.dimensions, samples, key)
+    points = Points(draws, space.dimensions, samples, key)
     shapes = {
         m: (batch,) if ms.MEASURES[m].per == "run" else (batch, ms.entries(m, case.loop.plant))
         for m in names
@@ -200,8 +207,39 @@ def _plan(case, space, names, samples, key, draws, batch):
     )
 
 
-def _batches(plan, store, runner, shard, merge, progress):
-    """Run the batches of this shard that the store lacks; returns {number: batch} of all of it."""
+def _joined(plan, store, runner, merge, progress):
+    """Run the batches that the store lacks; returns (Columns of the measures, (draws,) failed)."""
+    folder, several = None if store is None else store.folder, jax.process_count() > 1
+    samples, mine = plan.points.samples, {}
+    failed, table = np.zeros(samples, dtype=bool), None
+
+    def put(k, batch):
+        nonlocal table
+        if table is None:
+            table = Columns({n: batch[n] for n in plan.shapes if n != "failed"}, samples, folder)
+        table.put(k * plan.batch, batch)
+        rows = slice(k * plan.batch, min((k + 1) * plan.batch, samples))
+        failed[rows] = batch["failed"][: rows.stop - rows.start] > 0
+
+    _batches(plan, store, runner, None, merge, progress, mine.__setitem__ if several else put)
+    for k, batch in gather(mine, plan.count).items() if several else ():
+        put(k, batch)
+    return table, failed
+
+
+def _drawn(case, plan, folder):
+    """(Columns of the drawn values, (draws,) True where infeasible or None), blocks at a time."""
+    space, samples = plan.space, plan.points.samples
+    values, beyond = Columns(space.values(plan.points.rows(0, 1)), samples, folder), []
+    for rows in row_blocks(samples, BLOCK):
+        block = space.values(plan.points.rows(rows.start, rows.stop))
+        values.put(rows.start, block)
+        beyond.append(infeasible(case, block))
+    return values, None if beyond[0] is None else np.concatenate(beyond)
+
+
+def _batches(plan, store, runner, shard, merge, progress, put):
+    """Run the batches of this shard that the store lacks; put(number, batch) takes each of them."""
     mine = _numbers(plan.count, shard)
     missing = [k for k in mine if store is None or not store.has(k)]
     if merge and missing:
@@ -214,30 +252,28 @@ def _batches(plan, store, runner, shard, merge, progress):
 
     def report(batches):
         if progress is not None:
-            progress(min(len(plan.points), plan.batch * (done + batches)))
+            progress(min(plan.points.samples, plan.batch * (done + batches)))
 
-    found = _run_missing(plan, store, runner, missing, report)
+    _run_missing(plan, store, runner, missing, report, put)
     if shard is None and store is not None:
-        found |= {k: store.get(k, plan.shapes) for k in mine if k not in found}
-    return found
+        for k in sorted(set(mine) - set(missing)):
+            put(k, store.get(k, plan.shapes))
 
 
-def _run_missing(plan, store, runner, numbers, report):
-    """Run the batches of these numbers and keep them in the store; returns {number: batch}.
+def _run_missing(plan, store, runner, numbers, report, put):
+    """Run the batches of these numbers, keep them in the store, and pass each to `put`.
 
     report: called with the number of batches run.
     """
-    found, width, last = {}, len(runner.devices), len(plan.points) - 1
-    for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
-        indices = [np.arange(k * plan.batch, (k + 1) * plan.batch) for k in group]
-        # the last draw repeated to fill the last batch
-        rows = [plan.space.values(plan.points[np.minimum(i, last)]) for i in indices]
+    width = len(runner.devices)
+    for i in range(0, len(numbers), width):
+        group = numbers[i : i + width]
+        rows, indices = zip(*(plan.rows(k) for k in group))
         for k, measures in zip(group, runner(rows, indices)):
             if store is not None:
                 store.put(k, measures)
-            found[k] = measures
-        report(len(found))
-    return found
+            put(k, measures)
+        report(i + len(group))
 
 
 def _what(case, distributions, samples, key, draws, names, batch):
