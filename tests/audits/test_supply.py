@@ -98,7 +98,7 @@ READ = {
     ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "in a folder of mode 700 and"
     " the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
-    ("jaxtank.xla.program_cache", "_processor", "open"): "/proc/cpuinfo",
+    ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",

@@ -3,6 +3,7 @@
 Imported by `tuning` and its commands.
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.loop import run as lp
+from tuning.cluster.engine import check_alone, connect
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
@@ -27,6 +29,7 @@ from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
+from tuning.uncertainty.remote import RemoteRunner
 from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import Points, check_whole, spread_of
 
@@ -46,6 +49,7 @@ def ensemble(
     fan: bool = True,
     batch: int | None = None,
     devices: int = 1,
+    cluster: Any = None,
     shard: tuple[int, int] | None = None,
     folder: str | Path | None = None,
     checkpoint: str | Path | None = None,
@@ -78,6 +82,9 @@ def ensemble(
         Draws run at once on a device; a size that fits the case where None.
     devices : int
         Local devices to use.
+    cluster : str, distributed.Client or None
+        Run the batches on a Dask cluster: "HOST:PORT" of its scheduler, "local:N" for N workers on
+        this machine, or a Client. A worker that is killed or added changes no number.
     shard : (int, int) or None
         (i, n): run only the i-th of n shares of the batches, into the checkpoint (`merge` joins
         them). Under `jax.distributed` every process runs its share and all get the whole.
@@ -113,22 +120,23 @@ def ensemble(
     began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     _check_arguments(shard, samples, key)
     check_devices(devices)
+    check_alone(cluster, devices=devices > 1, shard=shard is not None, merge=merge)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = as_measures(None, limits)[1]
     limited = resolve_limits(case, limits)
     names = _measure_names(case, measures, limited)
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
     store = None
-    if folder is not None:
-        what = _what(case, distributions, samples, key, draws, names, plan.batch)
-        origin = shards.origin_of(case, case.limits if limits is None else limits)
-        shared = shard is not None or jax.process_count() > 1
-        store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
-    runner = Runner(case, names, plan.seed, devices)
-    if shard is not None:
-        _batches(plan, store, runner, shard, merge, progress, lambda k, batch: None)
-        return None
-    joined = _joined(plan, store, runner, merge, progress)
+    with _runner(case, names, plan.seed, devices, cluster) as runner:
+        if folder is not None:
+            what = _what(case, distributions, samples, key, draws, names, plan.batch)
+            origin = shards.origin_of(case, case.limits if limits is None else limits)
+            shared = shard is not None or jax.process_count() > 1
+            store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
+        if shard is not None:
+            _batches(plan, store, runner, shard, merge, progress, lambda k, batch: None)
+            return None
+        joined = _joined(plan, store, runner, merge, progress)
     values, beyond = _drawn(case, plan, folder)
     first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
     return Ensemble(
@@ -207,6 +215,16 @@ def _plan(case, space, names, samples, key, draws, batch):
     )
 
 
+@contextlib.contextmanager
+def _runner(case, names, seed, devices, cluster):
+    """Give what runs batches: the devices of this process, or the workers of a cluster."""
+    if cluster is None:
+        yield Runner(case, names, seed, devices)
+        return
+    with connect(cluster) as engine:
+        yield RemoteRunner(case, names, seed, engine)
+
+
 def _joined(plan, store, runner, merge, progress):
     """Run the batches that the store lacks; returns (Columns of the measures, (draws,) failed)."""
     folder, several = None if store is None else store.folder, jax.process_count() > 1
@@ -249,31 +267,16 @@ def _batches(plan, store, runner, shard, merge, progress, put):
             f" them number {missing[0]}"
         )
     done = len(mine) - len(missing)
-
-    def report(batches):
+    for k, batch in runner.each(missing, plan.rows):
+        if store is not None:
+            store.put(k, batch)
+        put(k, batch)
+        done += 1
         if progress is not None:
-            progress(min(plan.points.samples, plan.batch * (done + batches)))
-
-    _run_missing(plan, store, runner, missing, report, put)
+            progress(min(plan.points.samples, plan.batch * done))
     if shard is None and store is not None:
         for k in sorted(set(mine) - set(missing)):
             put(k, store.get(k, plan.shapes))
-
-
-def _run_missing(plan, store, runner, numbers, report, put):
-    """Run the batches of these numbers, keep them in the store, and pass each to `put`.
-
-    report: called with the number of batches run.
-    """
-    width = len(runner.devices)
-    for i in range(0, len(numbers), width):
-        group = numbers[i : i + width]
-        rows, indices = zip(*(plan.rows(k) for k in group))
-        for k, measures in zip(group, runner(rows, indices)):
-            if store is not None:
-                store.put(k, measures)
-            put(k, measures)
-        report(i + len(group))
 
 
 def _what(case, distributions, samples, key, draws, names, batch):

@@ -1,0 +1,42 @@
+"""What a Dask worker runs. Imports the standard library alone: the scheduler reads it, too."""
+
+import functools
+import importlib
+
+TASKS = {
+    "batch": ("tuning.uncertainty.remote", "batch"),
+    "points": ("tuning.uncertainty.remote", "points"),
+    "search": ("tuning.search.remote", "search"),
+}
+"""{name of a task: module and function}: names, texts, numbers and arrays are sent, no functions."""
+
+
+def call(task, x64, *arguments):
+    """Run a task on a worker.
+
+    Parameters
+    ----------
+    task : a name of TASKS
+    x64 : bool
+        Whether floats have 64 bits; of this thread alone, a worker may have other work.
+    arguments : of its function
+
+    Returns
+    -------
+    (digest of the type of processor, what the function returns)
+    """
+    import jaxtank  # noqa: F401, I001  it sets the options of the compiler, before jax starts
+
+    import jax
+
+    module, name = TASKS[task]
+    function = getattr(importlib.import_module(module), name)
+    with jax.enable_x64(x64):
+        return _processor(), function(*arguments)
+
+
+@functools.cache
+def _processor():
+    from jaxtank.xla.program_cache import processor
+
+    return processor()
