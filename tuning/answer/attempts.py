@@ -36,8 +36,8 @@ LEVELS = ("max_level", "overflow_volume")
 class Task:
     """What was asked for, and what stays the same from one search to the next."""
 
-    def __init__(self, free, plan, samples, progress):
-        self.free, self.plan, self.samples = free, plan, samples
+    def __init__(self, free, plan, samples, progress, engine=None):
+        self.free, self.plan, self.samples, self.engine = free, plan, samples, engine
         self.progress, self.may_filter = progress, True
         self.cache: Any = None
 
@@ -150,7 +150,8 @@ def _search(task, made, case, limits, least):
             checks and stays
         ):  # a start that holds the limits as they are may stay where they are tighter
             found.slack = checks.slack(problem)
-        search_from(problem, task.plan, task.report(problem, setting.cost_unit), found)
+        report = task.report(problem, setting.cost_unit)
+        search_from(problem, task.plan, report, found, task.engine)
 
     if not limits:
         search(made.found)

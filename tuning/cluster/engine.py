@@ -7,6 +7,7 @@ import contextlib
 import logging
 import queue
 import re
+import sys
 import time
 import warnings
 
@@ -29,14 +30,18 @@ MOST = 1024
 ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?(\[[0-9A-Fa-f:.]+\]|[\w.-]+):\d{1,5}")
 
 
+class ClusterWarning(UserWarning):
+    """Something about a cluster that a user should know; the command prints it as a note."""
+
+
 class Engine:
     """Runs tasks on a Dask cluster; made by `connect`.
 
-    client : distributed.Client
+    client : distributed.Client. check : called where there is no worker; it may raise.
     """
 
-    def __init__(self, client):
-        self.client, self.address = client, client.scheduler.address
+    def __init__(self, client, check=None):
+        self.client, self.address, self.check = client, client.scheduler.address, check
         self.processors, self.threads, self.looked = set(), 0, 0.0
 
     def run(self, task, given, waiting=None):
@@ -62,7 +67,7 @@ class Engine:
         given, pending = iter(given), {}
         try:
             while True:
-                self._look(waiting, bool(pending))
+                self._look(waiting)
                 while len(pending) < max(1, (1 + AHEAD) * self.threads):
                     number, arguments = next(given, (None, None))
                     if arguments is None:
@@ -86,7 +91,7 @@ class Engine:
         except Exception as error:
             raise self._lost(error) from None
 
-    def _look(self, waiting, busy):
+    def _look(self, waiting):
         """Look, now and then, whether the scheduler is there and how many threads it has."""
         now = time.monotonic()
         if now - self.looked < LOOK:
@@ -99,8 +104,13 @@ class Engine:
             found = sum(self.client.nthreads().values())
         except Exception as error:
             raise self._lost(error) from None
-        if not found and not self.looked:
-            warnings.warn(f"{self.address} has no worker yet: waiting for one", stacklevel=4)
+        if not found and self.check is not None:
+            self.check()
+        elif not found and (self.threads or not self.looked):
+            words = "no worker is left" if self.looked else "there is no worker yet"
+            warnings.warn(
+                f"cluster {self.address}: {words}, waiting for one", ClusterWarning, stacklevel=4
+            )
         self.threads, self.looked = found, now
 
     def _result(self, future):
@@ -120,10 +130,10 @@ class Engine:
                 f"cluster {self.address}: a task has ended several workers (out of memory?): give"
                 " them more, or --resume with other ones"
             )
-        if isinstance(error, ModuleNotFoundError) or "ModuleNotFoundError" in repr(error):
+        if isinstance(error, ImportError):
             raise InputError(
-                f"cluster {self.address}: scheduler and workers need this program, of the same"
-                f" version ({' '.join(str(error).split())[:120]})"
+                f"cluster {self.address}: a worker has no jaxtank"
+                f" {sys.modules['jaxtank'].__version__} ({error})"
             )
         raise error
 
@@ -131,8 +141,9 @@ class Engine:
         """Warn once where workers have processors of two types."""
         if len(self.processors) == 1 and processor not in self.processors:
             warnings.warn(
-                f"{self.address} has workers with different types of processor: numbers may differ"
-                " in their last digits from those of one type",
+                f"cluster {self.address}: workers have different types of processor: numbers may"
+                " differ in their last digits from those of one type",
+                ClusterWarning,
                 stacklevel=5,
             )
         self.processors.add(processor)
@@ -151,7 +162,7 @@ def connect(cluster):
 
     Parameters
     ----------
-    cluster : None, "HOST:PORT" or "tls://HOST:PORT" of a scheduler, "local:N" for N workers on this
+    cluster : None, an Engine, "HOST:PORT" or "tls://HOST:PORT" of a scheduler, "local:N" for N workers on this
         machine, or a `distributed.Client`, which stays open.
 
     Raises
@@ -165,8 +176,8 @@ def connect(cluster):
     ...     print(engine)
     None
     """
-    if cluster is None:
-        yield None
+    if cluster is None or isinstance(cluster, Engine):
+        yield cluster
         return
     check_cluster(cluster)
     if not isinstance(cluster, str):
@@ -174,9 +185,11 @@ def connect(cluster):
         return
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
+        check = None
         if cluster.startswith("local:"):
-            cluster = stack.enter_context(local_workers(int(cluster.removeprefix("local:"))))
-        yield Engine(stack.enter_context(_client(cluster)))
+            count = int(cluster.removeprefix("local:"))
+            cluster, check = stack.enter_context(local_workers(count))
+        yield Engine(stack.enter_context(_client(cluster)), check)
 
 
 def check_cluster(cluster):
@@ -190,7 +203,7 @@ def check_cluster(cluster):
     jaxtank.core.errors.InputError: cluster = 'local:0': must be HOST:PORT of a Dask scheduler, \
 tls://HOST:PORT, or local:N for N workers on this machine, from 1 to 1024
     """
-    if cluster is None:
+    if cluster is None or isinstance(cluster, Engine):
         return
     if isinstance(cluster, str):
         kind, _, count = cluster.partition(":")

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
+from tuning.cluster.parent import FOLDER
 
 PATIENCE = 60.0
 """Time within which the scheduler must have started [s]."""
@@ -20,26 +21,32 @@ PATIENCE = 60.0
 
 @contextlib.contextmanager
 def local_workers(count):
-    """Run a scheduler and `count` workers of one thread on this machine; gives its address.
+    """Run a scheduler and `count` workers of one thread on this machine.
 
-    They listen on 127.0.0.1, leave signals of the terminal to this process, and end with it.
+    Gives its address, and a function that raises InputError where no worker is left. They listen on 127.0.0.1, leave signals of the terminal to this process, and end with it.
     """
     with tempfile.TemporaryDirectory(prefix="jaxtank-") as folder, contextlib.ExitStack() as stack:
         file = Path(folder, "scheduler.json")
         common = ["--host", "127.0.0.1", "--no-dashboard", "--preload", "tuning.cluster.parent"]
         words = ["dask_scheduler", "--port", "0", "--scheduler-file", str(file), *common]
-        scheduler = stack.enter_context(_process(words, folder))
+        scheduler = stack.enter_context(_process(words, folder, {FOLDER: folder}))
         address = _address(file, scheduler)
         words = ["dask_worker", address, "--nthreads", "1", "--no-nanny", "--memory-limit", "0"]
         words += ["--local-directory", folder, "--death-timeout", str(int(PATIENCE)), *common]
-        for _ in range(count):
-            stack.enter_context(_process(words, folder))
-        yield address
+        workers = [stack.enter_context(_process(words, folder)) for _ in range(count)]
+
+        def check():
+            if all(worker.poll() is not None for worker in workers):
+                raise InputError(
+                    f"cluster: the workers on this machine have ended ({_last_line(folder)})"
+                )
+
+        yield address, check
 
 
 @contextlib.contextmanager
-def _process(words, folder):
-    """Run one of Dask's command lines until the context ends."""
+def _process(words, folder, more=None):
+    """Run one of Dask's command lines until the context ends; more: its own environment."""
     here = str(Path(__file__).parents[2])  # where this program is imported from
     path = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH"))))
     with open(Path(folder, "log.txt"), "ab") as log:
@@ -49,7 +56,7 @@ def _process(words, folder):
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env={**os.environ, **_programs(), "PYTHONPATH": path},
+            env={**os.environ, **_programs(), **(more or {}), "PYTHONPATH": path},
         )
     try:
         yield found
@@ -73,6 +80,11 @@ def _address(file, scheduler):
         with contextlib.suppress(OSError, ValueError):  # not there, or not yet whole
             return json.loads(file.read_text())["address"]
         time.sleep(0.05)
-    lines = file.with_name("log.txt").read_text(errors="replace").split("\n")
-    why = next((line for line in reversed(lines) if line.strip()), "it said nothing")
-    raise InputError(f"cluster: no Dask scheduler could be started on this machine ({why[:200]})")
+    why = _last_line(file.parent)
+    raise InputError(f"cluster: no Dask scheduler could be started on this machine ({why})")
+
+
+def _last_line(folder):
+    """Return the end of what the processes printed."""
+    lines = Path(folder, "log.txt").read_text(errors="replace").split("\n")
+    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "without a word")

@@ -3,8 +3,12 @@ does, however it ends. Imports the standard library alone.
 """
 
 import os
+import shutil
 import sys
 import threading
+
+FOLDER = "JAXTANK_LOCAL_CLUSTER"
+"""Environment variable with the folder that the scheduler removes then."""
 
 
 def dask_setup(server):
@@ -12,6 +16,8 @@ def dask_setup(server):
 
     def watch():
         sys.stdin.buffer.read()
+        if os.environ.get(FOLDER):
+            shutil.rmtree(os.environ[FOLDER], ignore_errors=True)
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True).start()

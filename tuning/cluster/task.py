@@ -1,7 +1,4 @@
-"""What a Dask worker runs. Imports the standard library alone: the scheduler reads it, too."""
-
-import functools
-import importlib
+"""What a Dask worker runs."""
 
 TASKS = {
     "batch": ("tuning.uncertainty.remote", "batch"),
@@ -25,18 +22,19 @@ def call(task, x64, *arguments):
     -------
     (digest of the type of processor, what the function returns)
     """
-    import jaxtank  # noqa: F401, I001  it sets the options of the compiler, before jax starts
+    import importlib
 
     import jax
+
+    import jaxtank  # noqa: F401  it sets the options of the compiler, before jax starts
+    from jaxtank.xla.program_cache import processor
 
     module, name = TASKS[task]
     function = getattr(importlib.import_module(module), name)
     with jax.enable_x64(x64):
-        return _processor(), function(*arguments)
+        return processor(), function(*arguments)
 
 
-@functools.cache
-def _processor():
-    from jaxtank.xla.program_cache import processor
-
-    return processor()
+# Dask sends a function of the main module as its code: a worker without this program then raises
+# an error of its own rather than end, and the scheduler needs no more than Dask
+call.__module__ = "__main__"

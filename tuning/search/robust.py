@@ -14,6 +14,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
+from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
@@ -141,6 +142,7 @@ def tune_robust(
     back_off: float = 0.0,
     tolerance: float = TOLERANCE,
     validation: int = 64,
+    cluster: Any = None,
     **options: Any,
 ) -> TuningResult:
     """Return the result of `tune` on `samples` drawn plants, every limit held on every plant.
@@ -160,6 +162,7 @@ def tune_robust(
     tolerance, options : as in `tune`.
     validation : runs of a case that has scenarios of its own, 0 for none (any other is validated on
         the new plants).
+    cluster : Dask cluster on which the local searches and the new plants run, as in `tune`.
 
     Returns
     -------
@@ -177,6 +180,25 @@ def tune_robust(
     >>> tuning.tune_robust(case, samples=16, back_off=0.03).certificate  # doctest: +SKIP
     """
     _check(samples, fresh, back_off)
+    with connect(cluster) as engine:
+        return _tune_robust(
+            case,
+            distributions,
+            risk,
+            samples,
+            fresh,
+            seed,
+            back_off,
+            tolerance,
+            validation,
+            options | {"cluster": engine},
+        )
+
+
+def _tune_robust(
+    case, distributions, risk, samples, fresh, seed, back_off, tolerance, validation, options
+):
+    """`tune_robust` with a cluster that is connected."""
     objective, limits = as_measures(options.get("objective"), options.get("limits"))
     options |= {"objective": objective, "limits": limits}
     distributions = spread_of(case) if distributions is None else stated(distributions)
@@ -191,13 +213,16 @@ def tune_robust(
     judge = Problem(case, options.get("free"), options.get("objective"), limits, None, seed)
     # what is certified is the case's own run, what the answer is judged by is its scenarios
     if case.scenarios:
-        broken = int(_run(result.tuned, distributions, limits, (), fresh, seed)[1].sum())
+        engine = options["cluster"]
+        broken = int(_run(result.tuned, distributions, limits, (), fresh, seed, engine)[1].sum())
         found = (None, None)
         if validation and result.status != "interrupted":
             values = {n: p["after"] for n, p in result.parameters.items()}
             found = validate(judge, judge.own_values(), values, validation, seed)
     else:
-        *found, broken = _on_new_plants(result, judge, distributions, limits, fresh, seed)
+        *found, broken = _on_new_plants(
+            result, judge, distributions, limits, fresh, seed, options["cluster"]
+        )
     support = _support(result)
     interval = clopper_pearson(broken, fresh)
     certificate = Certificate(
@@ -283,7 +308,7 @@ def _tightened(case, limits, share):
     return {m: (v - share * ms.MEASURES[m].sense * np.abs(v)).tolist() for m, v in values.items()}
 
 
-def _run(case, distributions, limits, names, fresh, seed):
+def _run(case, distributions, limits, names, fresh, seed, cluster):
     """Return (Ensemble of new plants, (fresh,) True where one violates a limit or diverges)."""
     found = cast(
         Ensemble,
@@ -295,6 +320,7 @@ def _run(case, distributions, limits, names, fresh, seed):
             measures=names,
             limits=limits,
             fan=False,
+            cluster=cluster,
         ),
     )
     past = [
@@ -304,14 +330,14 @@ def _run(case, distributions, limits, names, fresh, seed):
     return found, found.failed | np.any(past, axis=0) if past else found.failed
 
 
-def _on_new_plants(result, judge, distributions, limits, fresh, seed):
+def _on_new_plants(result, judge, distributions, limits, fresh, seed, cluster):
     """Return (summary, cloud, how many violate a limit after tuning) on new plants.
 
     Before and after tuning on the same draws.
     """
     names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
     sides = [
-        _run(case, distributions, limits, names, fresh, seed)
+        _run(case, distributions, limits, names, fresh, seed, cluster)
         for case in (result.case, result.tuned)
     ]
     costs = [

@@ -9,7 +9,6 @@ import scipy  # its parts are imported when they are first used
 from jaxtank.core.errors import InputError
 from tuning.uncertainty.distributions import Correlated, Uniform
 
-
 METHODS = ("random", "latin", "sobol")
 """Ways to draw points."""
 
