@@ -22,13 +22,13 @@ from tuning.answer.judged import FRESH, judge, matters
 from tuning.answer.result import result_of
 from tuning.answer.setting import NEAR, limited_levels, plants_of, setting_of
 from tuning.cluster.engine import Engine
+from tuning.cluster.problems import check_sent
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
 from tuning.problem.reported import margin_measures, run_measures
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
-from tuning.search.remote import check_sent
 from tuning.search.result import TuningResult
 from tuning.search.verdicts import lost_outputs
 from tuning.storage.evaluation_log import EvaluationLog

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from tuning.cluster.ahead import evaluate_ahead
 from tuning.cluster.engine import Engine
 from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import Search
-from tuning.search.methods import METHODS, restore
-from tuning.search.remote import Local, evaluate_ahead
+from tuning.search.methods import METHODS, restore, search_alone
 from tuning.search.screening import (
     Population,
     around,
@@ -139,8 +139,9 @@ def search_from(
     shortfall = np.maximum(0.0, -margins / search.limit_scale)
     merits = costs / search.scale + 10.0 * shortfall.sum(axis=1)
     starts = distinct_starts(zs, merits, plan["starts"], first)
-    how = Local(method_of(problem), plan["iterations"], TOLERANCE)
-    evaluate_ahead(engine, search, starts, how)
+    how = (method_of(problem), plan["iterations"], TOLERANCE)
+    searches = [(z, number, how) for number, z in enumerate(starts)]
+    evaluate_ahead(engine, problem, searches, search_alone, lambda: report(search))
     for z in starts:
         search.start = len(found.starts)
         _local_search(search, found, z, plan["iterations"])

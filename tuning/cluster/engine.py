@@ -10,6 +10,7 @@ import re
 import sys
 import time
 import warnings
+from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cluster.local import local_workers
@@ -63,7 +64,8 @@ class Engine:
         """
         import jax
 
-        x64, done = bool(jax.config.jax_enable_x64), queue.SimpleQueue()
+        config: Any = jax.config
+        x64, done = bool(config.jax_enable_x64), queue.SimpleQueue()
         given, pending = iter(given), {}
         try:
             while True:
@@ -162,8 +164,8 @@ def connect(cluster):
 
     Parameters
     ----------
-    cluster : None, an Engine, "HOST:PORT" or "tls://HOST:PORT" of a scheduler, "local:N" for N workers on this
-        machine, or a `distributed.Client`, which stays open.
+    cluster : None, an Engine, "HOST:PORT" or "tls://HOST:PORT" of a scheduler, "local:N" for N
+        workers on this machine, or a `distributed.Client`, which stays open.
 
     Raises
     ------

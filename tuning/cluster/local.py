@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cluster.parent import FOLDER
@@ -23,7 +24,8 @@ PATIENCE = 60.0
 def local_workers(count):
     """Run a scheduler and `count` workers of one thread on this machine.
 
-    Gives its address, and a function that raises InputError where no worker is left. They listen on 127.0.0.1, leave signals of the terminal to this process, and end with it.
+    Gives its address, and a function that raises InputError where no worker is left. They listen on
+    127.0.0.1, leave signals of the terminal to this process, and end with it.
     """
     with tempfile.TemporaryDirectory(prefix="jaxtank-") as folder, contextlib.ExitStack() as stack:
         file = Path(folder, "scheduler.json")
@@ -69,7 +71,8 @@ def _programs():
     """Environment by which a worker uses the compiled programs that this process keeps."""
     import jax
 
-    folder = jax.config.jax_compilation_cache_dir
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir
     return {"JAX_COMPILATION_CACHE_DIR": str(folder)} if folder else {}
 
 

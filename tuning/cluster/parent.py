@@ -6,9 +6,13 @@ import os
 import shutil
 import sys
 import threading
+import time
 
 FOLDER = "JAXTANK_LOCAL_CLUSTER"
 """Environment variable with the folder that the scheduler removes then."""
+
+PATIENCE = 10.0
+"""Time for which it tries to [s]."""
 
 
 def dask_setup(server):
@@ -16,8 +20,10 @@ def dask_setup(server):
 
     def watch():
         sys.stdin.buffer.read()
-        if os.environ.get(FOLDER):
-            shutil.rmtree(os.environ[FOLDER], ignore_errors=True)
+        folder, until = os.environ.get(FOLDER), time.monotonic() + PATIENCE
+        while folder and os.path.exists(folder) and time.monotonic() < until:
+            shutil.rmtree(folder, ignore_errors=True)  # workers write there until they end, too
+            time.sleep(0.1)
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -32,8 +32,8 @@ def sent(case: Case, names: Sequence[str] = ()) -> str:
     """
     if own := ms.functions(names):
         raise InputError(
-            f"cluster: {next(iter(own))} is a function of your own, and workers are sent no code: leave out"
-            " the cluster, or use measures of the package"
+            f"cluster: {next(iter(own))} is a function of your own, and workers are sent no code:"
+            " leave out the cluster, or use measures of the package"
         )
     try:
         text = rig.dump(case)

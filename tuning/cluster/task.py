@@ -3,9 +3,9 @@
 TASKS = {
     "batch": ("tuning.uncertainty.remote", "batch"),
     "points": ("tuning.uncertainty.remote", "points"),
-    "search": ("tuning.search.remote", "search"),
+    "search": ("tuning.search.methods", "search_task"),
 }
-"""{name of a task: module and function}: names, texts, numbers and arrays are sent, no functions."""
+"""{name of a task: module and function}; names, texts, numbers and arrays are sent to it."""
 
 
 def call(task, x64, *arguments):

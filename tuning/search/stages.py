@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from tuning.cluster.ahead import evaluate_ahead
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import SETTLED, Search
 from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
-from tuning.search.methods import UNCONSTRAINED, approach, find_feasible, slsqp
-from tuning.search.remote import Local, evaluate_ahead, run_local
+from tuning.search.methods import (
+    UNCONSTRAINED,
+    Local,
+    approach,
+    find_feasible,
+    run_local,
+    search_alone,
+    slsqp,
+)
 from tuning.search.screening import (
     MEMBERS,
     Population,
@@ -111,7 +119,8 @@ def _run_stages(problem, first, plan, found, report):
     shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
     merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
     starts = distinct_starts(screened.zs, merits, plan.starts, first)
-    evaluate_ahead(plan.engine, search, starts, plan.local)
+    searches = [(z, number, tuple(plan.local)) for number, z in enumerate(starts)]
+    evaluate_ahead(plan.engine, problem, searches, search_alone, lambda: report(search))
     for z in starts:
         search.start = len(found.starts)
         _local_search(search, found, plan, z, len(search.history))

@@ -17,6 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from tuning.cluster.engine import connect
+from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
@@ -28,7 +29,6 @@ from tuning.search.kkt import optimality
 from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
 from tuning.search.options import Solver, check_options, check_precision, spelled_out
-from tuning.search.remote import check_sent
 from tuning.search.result import TuningResult, constraint_rows
 from tuning.search.stages import Outcome, Plan, solve
 from tuning.search.verdicts import lost_outputs, status_of

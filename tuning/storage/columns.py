@@ -73,7 +73,7 @@ class Columns(Mapping[str, Array]):
     def _open(self) -> None:
         """Make the file, all of it, so that a full disk is known at once."""
         try:
-            self.file = tempfile.TemporaryFile(dir=self.folder)
+            self.file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115  ends with this
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(self.file.fileno(), 0, self.size)
             else:

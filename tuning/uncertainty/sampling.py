@@ -112,9 +112,9 @@ class Points:
         return found.clip(1e-12, 1 - 1e-12)
 
     def _random(self, start, stop):
-        rng = np.random.default_rng(self.seed)
-        rng.bit_generator.advance(start * self.dimensions)  # one step for each number before
-        return rng.random((stop - start, self.dimensions))
+        generator = np.random.PCG64(self.seed)  # that of default_rng
+        generator.advance(start * self.dimensions)  # one step for each number before
+        return np.random.Generator(generator).random((stop - start, self.dimensions))
 
     def _sobol(self, start, stop):
         """Points of the sequence; from its beginning a power of 2 is drawn, else scipy warns."""

@@ -229,20 +229,20 @@ def _joined(plan, store, runner, merge, progress):
     """Run the batches that the store lacks; returns (Columns of the measures, (draws,) failed)."""
     folder, several = None if store is None else store.folder, jax.process_count() > 1
     samples, mine = plan.points.samples, {}
-    failed, table = np.zeros(samples, dtype=bool), None
+    failed, tables = np.zeros(samples, dtype=bool), []
 
     def put(k, batch):
-        nonlocal table
-        if table is None:
-            table = Columns({n: batch[n] for n in plan.shapes if n != "failed"}, samples, folder)
-        table.put(k * plan.batch, batch)
+        if not tables:
+            like = {n: batch[n] for n in plan.shapes if n != "failed"}
+            tables.append(Columns(like, samples, folder))
+        tables[0].put(k * plan.batch, batch)
         rows = slice(k * plan.batch, min((k + 1) * plan.batch, samples))
         failed[rows] = batch["failed"][: rows.stop - rows.start] > 0
 
     _batches(plan, store, runner, None, merge, progress, mine.__setitem__ if several else put)
     for k, batch in gather(mine, plan.count).items() if several else ():
         put(k, batch)
-    return table, failed
+    return tables[0], failed
 
 
 def _drawn(case, plan, folder):

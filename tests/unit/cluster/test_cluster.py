@@ -220,7 +220,7 @@ def test_where_nobody_answers_is_an_error_in_time(case, monkeypatch, tmp_path):
 
 def test_a_cluster_goes_with_no_devices_shard_or_merge(case, tmp_path):
     for other in ({"shard": (1, 2)}, {"merge": True}):
-        with pytest.raises(InputError, match="cluster and (shard|merge): give one of them"):
+        with pytest.raises(InputError, match=r"cluster and (shard|merge): give one of them"):
             tuning.ensemble(case, SPREAD, cluster="local:2", folder=tmp_path, **other)
 
 

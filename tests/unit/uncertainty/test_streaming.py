@@ -31,7 +31,7 @@ def streamed(monkeypatch):
 
 
 def expected(values):
-    """Statistics of (draws, ...) values, all of them at once; of a measure whose larger is worse."""
+    """Statistics of (draws, ...) values at once, of a measure of which a larger one is worse."""
     half = 1.959964 * values.std(axis=0, ddof=1) / np.sqrt(len(values))
     mean = values.mean(axis=0)
     low = np.maximum(mean - half, np.minimum(0.0, values.min(axis=0)))
