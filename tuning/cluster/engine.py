@@ -119,8 +119,8 @@ class Engine:
         """Return what a task returned; raise what it raised, in one line."""
         if future.status == "finished":
             try:
-                processor, found = future.result(timeout=4 * CONNECT)
-            except Exception as error:  # between its end and its transfer the worker has gone
+                processor, found = future.result()  # computed again, if its worker has gone now
+            except Exception as error:
                 raise self._lost(error) from None
             self._same(processor)
             return found
@@ -277,10 +277,14 @@ def _client(address):
 @contextlib.contextmanager
 def _quiet():
     """Leave out the log of Dask, which would repeat in many lines what `Engine` says in one."""
-    log = logging.getLogger("distributed")
-    level = log.level
-    log.setLevel(logging.CRITICAL + 1)
+    import distributed  # noqa: F401  it sets levels of its own
+
+    known = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    levels = {log: log.level for log in map(logging.getLogger, known)}
     try:
+        for log in levels:
+            log.setLevel(logging.CRITICAL + 1)
         yield
     finally:
-        log.setLevel(level)
+        for log, level in levels.items():
+            log.setLevel(level)

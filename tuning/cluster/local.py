@@ -51,6 +51,7 @@ def _process(words, folder, more=None):
     """Run one of Dask's command lines until the context ends; more: its own environment."""
     here = str(Path(__file__).parents[2])  # where this program is imported from
     path = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH"))))
+    own = {"PYTHONPATH": path, "DASK_TEMPORARY_DIRECTORY": str(folder)}
     with open(Path(folder, "log.txt"), "ab") as log:
         found = subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{words[0]}", *words[1:]],
@@ -58,7 +59,7 @@ def _process(words, folder, more=None):
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env={**os.environ, **_programs(), **(more or {}), "PYTHONPATH": path},
+            env={**os.environ, **_programs(), **own, **(more or {})},
         )
     try:
         yield found

@@ -9,18 +9,22 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 
 import jax
 import numpy as np
 import pytest
+from helpers import command
 
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.cluster import engine as engines
+from tuning.cluster import parent
 from tuning.cluster.engine import Engine
 from tuning.cluster.local import local_workers
 from tuning.cluster.sent import received, sent
+from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
@@ -87,13 +91,10 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
         assert seen == sorted(seen) and seen[-1] == 400 and len(seen) == 25
         assert len(list(folder.glob("part-*.npz"))) == 25  # written by this process as they came
         assert victim not in client.nthreads()
-        client.wait_for_workers(2, timeout=60)
-        assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
     finally:
         for process in added:
             process.kill()
             process.wait()
-    assert client.status == "running"  # one that was given stays open
 
 
 def test_sensitivity_on_workers_is_that_of_one_process(case, client):
@@ -104,8 +105,7 @@ def test_sensitivity_on_workers_is_that_of_one_process(case, client):
     )
     assert (there.runs, there.failed, there.parameters) == (here.runs, 0, here.parameters)
     assert repr(there.columns) == repr(here.columns)
-    local = tuning.sensitivity(case, {"plant.drain": 0.05}, cluster="local:1")
-    assert local.notes == ["the local method takes one run: the cluster is not used"]
+    assert client.status == "running"  # one that was given stays open
 
 
 def answer(result):
@@ -152,7 +152,10 @@ def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, 
             if done == 64:
                 os.kill(pid, signal.SIGKILL)
 
-        with pytest.raises(InputError, match=r"^cluster tcp://.*scheduler was lost.*--resume DIR$"):
+        with (
+            pytest.raises(InputError, match=r"^cluster tcp://.*scheduler was lost.*--resume DIR$"),
+            warnings.catch_warnings(action="ignore", category=engines.ClusterWarning),
+        ):
             tuning.ensemble(
                 case, SPREAD, **OPTIONS, cluster=address, folder=tmp_path, progress=progress
             )
@@ -161,6 +164,21 @@ def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, 
     assert same(tuning.ensemble(case, SPREAD, **OPTIONS, folder=tmp_path, resume=True), whole)
 
 
+def test_a_process_of_local_ends_with_the_pipe_from_its_parent(tmp_path):
+    (tmp_path / "of" / "dask").mkdir(parents=True)
+    code = "import time; from tuning.cluster import parent; parent.dask_setup(None); time.sleep(60)"
+    begun = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        env={**os.environ, parent.FOLDER: str(tmp_path / "of")},
+    )
+    time.sleep(0.2)
+    assert begun.poll() is None
+    begun.stdin.close()
+    assert begun.wait(timeout=20) == 0 and not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
 def test_processes_of_local_end_with_the_one_that_began_them(tmp_path):
     code = (
         "import time\nfrom tuning.cluster.local import local_workers\n"
@@ -230,7 +248,7 @@ def test_without_dask_the_remedy_is_named(case, monkeypatch):
         tuning.ensemble(case, SPREAD, cluster="local:2")
 
 
-def test_classes_and_functions_of_ones_own_are_not_sent(case, tmp_path):
+def test_classes_and_functions_of_ones_own_are_not_sent(case):
     @dataclasses.dataclass(frozen=True)
     class Mine(type(case.loop.controller)):
         pass
@@ -238,10 +256,9 @@ def test_classes_and_functions_of_ones_own_are_not_sent(case, tmp_path):
     mine = Mine(**{f.name: getattr(case.loop.controller, f.name) for f in dataclasses.fields(Mine)})
     with pytest.raises(InputError, match=r"^cluster: workers get a case as its rig file"):
         sent(case.replace(loop=dataclasses.replace(case.loop, controller=mine)))
+    objective, _ = as_measures(lambda measures: measures["ise"][0], None)
     with pytest.raises(InputError, match="is a function of your own"):
-        own = {"objective": lambda measures: measures["ise"][0]}
-        tuning.tune(case, **SEARCH, **own, cluster=Refusing(), checkpoint=tmp_path / "run")
-    assert not any(tmp_path.iterdir())
+        sent(case, tuple(objective))
 
 
 def test_a_worker_that_differs_is_refused(case, monkeypatch):
@@ -254,3 +271,16 @@ def test_a_worker_that_differs_is_refused(case, monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", "")  # as where jax had started first
     with pytest.raises(InputError, match=r"jax had started on this worker before jaxtank"):
         received(text)
+
+
+@pytest.mark.parametrize(
+    "words", ["uncertainty", "sensitivity --method morris", "tune", "tune --robust cvar"]
+)
+def test_the_command_refuses_what_is_no_cluster_in_one_line(words, tmp_path):
+    name, *more = words.split()
+    found = command(
+        name, "cascaded/pi", *more, "--cluster", "local:x", "--out", str(tmp_path / "run")
+    )
+    assert found.code == 2 and found.out == "" and found.err.count("\n") == 1
+    assert "cluster = 'local:x': must be HOST:PORT" in found.err
+    assert not any(tmp_path.iterdir())
