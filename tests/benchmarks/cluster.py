@@ -1,8 +1,8 @@
 """Dask workers of this machine: two beside one, and drills in which processes are killed.
 
-    python tests/benchmarks/cluster.py [--rounds 3] [--samples 4096] [--kills 3]
+    python tests/benchmarks/cluster.py [--rounds 3] [--samples 16384] [--kills 3]
 
-Time: an ensemble of gouta2015/backstepping (12,001 samples) in batches of 64 on one and on two
+Time: an ensemble of gouta2015/backstepping (12,001 samples) in batches of 256 on one and on two
 workers, in turn, each with its program compiled before; wall time, core time of workers and of this
 process, and the load of the machine, without which a ratio of wall times means nothing.
 
@@ -45,12 +45,12 @@ def cluster(count):
 
 def times(case, samples, rounds):
     """Print wall and core times on one and on two workers."""
-    options = {"measures": ["rms_error_total", "max_level"], "fan": False, "batch": 64}
+    options = {"measures": ["rms_error_total", "max_level"], "fan": False}
     with cluster(1) as one, cluster(2) as two:
         spent = {one: [], two: []}
         for client in spent:  # every worker compiles, or has nothing to do at first
             for _ in range(2):
-                tuning.ensemble(case, samples=1024, cluster=client, **options)
+                tuning.ensemble(case, samples=2048, cluster=client, **options)
         for _ in range(rounds):
             for client, rows in spent.items():
                 before = sum(client.run(time.process_time).values())
@@ -62,7 +62,7 @@ def times(case, samples, rounds):
             wall, theirs, mine = (statistics.median(column) for column in zip(*rows))
             print(
                 f"{words}: {wall:.2f} s, core time {theirs:.2f} s of the workers,"
-                f" {1e3 * mine / (samples / 64):.1f} ms a batch of this process",
+                f" {1e3 * mine / (samples / 256):.1f} ms a batch of this process",
                 flush=True,
             )
         ratios = [a[0] / b[0] for a, b in zip(spent[one], spent[two])]
@@ -103,7 +103,7 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--samples", type=int, default=4096)
+    parser.add_argument("--samples", type=int, default=16_384)
     parser.add_argument("--kills", type=int, default=3)
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
