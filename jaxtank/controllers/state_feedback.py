@@ -40,7 +40,8 @@ def feedback(K, x, h0, u0):
 
 def _steady(model, plan, d):
     """The steady state (h0, u0) that was prepared, moved by disturbances d of the level rates."""
-    return steady_under(model, *plan, d) if d else plan
+    h0, u0 = plan
+    return steady_under(model, h0, u0, d) if d else (h0, u0)
 
 
 def check_free_outlets(model):

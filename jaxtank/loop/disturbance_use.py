@@ -44,7 +44,7 @@ def is_unused(loop: ClosedLoop) -> bool:
     along = tuple(jax.ShapeDtypeStruct((1,), number.dtype) for _ in r)
     plan: Any = jax.eval_shape(loop.controller.prepare, along, along, along)
     own: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
-    plan, own = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), (plan, own))
+    plan, own = jax.tree.map(_row, (plan, own))
     tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=own)
 
     def estimated(x: Any, tick: Any) -> Any:
@@ -55,3 +55,8 @@ def is_unused(loop: ClosedLoop) -> bool:
 
     d = jax.eval_shape(estimated, x, tick)
     return bool(d) and not use_of(decided, tuple(d), x, u, tick).reached
+
+
+def _row(v: Any) -> Any:
+    """The placeholder of one sample of an array (samples, ...)."""
+    return jax.ShapeDtypeStruct(v.shape[1:], v.dtype)

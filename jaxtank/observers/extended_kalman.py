@@ -1,7 +1,7 @@
 """Extended Kalman filter on the model of a rig."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -126,15 +126,16 @@ class ExtendedKalman(Observer):
         return levels, tuple(d)
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        n = range(len(state.x))
+        n, model = range(len(state.x)), self.model
+        area, walk = cast(Any, model).area if self.disturbed else (), cast(Any, self.walk)
 
         def onward(x):
             levels, d = self._parts(x)
-            inflow = tuple(self.model.area[i] * v for i, v in enumerate(d)) or None
+            inflow = tuple(area[i] * v for i, v in enumerate(d)) or None
             moved = advance(
-                self.model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
+                model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
             ).x
-            return (*moved, *x[self.model.tanks :])
+            return (*moved, *x[model.tanks :])
 
         one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
         # columns[j][i] = F_ij
@@ -142,8 +143,8 @@ class ExtendedKalman(Observer):
             jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in n),))[1] for j in n
         ]
         FP = [[sum(columns[k][i] * state.P[k][j] for k in n) for j in n] for i in n]
-        gained = [self.process[i] for i in range(self.model.tanks)]
-        gained += [self.walk[i] for i in self.disturbed]
+        gained = [self.process[i] for i in range(model.tanks)]
+        gained += [walk[i] for i in self.disturbed]
         P = [
             [
                 sum(FP[i][k] * columns[k][j] for k in n) + (gained[i] * tick.dt if i == j else 0.0)
