@@ -41,20 +41,24 @@ def is_unused(loop: ClosedLoop) -> bool:
         return False
     number = jax.ShapeDtypeStruct((), jnp.result_type(float))
     x, u, r = ((number,) * n for n in (loop.plant.tanks, loop.plant.pumps, loop.reference.channels))
+
+    def estimated(x: Any, t: Any) -> Any:
+        tick = Tick(t=t, r=(), dr=(), ddr=(), dt=t)
+        return loop.observer.step(loop.observer.init(x), tick, x)[0].d
+
+    d = tuple(jax.eval_shape(estimated, x, number))
+    if not d:
+        return False
     along = tuple(jax.ShapeDtypeStruct((1,), number.dtype) for _ in r)
     plan: Any = jax.eval_shape(loop.controller.prepare, along, along, along)
     own: Any = jax.eval_shape(lambda: loop.controller.inputs(Clock(dt=1.0, duration=0.0)))
     plan, own = jax.tree.map(_row, (plan, own))
     tick = Tick(t=number, r=r, dr=r, ddr=r, dt=number, plan=plan, own=own)
 
-    def estimated(x: Any, tick: Any) -> Any:
-        return loop.observer.step(loop.observer.init(x), tick, x)[0].d
-
     def decided(d: Any, x: Any, u: Any, tick: Any) -> Any:
         return loop.controller.step(loop.controller.init(x, u), tick, Estimate(x=x, d=d))
 
-    d = jax.eval_shape(estimated, x, tick)
-    return bool(d) and not use_of(decided, tuple(d), x, u, tick).reached
+    return not use_of(decided, d, x, u, tick).reached
 
 
 def _row(v: Any) -> Any:

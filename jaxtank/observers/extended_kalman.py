@@ -126,33 +126,35 @@ class ExtendedKalman(Observer):
         return levels, tuple(d)
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        n, model = range(len(state.x)), self.model
+        model, N, n = self.model, range(len(state.x)), self.model.tanks
         area, walk = cast(Any, model).area if self.disturbed else (), cast(Any, self.walk)
 
-        def onward(x):
+        def onward(x):  # the levels alone: a random walk stays where it is
             levels, d = self._parts(x)
             inflow = tuple(area[i] * v for i, v in enumerate(d)) or None
-            moved = advance(
+            return advance(
                 model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
             ).x
-            return (*moved, *x[model.tanks :])
 
         one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
-        # columns[j][i] = F_ij
+        # columns[j][i] = F_ij of the levels i; the rows of random walks are those of the identity
         columns = [
-            jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in n),))[1] for j in n
+            jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in N),))[1] for j in N
         ]
-        FP = [[sum(columns[k][i] * state.P[k][j] for k in n) for j in n] for i in n]
-        gained = [self.process[i] for i in range(model.tanks)]
-        gained += [walk[i] for i in self.disturbed]
+        FP = [
+            [sum(columns[k][i] * state.P[k][j] for k in N) if i < n else state.P[i][j] for j in N]
+            for i in N
+        ]
+        gained = [self.process[i] for i in range(n)] + [walk[i] for i in self.disturbed]
         P = [
             [
-                sum(FP[i][k] * columns[k][j] for k in n) + (gained[i] * tick.dt if i == j else 0.0)
-                for j in n
+                (sum(FP[i][k] * columns[k][j] for k in N) if j < n else FP[i][j])
+                + (gained[i] * tick.dt if i == j else 0.0)
+                for j in N
             ]
-            for i in n
+            for i in N
         ]
-        return Belief(onward(state.x), _symmetric(P))
+        return Belief((*onward(state.x), *state.x[n:]), _symmetric(P))
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)

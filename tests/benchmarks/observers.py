@@ -19,7 +19,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import robustness_table
-from robustness_table import N, SPREADS
+from robustness_table import SPREADS, N
 
 import tuning
 from jaxtank import presets

@@ -94,7 +94,7 @@ def test_the_change_of_the_levels_in_gpc_is_that_of_a_linear_plant():
     before = controller.init(tuple(h), u)
     tick = Tick(t=0.0, r=(0.0, 0.0), dr=(), ddr=(), dt=dt)
     found = jax.jit(lambda d: controller._change(before, tick, Estimate(x=tuple(h), d=d)))(d)
-    A, B, _ = jaxtank.analysis.linearise(controller.model, point, u)
+    A = jaxtank.analysis.linearise(controller.model, point, u)[0]
     rate = np.asarray(controller.model.derivative(0.0, tuple(point), u, None)) + d
     Ad, held = (np.asarray(v) for v in zero_order_hold(A, rate[:, None], dt))
     earlier = np.linalg.solve(Ad, (h - point) - held[:, 0])  # a sample before, x - point
@@ -117,6 +117,19 @@ def test_the_error_at_the_end_of_a_plateau_vanishes(kind, without):
     direct = dataclasses.replace(loop, observer=presets.find(f"gouta2015/{kind}").loop.observer)
     run = jaxtank.simulate(direct, case.clock, save_every=100)
     assert np.abs(np.asarray(run.e)[ends]).max(axis=1).min() > without
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["kalman", "extended-kalman"])
+def test_with_random_walks_in_a_kalman_filter_too(kind):
+    """Away from the operating point of the linear filter as well."""
+    lines = ['case = "gouta2015/ngpc"', "[observer]", f'kind = "{kind}"', "process = 1e-6"]
+    lines += ["measurement = 1e-4", "walk = 1e-4", "disturbed = [1, 2, 3, 4]"]
+    case = rig.loads("\n".join(lines))
+    case = rig.set_values(case, {"clock.dt": 0.1, "clock.duration": 470.0})
+    loop = dataclasses.replace(case.loop, plant=wrong(case.loop.plant))
+    run = jaxtank.simulate(loop, case.clock, save_every=100)
+    assert np.abs(np.asarray(run.e)[[27, 47]]).max() < 1e-3
 
 
 @pytest.mark.slow
