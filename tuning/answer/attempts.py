@@ -12,6 +12,7 @@ from jaxtank.case import Case
 from jaxtank.core.tree import with_values
 from tuning.answer.checks import LARGEST, Checks
 from tuning.answer.judged import Judged, judge, matters
+from tuning.answer.robustness import move_back
 from tuning.answer.setting import NEAR, PLANTS, Setting
 from tuning.answer.stay_put import Found, search_from
 from tuning.problem.problem import Problem
@@ -115,6 +116,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
             checks = _search(task, made, case, limits, least)
             if made.found.point is None:
                 return dataclasses.replace(made, attempt=0)
+            move_back(setting, made.problem, made.found)
             tuned = _at(setting, values_of(made.problem, made.found))
             made.after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
         except KeyboardInterrupt:
