@@ -13,7 +13,7 @@ from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_model, check_tanks
 from jaxtank.plants.base import Plant
-from jaxtank.plants.runge_kutta import advance
+from jaxtank.plants.runge_kutta import advance, euler
 
 FED = ("applied", "command")
 
@@ -101,14 +101,14 @@ class DisturbanceObserver(Observer):
         rate = level_rates(self.model, x, u)
         if self.before_compensation:
             rate = tuple(rate[i] + d[i] for i in n)
-        expected = tuple(x[i] + tick.dt * rate[i] for i in n)
+        expected = euler(self.model, x, rate, tick.dt)
         if len(self.measured) < len(x):
             area = getattr(self.model, "area", None)
             inflow = None if area is None else tuple(area[i] * d[i] for i in n)
             moved = advance(self.model, "rk4", tick.t, x, u, inflow, tick.dt, 1).x
             expected = tuple(expected[i] if i in self.measured else moved[i] for i in n)
         held = tuple((1.0 - self.l[i] * tick.dt) * d[i] if i in self.measured else d[i] for i in n)
-        return held, tuple(self.model.spill(expected)[0])
+        return held, expected
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)
