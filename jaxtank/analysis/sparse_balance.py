@@ -6,6 +6,7 @@ With 1,000 tanks a dense one takes minutes. Imports core; imported by `steady_st
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
@@ -120,3 +121,44 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14) -> tuple[Any, Any, Any]:
         else:
             break
     return (*split(z), left)
+
+
+def responses(plant, xp):
+    """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
+    a network of many tanks without pipes, by matrices that are filled and not added up.
+
+    xp: jax.numpy, or numpy where nothing is to be differentiated.
+
+    Examples
+    --------
+    >>> from jaxtank.plants import network
+    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[6.0], feeds=[(0, None)], rim=[30.0])
+    >>> [part.round(6).tolist() for part in responses(tank, np)]
+    [[[1.0]], [[0.05]]]
+    """
+    n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
+    free = np.setdiff1d(np.arange(n), outputs)
+    source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
+    first = np.array([a for a, _ in plant.feeds])
+    second = np.array([a if b is None else b for a, b in plant.feeds])
+    alone, pump = np.array([b is None for _, b in plant.feeds]), np.arange(m)
+    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
+    share = xp.where(alone, 1.0, xp.asarray(plant.split))
+    efflux = _filled(xp, -xp.diag(xp.asarray(plant.drain)), (source, source), -orifice)
+    efflux = _filled(xp, efflux, (sink, source), orifice)
+    pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
+    pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
+    columns = xp.concatenate([efflux[:, free], pumps], axis=1)
+    solution = xp.linalg.solve(columns, -efflux[:, outputs])
+    order = np.argsort(np.concatenate([outputs, free]))
+    speeds = xp.concatenate([xp.eye(m), solution[: len(free)]])[order]
+    return speeds, solution[len(free) :]
+
+
+def _filled(xp, matrix, places, values):
+    """`matrix` with values added at places, some of which may be the same."""
+    if xp is jnp:
+        return matrix.at[places].add(values)
+    matrix = np.array(matrix)
+    np.add.at(matrix, places, values)
+    return matrix

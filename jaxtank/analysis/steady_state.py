@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
-from jaxtank.analysis.sparse_balance import balanced
+from jaxtank.analysis.sparse_balance import balanced, responses
 from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.numerics import smooth_sqrt
+from jaxtank.core.numerics import lower_clip, smooth_sqrt
 
 
 def _balance(plant, xp=jnp):
@@ -80,11 +80,9 @@ def _from_known_speeds(plant, known, xp=jnp):
             f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
         )
     if n >= vectors.FROM:
-        speeds, inputs = _responses(plant, xp)
+        speeds, inputs = responses(plant, xp)
         return speeds @ known, inputs @ known
-    eye, (efflux, pumps) = np.eye(n), _balance(plant, xp)
-    free = [i for i in range(n) if i not in plant.outputs]
-    columns = xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
+    eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
     solution = xp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
     speeds = xp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
@@ -92,37 +90,53 @@ def _from_known_speeds(plant, known, xp=jnp):
     return speeds, solution[len(free) :]
 
 
-def _responses(plant, xp):
-    """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
-    a network of many tanks: `_from_known_speeds` for all of them at once, by matrices that are
-    filled and not added up.
+def _unknowns(plant, xp=jnp):
+    """(tanks that are not controlled, columns of their speeds and of the inputs in the balance,
+    efflux) of a network without pipes.
     """
-    n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
-    free = np.setdiff1d(np.arange(n), outputs)
-    source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
-    first = np.array([a for a, _ in plant.feeds])
-    second = np.array([a if b is None else b for a, b in plant.feeds])
-    alone, pump = np.array([b is None for _, b in plant.feeds]), np.arange(m)
-    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
-    share = xp.where(alone, 1.0, xp.asarray(plant.split))
-    efflux = _filled(xp, -xp.diag(xp.asarray(plant.drain)), (source, source), -orifice)
-    efflux = _filled(xp, efflux, (sink, source), orifice)
-    pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
-    pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
-    columns = xp.concatenate([efflux[:, free], pumps], axis=1)
-    solution = xp.linalg.solve(columns, -efflux[:, outputs])
-    order = np.argsort(np.concatenate([outputs, free]))
-    speeds = xp.concatenate([xp.eye(m), solution[: len(free)]])[order]
-    return speeds, solution[len(free) :]
+    efflux, pumps = _balance(plant, xp)
+    free = [i for i in range(plant.tanks) if i not in plant.outputs]
+    return free, xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1), efflux
 
 
-def _filled(xp, matrix, places, values):
-    """`matrix` with values added at places, some of which may be the same."""
-    if xp is jnp:
-        return matrix.at[places].add(values)
-    matrix = np.array(matrix)
-    np.add.at(matrix, places, values)
-    return matrix
+def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Return the steady state with the same outputs under disturbances of the level rates.
+
+        0 = efflux v + pumps u + A d,   v_outputs as before:   the balance is linear in v, u and d
+
+    so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
+    backwards is empty.
+
+    Parameters
+    ----------
+    plant : as in `steady_flows`
+    h0, u0 : (n) levels [cm] and (m) inputs [V] of the steady state without, from `steady_along`
+    d : (n) disturbances of the level rates [cm/s]
+
+    Returns
+    -------
+    ((n) levels [cm], (m) inputs [V])
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> rig = state_coupled_four_tank(15.0)
+    >>> h0, u0 = equilibrium(rig, (8.0, 10.0))
+    >>> h, u = steady_under(rig, tuple(h0), tuple(u0), (0.1, 0.0, -0.1, 0.0))
+    >>> rates = rig.derivative(0.0, h, u, (1.5, 0.0, -1.5, 0.0))
+    >>> max(abs(float(rate)) for rate in rates) < 1e-6
+    True
+    """
+    free, columns, _ = _unknowns(plant)
+    moved = jnp.linalg.solve(columns, -jnp.diag(jnp.asarray(plant.area)))
+    double = 2.0 * plant.gravity
+    h, n = list(h0), range(plant.tanks)
+    for k, i in enumerate(free):
+        v = jnp.sqrt(double) * smooth_sqrt(h0[i], plant.knee) + sum(moved[k, j] * d[j] for j in n)
+        v = lower_clip(v, 0.0)
+        h[i] = v * v / double
+    rows = moved[len(free) :]
+    return tuple(h), tuple(u + sum(rows[k, j] * d[j] for j in n) for k, u in enumerate(u0))
 
 
 def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
@@ -151,7 +165,7 @@ def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple
     """
     roots = [smooth_sqrt(v, plant.knee) for v in r]
     if plant.tanks >= vectors.FROM:
-        speeds, inputs = (part @ jnp.stack(roots) for part in _responses(plant, jnp))
+        speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp))
         w = jnp.sqrt(2.0 * plant.gravity)
         return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
     parts = [

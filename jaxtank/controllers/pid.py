@@ -81,7 +81,8 @@ class PID(Controller):
     Td/8. Without Td there is no derivative; without `order` the integral is of order one, with it
     s^-order = (1/s) s^(1-order), where the second factor is Oustaloup's filter: a true integrator
     is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
-    reference, (r' - f(r))/c2.
+    reference, (r' - f(r))/c2, less d/c2 for a disturbance d of the level rate [cm/s] that the
+    observer estimates. Without `feed_forward` no estimate of a disturbance is used.
 
     Examples
     --------
@@ -145,6 +146,9 @@ class PID(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         base = tick.plan if self.feed_forward else self.bias
+        if self.feed_forward and estimate.d:
+            pushed = zip(base, self.model.output(estimate.d), authority(self.model))
+            base = tuple(u - d / c for u, d, c in pushed)
         y = take(estimate.x, self.model.outputs)
         e = each(operator.sub, tick.r, y)
         v = each(lambda e, b, k, i: b + k * e + i, e, base, self.Kc, state.integral)
