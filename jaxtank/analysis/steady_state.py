@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.core.numerics import smooth_sqrt
+from jaxtank.core.numerics import lower_clip, smooth_sqrt
 
 
 def _balance(plant, xp=jnp):
@@ -77,14 +77,61 @@ def _from_known_speeds(plant, known, xp=jnp):
         raise InputError(
             f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
         )
-    eye, (efflux, pumps) = np.eye(n), _balance(plant, xp)
-    free = [i for i in range(n) if i not in plant.outputs]
-    columns = xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1)
+    eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
     solution = xp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
     speeds = xp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]
     return speeds, solution[len(free) :]
+
+
+def _unknowns(plant, xp=jnp):
+    """(tanks that are not controlled, columns of their speeds and of the inputs in the balance,
+    efflux) of a network without pipes.
+    """
+    efflux, pumps = _balance(plant, xp)
+    free = [i for i in range(plant.tanks) if i not in plant.outputs]
+    return free, xp.concatenate([efflux[:, np.array(free, dtype=int)], pumps], axis=1), efflux
+
+
+def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Return the steady state with the same outputs under disturbances of the level rates.
+
+        0 = efflux v + pumps u + A d,   v_outputs as before:   the balance is linear in v, u and d
+
+    so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
+    backwards is empty.
+
+    Parameters
+    ----------
+    plant : as in `steady_flows`
+    h0, u0 : (n) levels [cm] and (m) inputs [V] of the steady state without, from `steady_along`
+    d : (n) disturbances of the level rates [cm/s]
+
+    Returns
+    -------
+    ((n) levels [cm], (m) inputs [V])
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> rig = state_coupled_four_tank(15.0)
+    >>> h0, u0 = equilibrium(rig, (8.0, 10.0))
+    >>> h, u = steady_under(rig, tuple(h0), tuple(u0), (0.1, 0.0, -0.1, 0.0))
+    >>> rates = rig.derivative(0.0, h, u, (1.5, 0.0, -1.5, 0.0))
+    >>> max(abs(float(rate)) for rate in rates) < 1e-6
+    True
+    """
+    free, columns, _ = _unknowns(plant)
+    moved = jnp.linalg.solve(columns, -jnp.diag(jnp.asarray(plant.area)))
+    double = 2.0 * plant.gravity
+    h, n = list(h0), range(plant.tanks)
+    for k, i in enumerate(free):
+        v = jnp.sqrt(double) * smooth_sqrt(h0[i], plant.knee) + sum(moved[k, j] * d[j] for j in n)
+        v = lower_clip(v, 0.0)
+        h[i] = v * v / double
+    rows = moved[len(free) :]
+    return tuple(h), tuple(u + sum(rows[k, j] * d[j] for j in n) for k, u in enumerate(u0))
 
 
 def steady_along(plant: Any, r: tuple[Any, ...]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:

@@ -12,6 +12,7 @@ from jaxtank.controllers.feedback_linearisation import (
     decouple,
     floored_roots,
     input_metric,
+    less_upper,
 )
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
@@ -34,6 +35,19 @@ class Backstepping(Controller):
         r_i))
 
     k and k1 enter through k1 and k + k1 only: the loop is insensitive to k where k1 is much larger.
+
+    With an observer that estimates disturbances d of the level rates [cm/s], the plant is taken as
+
+        h_i' = z_i - c_i sqrt(h_i) + d_i,    h_3' = -c7 sqrt(h3) + c8 u1 + d_3,    i = 1, 2
+
+    (not in the paper). First step: with the error e_i = h_i - r_i, r constant, the virtual control
+    z_i = c_i sqrt(r_i) - k1 e_i - d_i makes e_i' = c_i (sqrt(r_i) - sqrt(h_i)) - k1 e_i, whatever
+    d_i; the second error is therefore Z_i = z_i - c_i sqrt(r_i) + k1 e_i + d_i. Second step: v_i =
+    z_i' = -(k + k1) Z_i with this Z_i, as in eq. (46) for d = 0 (d_i' is taken as 0; where d moves,
+    it enters as a disturbance of Z_i). d_3 and d_4 act where the pumps do and are subtracted from
+    the demanded voltages, u1 - d_3/c8. At a steady state v = 0 and the plant's own h_i' = 0, so
+    that c_i (sqrt(h_i) - sqrt(r_i)) + k1 e_i = 0: e = 0 whatever the error of the model, if d^
+    accounts for it. With `reference_rates`, h_i' is z_i - c_i sqrt(h_i) + d_i in the same way.
 
     Examples
     --------
@@ -67,11 +81,15 @@ class Backstepping(Controller):
         # residual of the first step [cm/s]; the roots come last, they are the last to be ready
         w1 = (self.k1 * (h1 - r1) - c.c1 * q1) + c.c2 * s3 + c.c3 * s4
         w2 = (self.k1 * (h2 - r2) - c.c4 * q2) + c.c5 * s3 + c.c6 * s4
+        if estimate.d:
+            w1, w2 = w1 + estimate.d[0], w2 + estimate.d[1]
         if not self.reference_rates:
-            return decouple(c, s3, s4, w1, w2, scale=-gain), state
+            u = decouple(c, s3, s4, w1, w2, scale=-gain)
+            return (less_upper(c, u, estimate.d) if estimate.d else u), state
         v1 = tick.ddr[0] + 0.5 * c.c1 * tick.dr[0] / q1 - gain * (w1 - tick.dr[0])
         v2 = tick.ddr[1] + 0.5 * c.c4 * tick.dr[1] / q2 - gain * (w2 - tick.dr[1])
-        return decouple(c, s3, s4, v1, v2), state
+        u = decouple(c, s3, s4, v1, v2)
+        return (less_upper(c, u, estimate.d) if estimate.d else u), state
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)

@@ -84,7 +84,8 @@ class Controller(abc.ABC):
         ----------
         state : from `init`, or from `track` of the sample before
         tick : time, setpoint and what was prepared for this sample
-        estimate : levels [cm] and disturbances [cm/s] from the observer
+        estimate : levels x [cm] and disturbances d of the level rates [cm/s] from the observer; d
+            is () where it estimates none
 
         Returns
         -------
@@ -118,6 +119,13 @@ class Controller(abc.ABC):
     def reads_model(self) -> bool:
         """True if the inputs depend on the coefficients of the controller's model."""
         return True
+
+    @property
+    def ignores_disturbance(self) -> bool:
+        """True if a setting of the controller states that `estimate.d` is not to be used, so that
+        an observer that estimates it calls for no note.
+        """
+        return False
 
     def check_pumps(self, actuator: Actuator) -> None:  # noqa: B027
         """Raise InputError for pumps whose limits, or whose input before t = 0, do not suit the

@@ -26,7 +26,8 @@ class ENMPC(Controller):
     with h, r [cm], k [1/s], c2 [cm/(s V)], f and d [cm/s]. Unsaturated and with an exact model the
     loop is e' = -k e. `compensation`: "none" omits d (ENMPC); "single" subtracts the observer's
     estimate once (CHADPC as it must be read, gouta2022 notes S4.3); "double" subtracts it twice, as
-    eqs. (27) and (28) do together. `drift`: "printed" has f with the sign of eqs. (12) and (27),
+    eqs. (27) and (28) do together. An observer that estimates no disturbance leaves all three the
+    same. `drift`: "printed" has f with the sign of eqs. (12) and (27),
     which is not the minimiser and leaves an offset 2 f/k (gouta2022 notes E2).
 
     Examples
@@ -69,7 +70,7 @@ class ENMPC(Controller):
             (1.0 if self.drift == "derived" else -1.0),
             COMPENSATIONS.index(self.compensation),
         )
-        d = estimate.d if times else (0.0,) * len(f)
+        d = estimate.d if times and estimate.d else (0.0,) * len(f)
         e = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
         return (
             tuple(
@@ -77,6 +78,10 @@ class ENMPC(Controller):
             ),
             state,
         )
+
+    @property
+    def ignores_disturbance(self) -> bool:
+        return self.compensation == "none"
 
     def check(self, reference: Signal) -> None:
         check_own_pumps(self.model)

@@ -76,13 +76,14 @@ def authority(model):
     return tuple(model.pump_gain[j] / model.area[first] for j, (first, _) in enumerate(model.feeds))
 
 
-def check_own_pumps(model, every=True):
+def check_own_pumps(model, every=True, holder="controller"):
     """Check that pump j fills the j-th controlled tank alone.
 
     Parameters
     ----------
     model : network
     every : whether every tank must be controlled too
+    holder : whose model it is, as messages name it
 
     Raises
     ------
@@ -106,12 +107,12 @@ def check_own_pumps(model, every=True):
         second is not None for _, second in model.feeds
     ):
         raise InputError(
-            "controller.model must have one pump per controlled tank, in the same order: this"
-            " controller inverts it tank by tank"
+            f"{holder}.model must have one pump per controlled tank, in the same order: this"
+            f" {holder} inverts it tank by tank"
         )
     if every and model.outputs != tuple(range(model.tanks)):
         raise InputError(
-            "controller.model has tanks whose levels are not controlled: this controller needs the"
+            f"{holder}.model has tanks whose levels are not controlled: this {holder} needs the"
             " setpoint of every tank"
         )
 
@@ -220,6 +221,33 @@ def decouple(c, s3, s4, v1, v2, scale=1.0):
     u1 = s3 * ((c.c7 / c.c8 + (scale * c.c6 / a8) * v1) - (scale * c.c3 / a8) * v2)
     u2 = s4 * ((c.c9 / c.c10 - (scale * c.c5 / a10) * v1) + (scale * c.c2 / a10) * v2)
     return u1, u2
+
+
+def less_upper(c, u, d):
+    """Return the voltages (u1, u2) less what the disturbances of the upper tanks do without them.
+
+        h3' = -c7 sqrt(h3) + c8 u1 + d3,   so that u1 - d3/c8 has the effect that u1 was meant to
+        have; u2 likewise
+
+    These disturbances are matched: they enter where the pumps do.
+
+    Parameters
+    ----------
+    c : Coefficients
+    u : (u1, u2) of `decouple` [V]
+    d : (4) disturbances of the level rates [cm/s]
+
+    Returns
+    -------
+    (u1, u2) [V]
+
+    Examples
+    --------
+    >>> c = Coefficients(*[2.0, 2.0, 1.0, 2.0, 1.0, 2.0, 3.0, 0.5, 3.0, 0.5])
+    >>> less_upper(c, (6.0, 6.0), (0.0, 0.0, 1.0, -0.5))
+    (4.0, 7.0)
+    """
+    return u[0] - d[2] / c.c8, u[1] - d[3] / c.c10
 
 
 def input_metric(c, s3, s4):

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.analysis.steady_state import steady_along
+from jaxtank.analysis.steady_state import steady_along, steady_under
 from jaxtank.controllers.base import Controller
 from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
 from jaxtank.controllers.state_feedback import feedback
@@ -31,7 +31,9 @@ def membership(size, b, w):
     ----------
     size : |e| [cm]
     b : size where the membership is 1/2 [cm]
-    w : half width, clipped to at most b, so that the membership is exactly 0 at no error [cm]
+    w : half width, clipped to at most b, so that the membership is exactly 0 at no error [cm]. At
+        w = b, where the clip begins to act, the slopes in w and b are the means of those of both
+        sides, as a central difference has them
 
     Returns
     -------
@@ -42,7 +44,7 @@ def membership(size, b, w):
     >>> [float(membership(size, 1.0, 0.5)) for size in (0.5, 1.0, 1.5)]
     [0.0, 0.5, 1.0]
     """
-    w = jnp.where(w > b, b, w)
+    w = jnp.minimum(w, b)  # its slopes at a tie are halves: the mean of both sides
     x = clip((size - b + w) / (2.0 * w), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
@@ -55,7 +57,8 @@ class FuzzyBlend(Controller):
     The sliding-mode voltages are clipped to [low, high] [V] before they are blended. pairing: which
     error weights input i: "cross", j = 3 - i, as in the text of sec. 4.3 (in the non-minimum phase
     each output is moved by the other pump), or "same", j = i, as eq. (17) is printed. b and w [cm]
-    are indexed by input. The blended controllers are `SlidingMode` and `StateFeedback`.
+    are indexed by input. The blended controllers are `SlidingMode` and `StateFeedback`, which use
+    disturbances that an observer estimates.
 
     Examples
     --------
@@ -109,10 +112,12 @@ class FuzzyBlend(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         h0, u0 = tick.plan
+        if estimate.d:
+            h0, u0 = steady_under(self.model, h0, u0, estimate.d)
         design = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
         far = [
             clip(u, self.low[i], self.high[i])
-            for i, u in enumerate(slide(*design, estimate.x, tick.r, u0, state))
+            for i, u in enumerate(slide(*design, estimate.x, tick.r, u0, state, estimate.d))
         ]
         near = feedback(self.K, estimate.x, h0, u0)
         size = [magnitude(h - r) for h, r in zip(estimate.x, tick.r)]

@@ -10,6 +10,7 @@ from jaxtank.controllers.feedback_linearisation import (
     decouple,
     floored_roots,
     input_metric,
+    less_upper,
 )
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
@@ -28,6 +29,12 @@ class NGPC(Controller):
     `feedback_linearisation.decouple`. z'_i is the level rate the model predicts
     (no differentiation). Without saturation the loop is exactly e'' + K2 e' + K1 e = 0: damping
     0.685, natural frequency 1.826/Tp.
+
+    With an observer that estimates disturbances d of the level rates [cm/s], the model is f + d:
+    z'_i has d_i in it, and the disturbances of the upper tanks, which enter where the pumps do, are
+    subtracted from the demanded voltages, u1 - d_3/c8 (the composite control of gouta2022, sec. 4,
+    for this rig; d' is taken as 0). At a steady state z'_i is then the plant's own rate, 0, and so
+    is e_i.
 
     Examples
     --------
@@ -53,9 +60,12 @@ class NGPC(Controller):
         k1, k2 = (10.0 / 3.0) / (self.Tp * self.Tp), 2.5 / self.Tp  # K1 [1/s^2], K2 [1/s]
         z1 = c.c2 * s3 + c.c3 * s4 - c.c1 * s1  # modelled h1' [cm/s]
         z2 = c.c5 * s3 + c.c6 * s4 - c.c4 * s2  # modelled h2'
+        if estimate.d:
+            z1, z2 = z1 + estimate.d[0], z2 + estimate.d[1]
         v1 = tick.ddr[0] - k1 * (h1 - r1) - k2 * (z1 - tick.dr[0]) + 0.5 * c.c1 * z1 / s1
         v2 = tick.ddr[1] - k1 * (h2 - r2) - k2 * (z2 - tick.dr[1]) + 0.5 * c.c4 * z2 / s2
-        return decouple(c, s3, s4, v1, v2), state
+        u = decouple(c, s3, s4, v1, v2)
+        return (less_upper(c, u, estimate.d) if estimate.d else u), state
 
     def input_metric(self, estimate: Estimate) -> tuple | None:
         _, _, s3, s4 = floored_roots(estimate.x, self.level_floor)

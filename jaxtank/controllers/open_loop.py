@@ -15,6 +15,8 @@ class OpenLoop(Controller):
     """u(t_k) = s(t_k): the inputs are those of a signal, independent of the levels (a recorded
     experiment, a constant flow).
 
+    Nothing that an observer estimates is used.
+
     signal: one channel per pump, in the unit of the pumps' input (V), whatever the signal's unit.
 
     Examples

@@ -79,7 +79,8 @@ class PID(Controller):
     Td/8. Without Td there is no derivative; without `order` the integral is of order one, with it
     s^-order = (1/s) s^(1-order), where the second factor is Oustaloup's filter: a true integrator
     is kept. base = bias, or with `feed_forward` the steady-state input of the model on the
-    reference, (r' - f(r))/c2.
+    reference, (r' - f(r))/c2, less d/c2 for a disturbance d of the level rate [cm/s] that the
+    observer estimates. Without `feed_forward` no estimate of a disturbance is used.
 
     Examples
     --------
@@ -140,6 +141,9 @@ class PID(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         base = tick.plan if self.feed_forward else tuple(self.bias[i] for i in range(len(tick.r)))
+        if self.feed_forward and estimate.d:
+            pushed = zip(base, self.model.output(estimate.d), authority(self.model))
+            base = tuple(u - d / c for u, d, c in pushed)
         y = tuple(estimate.x[i] for i in self.model.outputs)
         e = tuple(r - level for r, level in zip(tick.r, y))
         v = tuple(base[i] + self.Kc[i] * e[i] + state.integral[i] for i in range(len(e)))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from jaxtank.analysis.steady_state import steady_along
+from jaxtank.analysis.steady_state import steady_along, steady_under
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, smooth_signed_sqrt, smooth_signed_sqrt_slope
@@ -82,15 +82,21 @@ def acceleration(tanks, damping):
     )
 
 
-def slide(model, surface, ks, phi, switch, form, x, r, u0, previous) -> tuple[Any, Any]:
+def slide(model, surface, ks, phi, switch, form, x, r, u0, previous, d=()) -> tuple[Any, Any]:
     """Return the (2) voltages [V] of the sliding-mode control law, not limited; arguments as the
     fields of `SlidingMode`.
 
     x: (4) levels [cm]; r: (2) setpoint [cm]; u0: (2) steady voltages of the setpoint; previous: (2)
-    voltages now at the pumps [V], used by the printed form alone.
+    voltages now at the pumps [V], used by the printed form alone; d: (4) disturbances of the level
+    rates that the observer estimates [cm/s], or (): u0 then is that under them.
     """
     printed = form == "printed"
     tanks = lower_tanks(model, x)
+    if d:
+        tanks = tanks._replace(
+            drift=tuple(phi + w for phi, w in zip(tanks.drift, d[:2])),
+            above=tuple(fall - w for fall, w in zip(tanks.above, d[2:])),
+        )
     rate = tuple(p + g * u for p, g, u in zip(tanks.drift, tanks.own, previous if printed else u0))
     s = tuple(surface * (h - target) + v for h, target, v in zip(x, r, rate))
     f, (m11, m22), (m12, m21) = acceleration(tanks, 0.0 if printed else surface)
@@ -137,6 +143,10 @@ class SlidingMode(Controller):
     they grow without bound (mirakhorli notes H2). With sign, phi has no effect and the other
     derivatives omit the jumps.
 
+    With disturbances d of the level rates that an observer estimates [cm/s], phi_i(h) has d_i in
+    it, the tank above falls by d less, and u0 is the steady input under d (`steady_under`): the
+    surfaces are then zero at the steady state of the disturbed plant.
+
     Examples
     --------
     >>> from jaxtank.plants.rigs import johansson
@@ -162,7 +172,10 @@ class SlidingMode(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         design = (self.model, self.surface, self.ks, self.phi, self.switch, self.form)
-        return slide(*design, estimate.x, tick.r, tick.plan, state), state
+        u0 = tick.plan
+        if estimate.d:  # the inputs alone, which do not depend on the levels given
+            _, u0 = steady_under(self.model, estimate.x, u0, estimate.d)
+        return slide(*design, estimate.x, tick.r, u0, state, estimate.d), state
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
-from jaxtank.analysis.steady_state import steady_along, steady_flows
+from jaxtank.analysis.steady_state import steady_along, steady_flows, steady_under
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
@@ -38,6 +38,12 @@ def feedback(K, x, h0, u0):
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
 
 
+def _steady(model, plan, d):
+    """The steady state (h0, u0) that was prepared, moved by disturbances d of the level rates."""
+    h0, u0 = plan
+    return steady_under(model, h0, u0, d) if d else (h0, u0)
+
+
 def check_free_outlets(model):
     """Raise InputError unless the steady state of every setpoint follows from `model` by a linear
     balance.
@@ -54,7 +60,10 @@ class StateFeedback(Controller):
     """u = u0(r) - K (h - h0(r)), with h0 [cm] and u0 [V] the steady state of the model at the
     setpoint (mirakhorli sec. 4.2).
 
-    No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21).
+    No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21),
+    or if an observer estimates what it lacks: with disturbances d of the level rates [cm/s], h0 and
+    u0 are the steady state of f + g u + d at the setpoint (`steady_under`). The loop then rests
+    where h = h0 and u = u0, and the outputs are at their setpoints.
 
     Examples
     --------
@@ -75,7 +84,8 @@ class StateFeedback(Controller):
         return steady_along(self.model, r)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        return feedback(self.K, estimate.x, *tick.plan), state
+        h0, u0 = _steady(self.model, tick.plan, estimate.d)
+        return feedback(self.K, estimate.x, h0, u0), state
 
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
@@ -95,7 +105,9 @@ class LQI(Controller):
 
     [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
     extended by z, for the weights diag(Q) and diag(R); h, r [cm], z [cm s], u [V]. The gain depends
-    on its weights, model and operating point, and so do its derivatives.
+    on its weights, model and operating point, and so do its derivatives. With disturbances d that
+    an observer estimates, h0 and u0 are the steady state under them, as in `StateFeedback`: the
+    integrals then have nothing to do at a steady state.
 
     Examples
     --------
@@ -143,7 +155,7 @@ class LQI(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         z, _ = state
-        h0, u0 = tick.plan
+        h0, u0 = _steady(self.model, tick.plan, estimate.d)
         error = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
         return feedback(self.gain(), (*estimate.x, *z), (*h0, *(0.0 for _ in z)), u0), (z, error)
 

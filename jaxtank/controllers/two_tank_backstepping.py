@@ -31,8 +31,8 @@ class TwoTankBackstepping(Controller):
     Without limits the loop is e' = -K_phi e + a Y, Y' = -a e - K_y Y. It is a feedback
     linearisation of h3, of which only K_phi + K_y and K_phi K_y + a^2 matter: the two gains may be
     exchanged. a^2 carries a length, so the same gains are another controller where levels have
-    other units. The output h1 follows h3; there is no integral action. Units in this class are the
-    rig's (m, m^3/s).
+    other units. The output h1 follows h3; there is no integral action, and disturbances that an
+    observer estimates are not used. Units in this class are the rig's (m, m^3/s).
 
     Examples
     --------

@@ -60,7 +60,8 @@ class Estimate(NamedTuple):
     """What an observer gives to a controller: tuples of scalars."""
 
     x: Sequence[Any]  # level estimate, one per tank [cm]
-    # estimated disturbance of each tank's level rate [cm/s]; empty where none is estimated
+    # estimated disturbance of each level rate, what the model of the observer does not explain:
+    # inflow over area [cm/s]; empty where none is estimated
     d: Sequence[Any] = ()
 
 

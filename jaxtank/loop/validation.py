@@ -82,6 +82,8 @@ def check(
         if not _traced(loop.actuator):
             loop.controller.check_pumps(loop.actuator)
     loop.observer.check(loop.plant)
+    if not _traced(loop.observer):
+        loop.observer.check_clock(clock)
     if key is None:
         _check_noise(loop)
 

@@ -2,6 +2,7 @@
 
 from jaxtank.observers.base import Direct, Observer
 from jaxtank.observers.disturbance import DisturbanceObserver
-from jaxtank.observers.kalman import ExtendedKalman, Kalman
+from jaxtank.observers.extended_kalman import ExtendedKalman
+from jaxtank.observers.kalman import Kalman
 
 __all__ = ["Direct", "DisturbanceObserver", "ExtendedKalman", "Kalman", "Observer"]

@@ -4,6 +4,7 @@ import abc
 from collections.abc import Sequence
 from typing import Any
 
+from jaxtank.core.clock import Clock
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component
 from jaxtank.plants.base import Plant
@@ -38,6 +39,9 @@ class Observer(abc.ABC):
 
     def check(self, plant: Plant) -> None:  # noqa: B027  (there may be nothing to check)
         """Raise InputError if the observer does not fit this plant."""
+
+    def check_clock(self, clock: Clock) -> None:  # noqa: B027
+        """Raise InputError if the observer cannot work at the sampling period of this clock."""
 
 
 @component

@@ -1,28 +1,43 @@
-"""The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25)."""
+"""The nonlinear disturbance observer of gouta2022 (sec. 4, eqs. 22-25), for any rig."""
 
 from collections.abc import Sequence
 from typing import Any
 
-from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
+import numpy as np
+
+from jaxtank.controllers.feedback_linearisation import check_own_pumps
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 from jaxtank.observers.base import Observer
+from jaxtank.observers.checks import check_model, check_tanks
 from jaxtank.plants.base import Plant
+from jaxtank.plants.runge_kutta import advance, euler
 
 FED = ("applied", "command")
 
 
 @component
 class DisturbanceObserver(Observer):
-    """Estimate of the rate of each level that the model does not explain, one per tank [cm/s]:
+    """Estimate of the rate of each measured level that the model does not explain [cm/s]:
 
-        d^ = z + l h,   z' = -l z - l (l h + f(h) + c2 u)      (gouta2022 eqs. 23-24), so that d^' =
-        l (d - d^)
+        d^ = z + l h,   z' = -l z - l (l h + f(h) + g u)      (gouta2022 eqs. 23-24)
 
-    by forward Euler, carried as d^ and the level that the model expects next (the same numbers as
-    with z, and good in float32): d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + c2 u)). All levels are
-    measured; x_hat = y.
+    with f + g u the model's level rates. A disturbance d, the inflow that the model lacks over the
+    area of its tank, is estimated with d^' = l (d - d^): no rate of a level is measured. It is
+    computed by forward Euler, carried as d^ and the level that the model expects next (the same
+    numbers as with z, and good in float32),
+
+        d^+ = (1 - l dt) d^ + l (h+ - h - dt (f + g u)),      l dt < 2
+
+    so that a constant d is found without an error of discretisation.
+
+    `measured`: tanks whose levels are read; left out, all. For these x_hat = y. The level of any
+    other tank is predicted by the model from its level at t = 0, by a step of Runge-Kutta, and its
+    d^ is 0: what the model misses there appears in the measured tanks that it feeds. (To estimate
+    such a level too: `ExtendedKalman` with `disturbed`.) A rim that is physics in the model is so
+    here: what overflows is no disturbance.
 
     u [V] is the command after the pumps' limits: with `fed` = "command", the unlimited command,
     the observer winds up while a pump is saturated (gouta2022 notes S4.2). `before_compensation`
@@ -50,33 +65,93 @@ class DisturbanceObserver(Observer):
     """
 
     model: Plant
-    l: Any = leaf("1/s", "(n,) gain l of each tank", low=0.0, strict=True)
+    l: np.ndarray = leaf(
+        "1/s", "(n,) gain l of each tank; of unmeasured tanks not used", low=0.0, strict=True
+    )
     fed: str = static("-", "input that the observer uses", choices=FED, default="applied")
     before_compensation: bool = static(
         "-", "as printed: use the input before eq. (28)", choices=(False, True), default=False
     )
+    measured: tuple = static(
+        doc="tanks whose levels are measured, counted from 0; left out: all", default=()
+    )
+
+    def __post_init__(self) -> None:
+        if self.measured == ():
+            # the tanks themselves, so that loops that mean the same have the same structure
+            object.__setattr__(self, "measured", tuple(range(self.model.tanks)))
 
     def init(self, x0: tuple) -> Any:
         return tuple(0.0 * h for h in x0), x0
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         held, expected = state
-        d = tuple(held[i] + self.l[i] * (y[i] - expected[i]) for i in range(len(y)))
-        return Estimate(x=y, d=d), (d, y)
+        seen = [i in self.measured for i in range(len(held))]
+        d = tuple(
+            held[i] + self.l[i] * (y[i] - expected[i]) if known else held[i]
+            for i, known in enumerate(seen)
+        )
+        x = tuple(y[i] if known else expected[i] for i, known in enumerate(seen))
+        return Estimate(x=x, d=d), (d, x)
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        d, y = state
-        f, c2 = drift(self.model, y), authority(self.model)
+        d, x = state
+        n = range(len(x))
         u = applied if self.fed == "applied" else command
-        rate = tuple(
-            f[i] + c2[i] * u[i] + (d[i] if self.before_compensation else 0.0) for i in range(len(y))
-        )
-        held = tuple((1.0 - self.l[i] * tick.dt) * d[i] for i in range(len(y)))
-        return held, tuple(y[i] + tick.dt * rate[i] for i in range(len(y)))
+        rate = level_rates(self.model, x, u)
+        if self.before_compensation:
+            rate = tuple(rate[i] + d[i] for i in n)
+        expected = euler(self.model, x, rate, tick.dt)
+        if len(self.measured) < len(x):
+            area = getattr(self.model, "area", None)
+            inflow = None if area is None else tuple(area[i] * d[i] for i in n)
+            moved = advance(self.model, "rk4", tick.t, x, u, inflow, tick.dt, 1).x
+            expected = tuple(expected[i] if i in self.measured else moved[i] for i in n)
+        held = tuple((1.0 - self.l[i] * tick.dt) * d[i] if i in self.measured else d[i] for i in n)
+        return held, expected
 
     def check(self, plant: Plant) -> None:
-        check_own_pumps(self.model)
-        if self.model.tanks != plant.tanks:
-            raise InputError(
-                f"observer.model has {self.model.tanks} tanks, the plant {plant.tanks}"
-            )
+        check_model(self, plant)
+        check_tanks(self, "measured", plant)
+        if self.before_compensation:
+            check_own_pumps(self.model, holder="observer")
+
+    def check_clock(self, clock: Clock) -> None:
+        for i in self.measured:
+            if not float(np.max(self.l[..., i])) * clock.dt < 2.0:
+                raise InputError(
+                    f"observer.l[{i}] = {np.max(self.l[..., i]):g} 1/s: must be below 2/clock.dt ="
+                    f" {2.0 / clock.dt:g} 1/s, where the observer becomes unstable"
+                )
+
+
+def level_rates(model, x, u):
+    """Return f(h) + g u of every tank: the level rates of the model.
+
+    Of a network f is computed first, and what the pumps bring is added to it, as gouta2022 eq. (3)
+    has it: the order of the sum decides the last bit of recorded runs.
+
+    Parameters
+    ----------
+    model : plant
+    x : (n) levels [cm]
+    u : (m) inputs [V]
+
+    Returns
+    -------
+    Tuple of rates, one per tank [cm/s]
+
+    Examples
+    --------
+    >>> from jaxtank.plants import network
+    >>> tank = network(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[30.0])
+    >>> [round(float(rate), 3) for rate in level_rates(tank, (4.0,), (6.0,))]
+    [0.857]
+    """
+    shares = getattr(model, "shares", None)
+    if shares is None:
+        return tuple(model.derivative(0.0, tuple(x), tuple(u), None))
+    rate = list(model.derivative(0.0, tuple(x), (0.0,) * model.pumps, None))
+    for j, tank, gain in shares():
+        rate[tank] = rate[tank] + (gain / model.area[tank]) * u[j]
+    return tuple(rate)

@@ -103,6 +103,29 @@ def integrate(plant, integrator, t, x, u, d, h):
     )
 
 
+def euler(plant: Plant, x: Sequence[Any], rates: Sequence[Any], h: Any) -> tuple[Any, ...]:
+    """Return the levels a step `h` [s] later at given rates, with overflow: forward Euler.
+
+    Parameters
+    ----------
+    plant : Plant
+    x : (n) levels [cm]
+    rates : (n) [cm/s]
+    h : [s]
+
+    Returns
+    -------
+    (n) levels [cm]
+
+    Examples
+    --------
+    >>> from jaxtank.plants import state_coupled_four_tank
+    >>> euler(state_coupled_four_tank(15.0), (5.0,) * 4, (1.0, 2.0, 0.0, -1.0), 0.5)
+    (5.5, 6.0, 5.0, 4.5)
+    """
+    return tuple(plant.spill(_along(x, rates, h))[0])
+
+
 def change(plant, integrator, t, x, u, d, h):
     """Return the change of the levels in that step, for compensated sums (`jaxtank.core.kahan`)."""
     rates = _rates(plant, integrator, t, x, u, d, h)

@@ -105,8 +105,8 @@ class TankNetwork(Plant):
     def pumps(self) -> int:
         return len(self.feeds)
 
-    def _shares(self):
-        """[(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
+    def shares(self):
+        """Return [(pump, tank, gain [cm^3/(s V)])]: where each pump's flow goes."""
         shares = []
         for j, (first, second) in enumerate(self.feeds):
             if second is None:
@@ -167,7 +167,7 @@ class TankNetwork(Plant):
         for k, (source, _) in enumerate(self.links):
             out[source] = out[source] + self.orifice[k]
         rate = [0.0 if d is None else d[i] / self.area[i] for i in range(n)]
-        for j, tank, gain in self._shares():
+        for j, tank, gain in self.shares():
             rate[tank] = rate[tank] + (gain / self.area[tank]) * u[j]
         supply = () if step is None else self._supply(step)
         q = [
@@ -212,7 +212,7 @@ class TankNetwork(Plant):
             .at[other]
             .add(piped)
         )
-        pump, tank, gain = (list(column) for column in zip(*self._shares()))
+        pump, tank, gain = (list(column) for column in zip(*self.shares()))
         return flow.at[np.array(tank)].add(jnp.stack(gain) * u[np.array(pump)]) / jnp.asarray(
             self.area
         )
@@ -221,7 +221,7 @@ class TankNetwork(Plant):
         """Return the rate of change of the stored volume [cm^3/s]: inflow less outflow to the
         basin.
         """
-        inflow = sum(gain * u[j] for j, _, gain in self._shares()) + (0.0 if d is None else sum(d))
+        inflow = sum(gain * u[j] for j, _, gain in self.shares()) + (0.0 if d is None else sum(d))
         return inflow - sum(
             self.drain[i] * efflux(x[i], self.gravity, self.knee) for i in range(self.tanks)
         )

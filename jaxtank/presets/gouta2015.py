@@ -16,7 +16,7 @@ from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.observers import Direct
+from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.paper import Claim, Preset, Published, verdict
@@ -40,6 +40,7 @@ TUNABLE = {
     "controller.Tp": Free(1.0, 60.0),
     "controller.k": Free(1e-3, 50.0),
     "controller.k1": Free(1e-3, 5.0),
+    "observer.l": Free(2e-3, 5.0),
 }
 
 CONTROLLERS = {
@@ -50,6 +51,17 @@ CONTROLLERS = {
         ("controller.k", "controller.k1"),
     ),
 }
+OBSERVED = {
+    "ngpc-observer": (
+        "nonlinear predictive control with the disturbance observer of gouta2022 (CHADPC)",
+        ("controller.Tp", "observer.l"),
+    ),
+    "backstepping-observer": (
+        "backstepping as printed with the disturbance observer of gouta2022",
+        ("controller.k", "controller.k1", "observer.l"),
+    ),
+}
+GAIN = 0.5  # l of every tank in OBSERVED (notes A10) [1/s]
 VARIANTS = {
     "-table1": "plant A: areas as printed in Table 1",
     "-boxqp": "inputs allocated by box QP instead of clipped",
@@ -84,6 +96,10 @@ DEPARTURES = (
         "backstepping-ff and -boxqp are not in the paper: the first adds the rates that eq. (46)"
         " lacks (notes S4.4), the second takes the exact constrained minimiser of the paper's cost"
         " instead of clipping (notes S4.5)."
+    ),
+    (
+        "ngpc-observer and backstepping-observer are not in the paper: they have the disturbance"
+        " observer of gouta2022, whose estimate the controllers take into their model (notes S4.6)."
     ),
     "Kp is printed in cm^3/V; its dimension is cm^3/(s V) (E2).",
 )
@@ -136,6 +152,13 @@ def controller_of(kind, model):
     )
 
 
+def observer_of(kind, model):
+    """Return the observer of a case: none but for those of OBSERVED."""
+    if kind not in OBSERVED:
+        return Direct()
+    return DisturbanceObserver(model=model, l=number([GAIN] * 4))
+
+
 def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
     """Return the closed loop of a controller; area of the tanks [cm^2], ramp [s]."""
     plant = state_coupled_four_tank(area)
@@ -147,8 +170,8 @@ def build(kind, area=FAST_AREA, saturation="clip", ramp=60.0):
             noise=number([0.0] * 4),
             full_scale=number(3.3),  # of the STM32 board's converter; not in the paper
         ),
-        observer=Direct(),
-        controller=controller_of(kind, plant),
+        observer=observer_of(kind, plant),
+        controller=controller_of(kind.removesuffix("-observer"), plant),
         actuator=PumpBank(
             low=number([0.0, 0.0]),
             high=number([12.0, 12.0]),
@@ -199,9 +222,10 @@ def measured(run):
 def preset():
     """Return the Preset of this paper."""
     suffixes = itertools.product(("", "-table1"), ("", "-boxqp"), ("", "-slow"))
-    cases = {}
-    for kind, (table1, boxqp, slow) in itertools.product(CONTROLLERS, list(suffixes)):
-        title, free = CONTROLLERS[kind]
+    cases, kinds = {}, CONTROLLERS | OBSERVED
+    every = [*itertools.product(CONTROLLERS, suffixes), *((kind, ("",) * 3) for kind in OBSERVED)]
+    for kind, (table1, boxqp, slow) in every:
+        title, free = kinds[kind]
         name = f"{kind}{table1}{boxqp}{slow}"
         variants = [VARIANTS[v] for v in (table1, boxqp, slow) if v]
         cases[name] = Case(

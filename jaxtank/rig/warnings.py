@@ -8,6 +8,7 @@ import numpy as np
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import is_component, split_index, walk
+from jaxtank.loop.disturbance_use import is_unused
 from jaxtank.rig.signals import steps
 from jaxtank.signals.inflows import InflowPulses
 
@@ -17,7 +18,8 @@ def case_warnings(case: Case) -> list[str]:
 
     A run that does not end at a sample, changes and inflow pulses after its end, changes that
     overlap, levels and setpoints above a rim, pumps that start outside their limits, models that
-    differ from the plant. (Steps that are too long: `loop.step_size`.)
+    differ from the plant, estimates of disturbances that the controller does not use. (Steps that
+    are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -41,6 +43,7 @@ def case_warnings(case: Case) -> list[str]:
         *_above_rims(case),
         *_pumps(case),
         *model_warnings(case),
+        *_unused(case),
     ]
 
 
@@ -144,6 +147,17 @@ def _pumps(case):
                 f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
                 f" {low:g} and {high:g} {drive}"
             )
+
+
+def _unused(case):
+    """On an observer whose estimate of disturbances acts on no pump."""
+    if is_unused(case.loop):
+        part = getattr(case.loop.controller, "law", case.loop.controller)
+        without = " without feed-forward" if hasattr(part, "feed_forward") else ""
+        yield (
+            "observer: its estimate of disturbances (estimate.d) has no effect: the controller"
+            f" {type(part).__name__}{without} does not use it"
+        )
 
 
 def model_warnings(case: Case) -> list[str]:

@@ -494,6 +494,7 @@ def observed():
 
 FOUR = functools.partial(state_coupled_four_tank, FAST_AREA)
 FILTER = {"process": np.full(4, 0.02), "measurement": np.full(4, 0.05), "measured": (0, 1)}
+WALKS = {**FILTER, "walk": np.full(4, 0.03), "disturbed": (2, 3)}
 OBSERVERS = {
     "Kalman": lambda: observers.Kalman(
         model=FOUR(), levels=np.array([8.0, 7.0, 6.0, 9.0]), inputs=np.array([3.0, 3.1]), **FILTER
@@ -502,6 +503,15 @@ OBSERVERS = {
         model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **FILTER
     ),
     "DisturbanceObserver": lambda: presets.find("gouta2022/chadpc").loop.observer,
+    "Kalman with disturbances": lambda: observers.Kalman(
+        model=FOUR(), levels=np.array([8.0, 7.0, 6.0, 9.0]), inputs=np.array([3.0, 3.1]), **WALKS
+    ),
+    "ExtendedKalman with disturbances": lambda: observers.ExtendedKalman(
+        model=FOUR(), spread=np.full(4, 0.3), start=np.full(4, 7.0), **WALKS
+    ),
+    "DisturbanceObserver without a sensor": lambda: observers.DisturbanceObserver(
+        model=FOUR(), l=np.array([0.5, 0.7, 0.9, 1.1]), measured=(0, 1, 3)
+    ),
 }
 
 
@@ -515,6 +525,9 @@ def of_observer(name, tanks, samples):
 of_observer("Kalman", 4, 1)  # each sample designs it anew, and takes as long to compile
 of_observer("ExtendedKalman", 4, 1)
 of_observer("DisturbanceObserver", 2, 3)
+of_observer("Kalman with disturbances", 4, 1)
+of_observer("ExtendedKalman with disturbances", 4, 1)
+of_observer("DisturbanceObserver without a sensor", 4, 3)
 
 
 # laws: two samples, the limits between them

@@ -565,6 +565,7 @@ def test_two_hundred_signals():
     assert found["signals"] == 200 and not found["wrong"], found["wrong"]
 
 
+@pytest.mark.slow
 def test_an_identification_goes_on_where_it_was_interrupted(tmp_path):
     """Two of three searches are in the log: the third alone is run, and the answer has the same
     bits; another problem's log is refused.

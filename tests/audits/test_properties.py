@@ -124,6 +124,7 @@ def after(plant, x, u, d, dt, steps, integrator="rk4"):
     return course(plant, x, u, d, dt, steps, integrator)[0][-1]
 
 
+@pytest.mark.slow_for("16")
 @of_every_rig(16, 500)
 def test_mass_is_kept_with_what_is_lost_over_the_rims(seed, tanks, kind):
     """What is stored has come in and has not been lost: the same Runge-Kutta steps of one more

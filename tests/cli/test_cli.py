@@ -528,7 +528,7 @@ def test_tune_takes_what_is_free_limited_and_wanted_from_its_options():
     )
 
 
-@pytest.mark.slow_for("auto", "lbfgs", "slsqp", "trf")
+@pytest.mark.slow_for("auto", "lbfgs", "slsqp", "trf", "adam")
 @pytest.mark.parametrize("method", ["auto", "trf", "slsqp", "lbfgs", "adam"])
 def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
     printed = say(

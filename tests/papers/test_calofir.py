@@ -332,6 +332,7 @@ def test_slopes_of_the_mean_square_error():
     )
 
 
+@pytest.mark.slow
 def test_the_landscape_is_symmetric():
     """Notes S10: J(K_phi, K_y) = J(K_y, K_phi) over a grid of gains, and it is not flat."""
     case = CASES["backstepping"]

@@ -18,7 +18,10 @@ from tuning.report.papers import measure
 NAMES = presets.names()
 NEW = [name for name in NAMES if not name.startswith("gouta2015")]
 CONTRACT = {
-    "gouta2015": "ngpc backstepping backstepping-ff ngpc-table1 backstepping-boxqp ngpc-slow",
+    "gouta2015": (
+        "ngpc backstepping backstepping-ff ngpc-table1 backstepping-boxqp ngpc-slow ngpc-observer"
+        " backstepping-observer"
+    ),
     "gouta2022": (
         "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed"
         " chadpc-trapezoid"
@@ -37,6 +40,7 @@ CONTRACT = {
 }
 NAMES_THAT_MUST_EXIST = {
     "gouta2022/chadpc": "controller.Tp observer.l plant.pump_gain actuator.dead_zone",
+    "gouta2015/backstepping-observer": "controller.k controller.k1 observer.l",
     "gouta2022/pid": "controller.Kc controller.Ti controller.Td",
     "gouta2022/fopi": "controller.order",
     "mirakhorli/sfc": "controller.K",

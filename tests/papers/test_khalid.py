@@ -362,6 +362,7 @@ def rows(table, quick):
     "S2-laguerre-unconstrained-0.5",
     "S1-laguerre-constrained-0.1",
     "S1-laguerre-unconstrained-0.5",
+    "S1-laguerre-constrained-0.5",
 )
 @pytest.mark.parametrize("row", list(rows(ONE_PUMP, QUICK)))
 def test_rows_with_one_pump(row):

@@ -6,12 +6,13 @@ import re
 import shlex
 import tomllib
 
+import jax
 import pytest
 from helpers import RANK, RIGS, ROOT
 
 import jaxtank
 import tuning as package
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.measures import MEASURES
 from tuning.cli import main
@@ -170,14 +171,19 @@ def test_the_controller_of_ones_own_is_tuned(capsys):
 
 
 def test_the_rigs_shown_are_the_one_that_is_tested():
-    (short,), (full, plant) = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
+    (short,), rigs = blocks("toml", "README.md"), blocks("toml", "jaxtank/README.md")
+    full, plant, watched = rigs
     assert full == RIG.read_text()
     assert tomllib.loads(short) == tomllib.loads(full)
     assert len([line for line in short.splitlines() if line.strip()]) <= 15
-    assert blocks("toml") == [short, full, plant]
+    assert blocks("toml") == [short, *rigs]
     of_file = tomllib.loads((RIGS / "two_tanks.toml").read_text())
     tables = tomllib.loads(plant)
     assert len(tables) == 5 and tables == {name: of_file[name] for name in tables}
+    built, preset = rig.loads(watched), presets.find("gouta2015/backstepping-observer")
+    assert jax.tree.structure(built.loop) == jax.tree.structure(preset.loop)
+    assert built.loop.observer.l.tolist() == preset.loop.observer.l.tolist()
+    assert built.free.keys() < preset.free.keys()
 
 
 def test_what_the_page_states_of_outputs_holds():

@@ -67,7 +67,7 @@ def test_equals_the_enumeration_of_active_sets(n, rows, seed):
     np.testing.assert_allclose(solve(*data, iterations=20), exact, atol=1e-8)
 
 
-@pytest.mark.slow_for("22-30")
+@pytest.mark.slow_for("22-30", "8-60")
 @pytest.mark.parametrize("n, rows", [(8, 60), (22, 30)])
 def test_equals_scipy(n, rows):
     H, f, G, l, u = problem(n, rows, 5, tight=1.0)
@@ -277,6 +277,7 @@ def test_it_ends_when_it_has_arrived():
         np.testing.assert_array_equal(solve(*data), solve(*data, iterations=400))
 
 
+@pytest.mark.slow
 def test_second_derivatives_in_reverse():
     """No loop is gone through backwards: reverse over reverse, and over forward."""
     H, f, G, l, u = problem(3, 6, 1)
@@ -358,6 +359,7 @@ def along(n=48):
     return value
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_large_programme_against_differences():
     value, h = along(), 1e-5
     run = jax.jit(value)
@@ -407,6 +409,7 @@ print(all(np.isfinite(run(k / 100 * f)).all() for k in range(1, 201)))
 """
 
 
+@pytest.mark.slow
 def test_200_batches_on_two_devices_return():
     """The time limit is there to end a run that would never end: it takes 15 s."""
     done = subprocess.run(
@@ -415,6 +418,7 @@ def test_200_batches_on_two_devices_return():
     assert done.returncode == 0 and done.stdout.strip() == "True", done.stderr[-2000:]
 
 
+@pytest.mark.slow
 def test_the_loop_of_a_large_programme_is_one_compiled_function():
     """LAPACK in it, or any other call, would keep XLA from that; in front of the loop, where the
     rig is discretised, there is some.

@@ -118,6 +118,7 @@ def test_nothing_is_called_proved_that_the_filter_does_not_cover(case, changes, 
     assert dict(found.limits) == {"max_level": 2.7}  # still to be kept by the search
 
 
+@pytest.mark.slow
 def test_a_share_is_that_of_every_flow_where_a_rig_names_nothing(path, tmp_path):
     (tmp_path / "bare.toml").write_text(TANK.replace("uncertain = {", "# {"))
     words = ["--validation", "8", "--starts", "1", "--iterations", "1", "--json", "--quiet"]

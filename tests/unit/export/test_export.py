@@ -122,7 +122,9 @@ class Compiled:
         return out
 
 
-@pytest.mark.slow_for("gouta2015/ngpc", "mirakhorli/smc")
+@pytest.mark.slow_for(
+    "gouta2015/ngpc", "mirakhorli/smc", "calofir/backstepping", "mirakhorli/hybrid"
+)
 @needs_gcc
 @pytest.mark.parametrize("name", EVERY)
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
@@ -147,6 +149,7 @@ def test_c_has_the_safety_filter_of_the_loop(tmp_path):
 DELAYED = (("actuator.delay", 40.0),)  # ten samples of cascaded/pi
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_c_has_the_safety_filter_that_predicts_over_the_dead_time(tmp_path):
     """Within 1e-9 of the pumps' range, where the cap is another than that of the readings alone."""
@@ -481,6 +484,7 @@ def expected(error):
     return np.concatenate([np.ravel(f(jnp.float64(error))).astype(float) for f in FUNCTIONS])
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
     case, errors = own()

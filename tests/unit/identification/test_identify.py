@@ -1281,6 +1281,7 @@ QUICK = (
 )
 
 
+@pytest.mark.slow
 def test_a_rig_without_a_controller_is_not_sent_to_the_tuner(logged):
     folder, _ = logged
     code, _, err = estimated(folder, "plain")
@@ -1290,6 +1291,7 @@ def test_a_rig_without_a_controller_is_not_sent_to_the_tuner(logged):
     assert command("tune", str(folder / "plain" / "rig.toml"), "--robust", "cvar")[0] == 2
 
 
+@pytest.mark.slow
 def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
     """Kc = 0.5/K and Ti = T/2 of one tank, K = k/G, T = A/G with G = s sqrt(g / 2 h) at the mean
     input of the log.
@@ -1404,6 +1406,7 @@ def test_the_cascaded_tanks(cascaded):
     )
 
 
+@pytest.mark.slow_for("named")
 @pytest.mark.parametrize(
     "free, advice",
     [

@@ -35,6 +35,7 @@ def test_the_loop_compiles_to_one_function(gouta, name):
     )
 
 
+@pytest.mark.slow
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
     """Two calls: the random generator has a loop of its own."""
     from jaxtank.measures import MEASURES as every
@@ -280,6 +281,7 @@ def test_a_late_import_warns_once():
     assert "jax had started" not in python("import jax; import jaxtank")[1]
 
 
+@pytest.mark.slow
 def test_the_option_off_gives_the_same_numbers():
     code = (
         "import jaxtank, jax; jax.config.update('jax_enable_x64', True); from jaxtank import"

@@ -264,7 +264,7 @@ WRONG = (
 DOUBT = "tank 1 runs empty faster than the steps follow"
 
 
-@pytest.mark.slow_for("0.2-6-None")
+@pytest.mark.slow_for("0.2-6-None", "0.2-1-words0")
 @pytest.mark.parametrize(
     ("last", "substeps", "words"), [(0.2, 1, WRONG), (10.0, 1, DOUBT), (0.2, 6, None)]
 )

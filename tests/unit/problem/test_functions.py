@@ -106,6 +106,7 @@ def test_its_derivatives_are_those_of_the_measure_that_it_repeats(four_tanks):
         np.testing.assert_allclose(change, reverse[i], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_functions_of_thinned_trajectories_and_measures_agree_with_differences(watertank):
     register("fastest", from_function(fastest_change, "V/s", save_every=11))
     register("both", from_function(total_variation_and_level))
@@ -163,6 +164,7 @@ def test_many_parameters_are_differentiated_in_reverse(watertank, monkeypatch):
 QUICK = dict(starts=1, screening=8, validation=0, iterations=40)
 
 
+@pytest.mark.slow
 def test_a_function_has_the_optimum_of_the_measure_that_it_repeats(watertank):
     """By BFGS, where the measure is minimised by Gauss-Newton."""
     free = {"controller.Kc": (0.5, 20.0), "controller.Ti": (1.0, 100.0)}

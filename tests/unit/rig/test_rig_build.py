@@ -249,6 +249,7 @@ def test_a_controller_of_a_paper_on_a_rig_of_ones_own():
     np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.slow
 def test_a_rig_is_the_same_in_any_unit_of_length():
     """Two tanks and a pipe, from empty and to empty, counted in cm, m, mm and dm, nothing said of
     the film or of a law's floors.

@@ -241,6 +241,7 @@ ROWS = {
 }
 
 
+@pytest.mark.slow_for("gouta2015/ngpc")
 @pytest.mark.parametrize("name", ["gouta2015/ngpc", "cascaded/pi"])
 def test_the_filtered_loop_has_the_errors_of_an_independent_prototype(name):
     case = presets.find(name)

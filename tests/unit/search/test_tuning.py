@@ -294,6 +294,7 @@ def test_the_weight_of_the_objective_does_not_move_the_answer(gouta):
     )
 
 
+@pytest.mark.slow
 def test_first_order_methods_that_stop_early_do_not_claim_to_have_converged(gouta):
     result = quick(gouta, "ngpc", method="adam", limits={}, iterations=2, screening=2, starts=1)
     assert result.status == "not_converged" and not result.success
@@ -530,6 +531,7 @@ def test_chatter_is_told_and_drawn(gouta, short):
     assert "input-total-variation" not in codes({"before": calm, "after": calm})
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_an_objective_of_zero_gives_no_share_and_no_warning():
     case = rig.set_values(

@@ -1,0 +1,169 @@
+"""Extended Kalman filter on the model of a rig."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import component, leaf, static
+from jaxtank.observers.base import Observer
+from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
+from jaxtank.plants.base import Plant
+from jaxtank.plants.runge_kutta import advance
+
+
+class Belief(NamedTuple):
+    """State of the extended filter, of n tanks and N = n + disturbed numbers."""
+
+    x: Sequence  # (N) levels [cm], then disturbances of level rates [cm/s]
+    P: tuple  # (N) rows of N covariances [cm^2, cm^2/s, cm^2/s^2]
+
+
+@component
+class ExtendedKalman(Observer):
+    """Extended Kalman filter (Jazwinski 1970): the levels are predicted by an integrator step,
+    their covariance by that step's Jacobian.
+
+        correct, for each measured tank i in turn:  K = P e_i / (P_ii + r_i),  x += K (y_i - x_i),
+        P -= K e_i' P
+        predict:  x = Phi(x, u),  P = F P F' + Q dt,   F = d Phi / d x
+
+    Phi is one or more steps of "rk4" or "midpoint" with u, the input after the pumps' limits, held.
+    The noises of the sensors are independent, so that correcting by one after the other is the
+    joint correction and no matrix is inverted. x [cm], P [cm^2].
+
+    `disturbed` names tanks whose level rate has a part d [cm/s] that the model does not explain, a
+    random walk that gains the variance `walk` per second and is 0 at first; x is then extended by
+    them, d(k+1) = d(k), and the controller receives the estimate. There can be no more of them than
+    measured tanks, and each must act on one.
+
+    Examples
+    --------
+    >>> from jaxtank.plants.rigs import johansson
+    >>> observer = ExtendedKalman(
+    ...     model=johansson("minimum")[0],
+    ...     process=[0.01] * 4,
+    ...     measurement=[0.04] * 4,
+    ...     spread=[0.04] * 4,
+    ...     measured=(0, 1),
+    ... )
+    >>> tick = Tick(t=0.0, r=(12.0, 12.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)
+    >>> start = observer.init((12.0, 12.0, 2.0, 2.0))
+    >>> estimate, _ = observer.step(start, tick, (12.2, 12.0, 0.0, 0.0))
+    >>> [round(float(h), 6) for h in estimate.x]  # equal variances: half the innovation
+    [12.1, 12.0, 2.0, 2.0]
+    """
+
+    model: Plant
+    process: np.ndarray = leaf(
+        "cm^2/s", "(n,) variance that each level's own disturbance gains per second (Q)", low=0.0
+    )
+    measurement: np.ndarray = leaf(
+        "cm^2",
+        "(n,) variance of each sensor's noise (r); of unmeasured tanks not used",
+        low=0.0,
+        strict=True,
+    )
+    spread: np.ndarray = leaf("cm^2", "(n,) variance of the initial estimate at t = 0", low=0.0)
+    start: np.ndarray | None = leaf(
+        "cm",
+        "(n,) initial estimate at t = 0; absent: the true ones",
+        low=0.0,
+        like="spread",
+        default=None,
+    )
+    walk: np.ndarray | None = leaf(
+        "cm^2/s^3",
+        "(n,) variance that the disturbance of each level's rate gains per second; of tanks not in"
+        " `disturbed` not used",
+        low=0.0,
+        strict=True,
+        like="process",
+        default=None,
+    )
+    measured: tuple = static(doc="tanks whose levels are measured, counted from 0")
+    disturbed: tuple = static(
+        doc="tanks whose rate has a disturbance that is estimated, counted from 0", default=()
+    )
+    substeps: int = static("-", "integrator steps per sample", low=1, high=10, default=1)
+    integrator: str = static(
+        doc="how the model is integrated", choices=("rk4", "midpoint"), default="rk4"
+    )
+
+    def init(self, x0: tuple) -> Any:
+        n = range(len(x0))
+        x = x0 if self.start is None else tuple(self.start[i] + 0.0 * x0[i] for i in n)
+        zero, N = 0.0 * x0[0], range(len(x0) + len(self.disturbed))
+        return Belief(
+            x=(*x, *(zero for _ in self.disturbed)),
+            P=tuple(
+                tuple(self.spread[i] + 0.0 * x0[i] if i == j and i in n else zero for j in N)
+                for i in N
+            ),
+        )
+
+    def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
+        x, P = state
+        n = range(len(x))
+        for i in self.measured:
+            K = [P[j][i] / (P[i][i] + self.measurement[i]) for j in n]
+            x = tuple(x[j] + K[j] * (y[i] - x[i]) for j in n)
+            P = _symmetric([[P[j][k] - K[j] * P[i][k] for k in n] for j in n])
+        levels, d = self._parts(x)
+        return Estimate(x=levels, d=d), Belief(x, P)
+
+    def _parts(self, x):
+        """((n) levels [cm], (n) disturbances [cm/s], () without `disturbed`) of a state."""
+        levels, found = x[: self.model.tanks], x[self.model.tanks :]
+        if not self.disturbed:
+            return levels, ()
+        d = [0.0 * h for h in levels]
+        for i, value in zip(self.disturbed, found):
+            d[i] = value
+        return levels, tuple(d)
+
+    def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        model, N, n = self.model, range(len(state.x)), self.model.tanks
+        area, walk = cast(Any, model).area if self.disturbed else (), cast(Any, self.walk)
+
+        def onward(x):  # the levels alone: a random walk stays where it is
+            levels, d = self._parts(x)
+            inflow = tuple(area[i] * v for i, v in enumerate(d)) or None
+            return advance(
+                model, self.integrator, tick.t, levels, applied, inflow, tick.dt, self.substeps
+            ).x
+
+        one, zero = jnp.ones_like(state.x[0]), jnp.zeros_like(state.x[0])
+        # columns[j][i] = F_ij of the levels i; the rows of random walks are those of the identity
+        columns = [
+            jax.jvp(onward, (state.x,), (tuple(one if i == j else zero for i in N),))[1] for j in N
+        ]
+        FP = [
+            [sum(columns[k][i] * state.P[k][j] for k in N) if i < n else state.P[i][j] for j in N]
+            for i in N
+        ]
+        gained = [self.process[i] for i in range(n)] + [walk[i] for i in self.disturbed]
+        P = [
+            [
+                (sum(FP[i][k] * columns[k][j] for k in N) if j < n else FP[i][j])
+                + (gained[i] * tick.dt if i == j else 0.0)
+                for j in N
+            ]
+            for i in N
+        ]
+        return Belief((*onward(state.x), *state.x[n:]), _symmetric(P))
+
+    def check(self, plant: Plant) -> None:
+        check_model(self, plant)
+        check_tanks(self, "measured", plant)
+        # half full, each tank a little differently: levels at which no two flows cancel
+        typical = np.asarray(self.model.rim) * (0.5 + 0.01 * np.arange(plant.tanks))
+        check_disturbed(self, plant, typical)
+
+
+def _symmetric(P):
+    """Rows whose lower half is the upper one: round-off would make them differ."""
+    return tuple(tuple(P[min(i, j)][max(i, j)] for j in range(len(P))) for i in range(len(P)))
