@@ -1,7 +1,7 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
 Imported by the command `explore`, by reports and by notebooks. Beside it lie the parts of the page:
-page.html, page.css, core.js, charts.js, rig.js, page.js, worker.js, tune.js, and uPlot in vendor/.
+page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot in vendor/.
 """
 
 import base64
@@ -26,7 +26,7 @@ from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
 
 HERE = Path(__file__).parent
-SCRIPTS = ("charts", "rig", "page")
+SCRIPTS = ("charts", "rig", "runner", "page")
 LARGEST = 150_000
 """Characters of a page, above which the safety filter that a case has not is left out."""
 
