@@ -19,7 +19,8 @@ DRAG = """async () => {
   let pictures = 0;
   const watch = new MutationObserver(() => (pictures += 1));  // once for each new run
   for (let i = 0; i < 120; i += 1) {
-    if (i === 30) watch.observe(document.querySelector("#measures"), { subtree: true, childList: true });
+    const measures = document.querySelector("#measures");
+    if (i === 30) watch.observe(measures, { subtree: true, childList: true });
     own.value = 200 + 5 * i;
     own.dispatchEvent(new Event("input"));
     const start = performance.now();
@@ -57,8 +58,8 @@ def measure(browser, name, folder):
     middle, slow = drag[len(drag) // 2], drag[int(0.95 * len(drag))]
     print(
         f"{name}: {path.stat().st_size / 1000:.0f} kB; run {run:.1f} ms; frame {middle:.1f} ms"
-        f" (95 %: {slow:.1f} ms), {pictures:.0f} runs drawn a second; search {seconds:.2f} s, objective {objective:.6g}, limits passed"
-        f" by {100 * violation:.2g} %"
+        f" (95 %: {slow:.1f} ms), {pictures:.0f} runs drawn a second; search {seconds:.2f} s,"
+        f" objective {objective:.6g}, limits passed by {100 * violation:.2g} %"
     )
 
 

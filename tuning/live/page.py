@@ -1,7 +1,8 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
 Imported by the command `explore`, by reports and by notebooks. Beside it lie the parts of the page:
-page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot in vendor/.
+page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot
+in vendor/.
 """
 
 import base64
