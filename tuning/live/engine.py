@@ -55,14 +55,16 @@ def engine(case: Case, filtered: Case | None = None) -> str:
         cases = [one for one in (case, filtered) if one is not None]
         loops = [whole_loop(one) for one in cases]
         facts = _facts(case, loops)
-        programs = ",\n".join(_program(loop, _tangents(loop.case)) for loop in loops)
+        shared: dict[str, str] = {}
+        own = ",\n".join(_program(loop, _tangents(loop.case), shared) for loop in loops)
+        programs = _with_functions(own, shared)
     driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
             "const makeEngine=(()=>{",
             '"use strict";',
             f"const info={data(_packed(facts))};",
-            f"const programs=[{programs}];",
+            f"const programs={programs};",
             driver,
             "return makeEngine;",
             "})();",
@@ -127,23 +129,33 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     return (("mean_square_error", 1.0),) if ROOT in objective or not own else own
 
 
-def _program(loop: WholeLoop, tangents: TangentLoop) -> str:
-    """One loop as an object of its functions."""
+def _program(loop: WholeLoop, tangents: TangentLoop, shared: dict[str, str]) -> str:
+    """One loop as an object of its functions; functions on arrays are added to `shared`."""
     columns = [[f, len(found)] for f, found in loop.saved.items()]
     main, slopes = Printed(loop), PrintedTangents(tangents)
     along = [_name(*leaf) for leaf in tangents.leaves]
-    own = f"{_block(slopes, 'lead,signals,read,aim,push,slope', f'along:{data(along)}')}"
-    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}")
+    own = _block(slopes, "lead,signals,read,aim,push,slope", f"along:{data(along)}", shared)
+    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}", shared)
 
 
-def _block(printed: Printed, functions: str, facts: str) -> str:
-    """Functions in a scope of their own."""
-    body = "\n".join([*printed.helpers(), printed.text()])
-    body = "\n".join([*called(body), body])
+def _block(printed: Printed, functions: str, facts: str, shared: dict[str, str]) -> str:
+    """Functions in a scope of their own; shared: {text of a function on arrays: its name}."""
+    own = [
+        f"{name}={shared.setdefault(text, f'g{len(shared)}')}"
+        for name, text in printed.helpers().items()
+    ]
+    body = "\n".join([*([f"const {','.join(own)};"] if own else []), printed.text()])
     measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
     leaves = data([_name(*leaf) for leaf in printed.loop.leaves])
     facts = f"streams:{len(printed.streams())},measures:{measures},leaves:{leaves},{facts}"
-    return f"(()=>{{{maths(body)}\n{body}\nreturn{{{functions},{facts}}};}})()"
+    return f"(()=>{{{body}\nreturn{{{functions},{facts}}};}})()"
+
+
+def _with_functions(programs: str, shared: dict[str, str]) -> str:
+    """An array of programs, with the functions that they call."""
+    own = "\n".join(f"const {name}={text};" for text, name in shared.items())
+    above = "\n".join([*called(f"{own}\n{programs}"), own])
+    return f"(()=>{{{maths(f'{above} {programs}')}\n{above}\nreturn[{programs}];}})()"
 
 
 def _name(name, index):
