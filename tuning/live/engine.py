@@ -4,6 +4,7 @@ The text needs no page: node runs it too. Imported by the page.
 """
 
 import json
+import re
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -65,7 +66,7 @@ def engine(case: Case, filtered: Case | None = None) -> str:
             '"use strict";',
             f"const info={data(_packed(facts))};",
             f"const programs={programs};",
-            driver,
+            bare(driver),
             "return makeEngine;",
             "})();",
         ]
@@ -94,6 +95,18 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
         groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(own)
     packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
     return {**facts, "leaves": packed}
+
+
+def bare(script: str) -> str:
+    """Return a script of ours without comments in blocks, indentation and empty lines.
+
+    Examples
+    --------
+    >>> bare("/* a\\nb */\\nif (x) {\\n  y = 1;\\n}")
+    'if (x) {\\ny = 1;\\n}'
+    """
+    lines = (line.strip() for line in re.sub(r"/\*.*?\*/", "", script, flags=re.S).splitlines())
+    return "\n".join(filter(None, lines))
 
 
 def data(value: Any) -> str:
@@ -154,7 +167,7 @@ def _block(printed: Printed, functions: str, facts: str, shared: dict[str, str])
 def _with_functions(programs: str, shared: dict[str, str]) -> str:
     """An array of programs, with the functions that they call."""
     own = "\n".join(f"const {name}={text};" for text, name in shared.items())
-    above = "\n".join([*called(f"{own}\n{programs}"), own])
+    above = "\n".join([*map(bare, called(f"{own}\n{programs}")), own])
     return f"(()=>{{{maths(f'{above} {programs}')}\n{above}\nreturn[{programs}];}})()"
 
 

@@ -199,9 +199,7 @@ class ArrayText:
         operands = [spread(self, v, eqn.outvars[0], o) for v, o in zip(eqn.invars, operands)]
         size = int(np.prod(eqn.outvars[0].aval.shape))
         own = [entry(o, v.aval.size, size) for v, o in zip(eqn.invars, operands)]
-        text = Text(
-            {Ref(x): o for x, o in zip("xyz", own)}, (f"x{i}" for i in itertools.count())
-        )
+        text = Text({Ref(x): o for x, o in zip("xyz", own)}, (f"x{i}" for i in itertools.count()))
         lines = text.write(writer.scopes[0], [e])
         return self.filled(size, "".join(lines), text.of(e))
 

@@ -24,8 +24,7 @@ PARTED = ("scan", "cond")
 
 
 class ArrayWriter(Writer):
-    """A Writer that turns work on larger arrays into calls; `functions`: {name: its text, an expression}.
-    """
+    """A Writer that turns work on larger arrays into calls; `functions`: {name: its text}."""
 
     def __init__(self):
         super().__init__()
