@@ -279,7 +279,7 @@ def _read(name):
 def _style():
     """The style sheets, without comments and indentation."""
     text = re.sub(r"/\*.*?\*/", "", _read("vendor/uPlot.min.css") + _read("page.css"), flags=re.S)
-    return re.sub(r"\s*([{};,])\s*", r"\1", re.sub(r"\s+", " ", text)).replace(": ", ":")
+    return re.sub(r"\s*([{};])\s*", r"\1", re.sub(r"\s+", " ", text)).replace(": ", ":")
 
 
 @cache
