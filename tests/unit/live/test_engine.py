@@ -43,6 +43,26 @@ const r = e.tangents(d.values, e.info.free, { seed: d.seed });
 const jacobian = Object.entries(r.jacobian).map(([k, v]) => [k, Array.from(v)]);
 console.log(JSON.stringify([e.info.free, jacobian, Array.from(r.gauss_newton)]));
 """
+RUNNER = """
+const sent = [], shown = [], worker = { postMessage: (m) => sent.push(m.values) };
+globalThis.performance ??= { now: () => 0 };
+const done = (run, { values }) => shown.push([run, values]);
+const on = { done, failed: (text) => shown.push(text) };
+const answer = (run) => worker.onmessage({ data: { kind: "run", run, milliseconds: 1 } });
+const runner = makeRunner(() => worker, ({ values }) => -values, on);
+[1, 2, 3].forEach((values) => runner.ask({ values }));
+answer("a");
+answer("b");
+const quiet = !runner.busy;
+runner.ask({ values: 4 });
+worker.onerror();
+setTimeout(() => {
+  runner.ask({ values: 5 });
+  const fail = () => { throw new Error("x"); }, forbidden = makeRunner(fail, fail, on);
+  forbidden.ask({ values: 6 });
+  console.log(JSON.stringify({ sent, shown, quiet }));
+}, 5);
+"""
 SEARCH = """
 const e = makeEngine();
 console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 3 })));
@@ -203,6 +223,29 @@ def test_a_search_keeps_the_limits():
     levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
     start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
     assert np.max(start) > 17.0 >= np.max(levels) > 16.9
+
+
+def test_a_search_without_a_way_ends_at_the_least_violation():
+    """Of one gain, against the least of the largest violation on a scan of 60 values."""
+    case = presets.find("cascaded/pi").replace(limits={"max_level": [6.0, 5.0]})
+    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    scan = []
+    for gain in np.geomspace(0.05, 3.3, 60):
+        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
+        levels = np.asarray(jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"])
+        scan.append(np.max(levels / [6.0, 5.0] - 1.0))
+    assert found["status"] == "limits not met" and min(scan) > 0.01
+    assert found["violation"] == pytest.approx(min(scan), rel=0.01, abs=1e-4)
+    assert found["violation"] <= min(scan) + 1e-6
+
+
+def test_of_runs_asked_for_meanwhile_the_newest_is_sent_and_without_a_worker_it_runs_here():
+    runner = resources.files("tuning.live").joinpath("runner.js").read_text("utf-8")
+    found = node(runner + RUNNER)
+    assert found["sent"] == [1, 3, 4] and found["quiet"]
+    assert found["shown"] == [["a", 1], ["b", 3], [-4, 4], [-5, 5], "x"]
 
 
 def test_names_of_a_rig_stay_text():
