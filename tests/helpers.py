@@ -38,6 +38,7 @@ RANKS = [
     "jaxtank.presets",
     "jaxtank.rig jaxtank.plots jaxtank.export jaxtank.interop",
     "tuning.problem tuning.storage",
+    "tuning.cluster",
     "tuning.uncertainty tuning.identification tuning.optimal_input",
     "tuning.feasible",
     "tuning.search tuning.falsification",

@@ -8,7 +8,7 @@ import errno
 import os
 import stat
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from jaxtank.core.errors import InputError
@@ -17,6 +17,9 @@ LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 
 LOCK = ".jaxtank.lock"
 """File that a run keeps in its folder while it lasts, and that stays after a kill."""
+
+Content = str | bytes | Iterable[str]
+"""What a file is written from."""
 
 ASIDE = ".jaxtank"
 """Suffix of files that are not yet complete."""
@@ -49,7 +52,7 @@ def write_atomic(path: str | os.PathLike[str], data: str | bytes) -> None:
     write_together(path.parent, {path.name: data})
 
 
-def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | bytes]) -> None:
+def write_together(folder: str | os.PathLike[str], files: Mapping[str, Content]) -> None:
     """Write several files to a folder, all of them or none.
 
     All are complete on the disk before the first replaces an older one, so that a full disk leaves
@@ -58,7 +61,7 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | byt
     Parameters
     ----------
     folder : existing folder
-    files : {name: text or bytes}
+    files : {name: text, bytes or parts of a text, of which one at a time is in memory}
 
     Raises
     ------
@@ -79,7 +82,8 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | byt
             handle, temporary = tempfile.mkstemp(dir=folder, prefix=f".{name}.", suffix=ASIDE)
             aside.append((temporary, folder / name))
             with os.fdopen(handle, "wb") as file:
-                file.write(data.encode() if isinstance(data, str) else data)
+                for part in (data,) if isinstance(data, str | bytes) else data:
+                    file.write(part.encode() if isinstance(part, str) else part)
                 file.flush()
                 os.fsync(file.fileno())
             os.chmod(temporary, 0o666 & ~_umask())
@@ -92,7 +96,7 @@ def write_together(folder: str | os.PathLike[str], files: Mapping[str, str | byt
         raise
 
 
-def write_folder(folder: str | Path, files: Mapping[str, str | bytes]) -> list[Path]:
+def write_folder(folder: str | Path, files: Mapping[str, Content]) -> list[Path]:
     """Write files to a folder, made if need be, all of them or none; return their paths.
 
     Parameters

@@ -1,6 +1,6 @@
 """Stability margins of a closed loop: at the steady state of every plateau, and the worst of them.
 
-May import `loop.operating_point` and the folders below `jaxtank.loop`.
+May import `loop.operating_point`, `loop.validation` and the folders below `jaxtank.loop`.
 """
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
@@ -21,6 +21,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, run_of, zero_of
 from jaxtank.loop.operating_point import REASONS, linearised
+from jaxtank.loop.validation import check
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
 
@@ -59,7 +60,8 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     Raises
     ------
     InputError
-        For a loop in float32, whose poles near z = 1 are too inexact.
+        For a loop or clock that cannot be run, and for a loop in float32, whose poles near z = 1
+        are too inexact.
 
     Examples
     --------
@@ -72,6 +74,7 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     >>> first.stable, round(float(first.margins.sensitivity_peak), 2)
     (True, 1.86)
     """
+    check(loop, clock, jax.random.key(0))
     if not serves(loop):
         return ()
     r, linear, found = _of_plateaus(loop, clock)

@@ -16,7 +16,9 @@ NONE_LEFT = (
 NOTHING_HELD = "the reference holds no setpoints at which the loop could be linearised"
 
 
-def _margin(field: str, unit: str, doc: str, unlimited: str, shown: int) -> Measure:
+def _margin(
+    field: str, unit: str, doc: str, unlimited: str, shown: int, low: float, high: float | None
+) -> Measure:
     """A margin of each pump: larger is better, infinite where nothing crosses."""
 
     def read(run: Run, accumulated: dict[str, Any]) -> Any:
@@ -28,7 +30,8 @@ def _margin(field: str, unit: str, doc: str, unlimited: str, shown: int) -> Meas
         (),
         read,
         doc,
-        low=None,
+        low=low,
+        high=high,
         sense=-1.0,
         shown=shown,
         undefined=NONE_LEFT,
@@ -46,6 +49,7 @@ MARGINS: dict[str, Measure] = {
         (),
         lambda run, accumulated: run.margins.sensitivity_peak,
         "Ms of the linearised loop: largest gain of 1/(1 + L), at the pumps",
+        low=1.0,  # the mean of log|S| over frequency is at least 0 (Bode), as L is strictly proper
         shown=110,
         undefined=NONE_LEFT,
         worst=UNSTABLE,
@@ -58,6 +62,8 @@ MARGINS: dict[str, Measure] = {
         "factor on the loop gain, up or down, that the linearised loop stands",
         "the phase never reaches -180 deg",
         120,
+        low=1.0,
+        high=None,
     ),
     "phase_margin": _margin(
         "phase_margin",
@@ -65,6 +71,8 @@ MARGINS: dict[str, Measure] = {
         "change of the phase that the linearised loop stands",
         "the gain never reaches 1",
         130,
+        low=0.0,
+        high=180.0,
     ),
     "delay_margin": _margin(
         "delay_margin",
@@ -72,6 +80,8 @@ MARGINS: dict[str, Measure] = {
         "additional dead time that the linearised loop stands",
         "the gain never reaches 1",
         140,
+        low=0.0,
+        high=None,
     ),
 }
 """{name: Measure}, entries of the catalogue."""

@@ -18,7 +18,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.measures import check_names, entries
+from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
 from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_finite, is_numeric, read_entry, sizes_of
@@ -176,10 +176,14 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
             raise InputError(
                 f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}"
             )
-        if measure == "max_level" and np.min(value) < 0:
+        low, high = MEASURES[measure].low, MEASURES[measure].high
+        if (low is not None and np.min(value) < low) or (high is not None and np.max(value) > high):
+            of = "" if unit == "-" else f" {unit}"
+            least = "" if low is None else f"at least {low:g}"
+            most = "" if high is None else f"at most {high:g}"
             raise InputError(
-                f"limit {measure} = {shortened(value)} {unit}: must be at least 0 {unit}, no level"
-                " is below empty"
+                f"limit {measure} = {shortened(value)}{of}: must be"
+                f" {' and '.join(filter(None, (least, most)))}{of}; no run has a value beyond"
             )
     return dict(limits)
 

@@ -152,7 +152,7 @@ def prepare(folder: str | os.PathLike[str] | None = None) -> tuple[Path | None, 
         why = refused(base)
         if why:
             return None, why
-        mine = base.resolve() / f"{_version()}-{_processor()}"
+        mine = base.resolve() / f"{_version()}-{processor()}"
         mine.mkdir(mode=0o700, exist_ok=True)
         if not os.access(mine, os.W_OK | os.X_OK):
             return None, ""
@@ -241,9 +241,14 @@ def _version() -> str:
     return sys.modules["jaxtank"].__version__
 
 
-def _processor() -> str:
+def processor() -> str:
     """Return what native code depends on, as 12 hexadecimal digits: programs for one processor may
     end on another, which shares the home, by an illegal instruction.
+
+    Examples
+    --------
+    >>> len(processor())
+    12
     """
     words = [platform.machine(), sys.platform]
     try:

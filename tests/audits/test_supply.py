@@ -41,6 +41,10 @@ IMPORTED = {
         "subprocess",
     ): "`jaxtank bench` compiles its own floor.c with gcc, where there is one",
     ("tuning.bench.bench", "ctypes"): "and calls it",
+    (
+        "tuning.cluster.local",
+        "subprocess",
+    ): "`--cluster local:N` starts Dask's own commands, of this Python, with constant words",
     ("tuning.cli.commands.explore", "webbrowser"): "`explore --open` shows the file it has written",
 }
 
@@ -79,6 +83,7 @@ MADE = {
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
     ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
+    ("tuning.cluster.task", "call", "import_module"): "names of its own table, in its own package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
 READ = {
@@ -98,7 +103,7 @@ READ = {
     ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "in a folder of mode 700 and"
     " the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
-    ("jaxtank.xla.program_cache", "_processor", "open"): "/proc/cpuinfo",
+    ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
@@ -110,6 +115,10 @@ READ = {
     ): "after `refusal`; unpacked sizes are added up first",
     ("tuning.storage.batch_store", "read_batch", "load"): "after that; allow_pickle=False",
     ("tuning.storage.batch_store", "read_manifest", "read_text"): "after `refusal`",
+    ("tuning.storage.columns", "__getitem__", "memmap"): "a file without a name, its own",
+    ("tuning.cluster.local", "_process", "open"): "to write",
+    ("tuning.cluster.local", "_address", "read_text"): "in a new folder of its own, mode 700",
+    ("tuning.cluster.local", "_last_line", "read_text"): "of the same folder",
     ("tuning.cli.main", "_drop_output", "open"): "/dev/null, to write",
     ("tuning.cli.terminal", "guard", "open"): "/dev/null, in place of a stream that was closed",
     ("tuning.storage.folder_lock", "_locked", "open"): "its own lock, of which 20 bytes are read",

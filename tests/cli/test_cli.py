@@ -959,6 +959,16 @@ BAD = [  # arguments, words that the line must have
     ),
     (["tune", CASE, "--limit", "max_level=nan"], "limit max_level = nan: must be a finite number"),
     (["tune", CASE, "--limit", "max_level=true"], "limit max_level = True"),
+    (
+        ["tune", CASE, "--limit", "phase_margin=500"],
+        "limit phase_margin = 500 deg: must be at least 0 and at most 180 deg",
+    ),
+    (
+        ["tune", CASE, "--limit", "sensitivity_peak=0.5"],
+        "sensitivity_peak = 0.5: must be at least 1;",
+    ),
+    (["tune", CASE, "--limit", "gain_margin=-2"], "gain_margin = -2: must be at least 1;"),
+    (["tune", CASE, "--limit", "iae=-1"], "limit iae = -1 cm s: must be at least 0 cm s"),
     (["tune", CASE, "--limit", "max_level=[1,2]"], "or 4 of them"),
     (
         ["tune", CASE, "--limit", "max_level=30,5"],

@@ -12,6 +12,7 @@ from jaxtank.case import Case
 from jaxtank.core.tree import with_values
 from tuning.answer.checks import LARGEST, Checks
 from tuning.answer.judged import Judged, judge, matters
+from tuning.answer.robustness import move_back
 from tuning.answer.setting import NEAR, PLANTS, Setting
 from tuning.answer.stay_put import Found, search_from
 from tuning.problem.problem import Problem
@@ -37,8 +38,8 @@ LEVELS = ("max_level", "overflow_volume")
 class Task:
     """What was asked for, and what stays the same from one search to the next."""
 
-    def __init__(self, free, plan, samples, progress):
-        self.free, self.plan, self.samples = free, plan, samples
+    def __init__(self, free, plan, samples, progress, engine=None):
+        self.free, self.plan, self.samples, self.engine = free, plan, samples, engine
         self.progress, self.may_filter = progress, True
         self.cache: Any = None
         self.stage = ""
@@ -112,6 +113,7 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
             checks = _search(task, made, case, limits, least)
             if made.found.point is None:
                 return dataclasses.replace(made, attempt=0)
+            move_back(setting, made.problem, made.found)
             tuned = _at(setting, values_of(made.problem, made.found))
             task.enter(f"judging the answer on {task.samples} validation plants")
             made.after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
@@ -148,7 +150,8 @@ def _search(task, made, case, limits, least):
             checks and stays
         ):  # a start that holds the limits as they are may stay where they are tighter
             found.slack = checks.slack(problem)
-        search_from(problem, task.plan, task.report(setting.cost_unit), found)
+        report = task.report(setting.cost_unit)
+        search_from(problem, task.plan, report, found, task.engine)
 
     if not limits:
         search(made.found)

@@ -11,6 +11,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from tuning.answer.judged import FRESH
 from tuning.answer.recommend import recommend
+from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.search import tuner
@@ -47,6 +48,7 @@ def tune(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
+    cluster: Any = None,
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits.
 
@@ -103,6 +105,9 @@ def tune(
         resume=True, to the same bits; `log` is its former name.
     progress : called with a dict after every evaluation. Ctrl-C ends the search with the best
         point so far.
+    cluster : Dask cluster on which the local searches run side by side, to the same answer:
+        "HOST:PORT" of its scheduler, "local:N" for N workers on this machine, or a
+        `distributed.Client`.
 
     Returns
     -------
@@ -132,7 +137,8 @@ def tune(
     if own is DEFAULT:
         assert isinstance(case, Case)
         _check_default(**{n: common[n] for n in counts})
-        return recommend(case, **given, **common)
+        with connect(cluster) as engine:
+            return recommend(case, engine=engine, **given, **common)
     for name, value in given.items():
         if value is not None:
             raise InputError(f"{name}: belongs to the default answer, not to the nominal optimum")
@@ -145,6 +151,7 @@ def tune(
         screening=NOMINAL["screening"] if screening is None else screening,
         batch=batch,
         tolerance=tolerance,
+        cluster=cluster,
         **common,
     )
 

@@ -21,6 +21,8 @@ from tuning.answer.findings import findings_of
 from tuning.answer.judged import FRESH, judge, matters
 from tuning.answer.result import result_of
 from tuning.answer.setting import NEAR, limited_levels, plants_of, setting_of
+from tuning.cluster.engine import Engine
+from tuning.cluster.problems import check_sent
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
@@ -49,8 +51,12 @@ def recommend(
     checkpoint: Any = None,
     resume: bool = False,
     progress: Callable | None = None,
+    engine: Engine | None = None,
 ) -> TuningResult:
-    """Return the default answer; parameters and errors as `tuning.tune`."""
+    """Return the default answer; parameters and errors as `tuning.tune`.
+
+    engine : of a cluster, None without.
+    """
     began = time.perf_counter()
     case, mended = _mended(case, mend, distributions, limits, seed)
     if safety_filter and not case.safety:  # asked for here: the case as given has none
@@ -59,10 +65,11 @@ def recommend(
     if safety_filter is False:
         setting = setting.without_filter()
     plan = {"starts": starts, "iterations": iterations, "seed": seed}
-    task = Task(free, plan, validation, progress)
+    task = Task(free, plan, validation, progress, engine)
     first = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     first.start()
     _check_functions(setting, first.needed)
+    check_sent(engine, first)
     if checkpoint is not None:
         what = _what(setting, free, plan, validation, safety_filter, first.needed)
         task.cache = EvaluationLog(checkpoint, what, resume)

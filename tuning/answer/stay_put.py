@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from tuning.cluster.ahead import evaluate_ahead
+from tuning.cluster.engine import Engine
 from tuning.problem.functions import check_slopes
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import Search
-from tuning.search.methods import METHODS, restore
+from tuning.search.methods import METHODS, restore, search_alone
 from tuning.search.screening import (
     Population,
     around,
@@ -120,10 +122,12 @@ def method_of(problem: Problem) -> str:
     return "trf-slsqp" if problem.model and len(problem.bounds) >= MANY else "slsqp"
 
 
-def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Found) -> None:
+def search_from(
+    problem: Problem, plan: dict[str, int], report: Any, found: Found, engine: Engine | None = None
+) -> None:
     """Search the problem from its start and from screened points, and keep in `found` the answer.
 
-    plan : {"starts", "iterations", "seed"}.
+    plan : {"starts", "iterations", "seed"}. engine : of a cluster, None without.
     """
     first = problem.start()
     reference = problem.point(first)
@@ -134,7 +138,11 @@ def search_from(problem: Problem, plan: dict[str, int], report: Any, found: Foun
     costs, margins = problem.screen(zs)
     shortfall = np.maximum(0.0, -margins / search.limit_scale)
     merits = costs / search.scale + 10.0 * shortfall.sum(axis=1)
-    for z in distinct_starts(zs, merits, plan["starts"], first):
+    starts = distinct_starts(zs, merits, plan["starts"], first)
+    how = (method_of(problem), plan["iterations"], TOLERANCE)
+    searches = [(z, number, how) for number, z in enumerate(starts)]
+    evaluate_ahead(engine, problem, searches, search_alone, lambda: report(search))
+    for z in starts:
         search.start = len(found.starts)
         _local_search(search, found, z, plan["iterations"])
         found.agreed = _agree(found.starts)

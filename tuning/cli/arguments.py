@@ -147,8 +147,21 @@ def uncertain():
     return found
 
 
-def on_devices():
-    """Return the parent parser of --devices."""
+def on_cluster():
+    """Return the parent parser of --cluster."""
     found = Parser(add_help=False)
+    option(
+        found,
+        "--cluster",
+        "ADDRESS",
+        "run on a Dask cluster: HOST:PORT of its scheduler, or local:N for N workers on this"
+        " machine (pip install distributed)",
+    )
+    return found
+
+
+def on_devices():
+    """Return the parent parser of --devices and --cluster."""
+    found = Parser(add_help=False, parents=[on_cluster()])
     option(found, "--devices", "N", "devices of this machine to use (default 1)", "1")
     return found

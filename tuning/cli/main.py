@@ -40,6 +40,7 @@ def main(argv=None):
 
         # the note is printed once, where the case is opened
         warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        warnings.showwarning = _shown(warnings.showwarning)
     try:
         code = _command(argv)
         sys.stdout.flush()
@@ -75,6 +76,18 @@ def _command(argv):
         _keep_programs(args)
     with hold(folder, shared=shared, leaving=interrupts.before_leaving):
         return args.run(args)
+
+
+def _shown(other):
+    """Return what shows a warning: one on a cluster as a note, `other` any other one."""
+
+    def show(message, category, *where):
+        if category.__name__ == "ClusterWarning":
+            print(f"jaxtank: note: {message}", file=sys.stderr)
+        else:
+            other(message, category, *where)
+
+    return show
 
 
 def _keep_programs(args):

@@ -29,6 +29,6 @@ def parser():
     for module in (case, explore, tuning, studies, falsification, identification, tools):
         module.add(commands, parents)
     for one in commands._choices_actions:  # what the list of commands says, where nothing else is
-        own = commands.choices[one.dest]
-        own.description = own.description or f"{one.help[0].upper()}{one.help[1:]}."
+        own, text = commands.choices[one.dest], one.help or one.dest
+        own.description = own.description or f"{text[0].upper()}{text[1:]}."
     return top

@@ -92,7 +92,7 @@ class Constraint:
         if (self.upper is None) == (self.lower is None):
             raise InputError(f"constraint {self.name}: must have either upper or lower")
         try:
-            finite = not isinstance(self.limit, bool) and math.isfinite(self.limit)
+            finite = not isinstance(self.limit, bool | np.bool_) and math.isfinite(self.limit)
         except (TypeError, OverflowError):
             finite = False
         if not finite:
@@ -198,6 +198,11 @@ def _limited(limits: Any, found: dict[str, ms.Measure]) -> dict[str, Any]:
 def _enter(name: str, measure: ms.Measure, found: dict[str, ms.Measure]) -> str:
     """Return the name of a measure after it was entered in `found`."""
     if found.get(name, measure) != measure:
+        if name == UNNAMED:
+            raise InputError(
+                "objective: two functions without a name, as lambdas; give each one:"
+                ' tuning.Objective("name", function)'
+            )
         raise InputError(
             f"{name} is the name of two functions (or of one with two units, limits or save_every):"
             " give each a name of its own"

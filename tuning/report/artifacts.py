@@ -64,8 +64,8 @@ def earlier(folder, names):
 
 
 def write_result(folder, files, draw, page=None, stale=()):
-    """Write `files` {name: text or bytes} of a result to `folder`, all or none, then its pictures,
-    all or none; returns the paths.
+    """Write `files` {name: text, its parts, or bytes} of a result to `folder`, all or none, then
+    its pictures, all or none; returns the paths.
 
     draw: function that returns {name: figure}, called once the files are written; page: function of
         these that returns report.html;

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.text import shortened
 from jaxtank.core.tree import split_index
 from jaxtank.rig.components import ROLES
 from tuning.problem.bounds import bounds
@@ -107,6 +108,11 @@ def _row(variant, status, before, after, parameters=None, reason=None):
 
 def _variants(case, choices, free):
     """Return the Variants of all combinations. Raises InputError for one that cannot be."""
+    if not isinstance(choices, Mapping):
+        raise InputError(
+            f"choices = {shortened(choices)}: must be {{name: [values to try]}}, as"
+            ' {"controller.kind": ["pid", "lqi"]}'
+        )
     for name, values in choices.items():
         if not isinstance(values, (list, tuple)) or not values:
             raise InputError(f"choices {name}: must be a list of values to try")

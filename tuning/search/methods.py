@@ -1,15 +1,18 @@
 """Local searches from one start: each takes a Search, may stop early, and may not fail.
 
-Imported by `stages` and `pareto`.
+Imported by `stages`, `pareto` and `tuning.answer`; `search_task` by workers of a cluster.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from tuning.cluster.ahead import recorded
 from tuning.problem.point import DIVERGED
 from tuning.problem.problem import ROOT
-from tuning.search.driver import CoarseSearch
-from tuning.search.first_order import adam, lbfgs
+from tuning.search.driver import CoarseSearch, Search
+from tuning.search.first_order import adam, lbfgs, minibatches
 from tuning.search.kkt import LOWER_BY
 from tuning.search.screening import MEMBERS, distinct_starts, evolution_size, evolve, sobol
 
@@ -297,3 +300,42 @@ METHODS = {
     "trf-slsqp": gauss_newton_first,
     "coarse-trf": coarse_first,
 }
+
+
+class Local(NamedTuple):
+    """How local searches run.
+
+    Examples
+    --------
+    >>> Local("slsqp", 40).batch is None
+    True
+    """
+
+    method: str
+    iterations: int
+    tolerance: float | None = None  # that of a Search where None
+    batch: int | None = None  # scenarios drawn for each step of adam
+    seed: int = 0  # of these
+
+
+def run_local(search, z, how):
+    """Return True if the local search from z (P,) converged."""
+    if how.batch is None:
+        return METHODS[how.method](search, z, how.iterations)
+    rng = np.random.default_rng([how.seed, search.start])
+    return minibatches(search, z, how.iterations, how.batch, rng)
+
+
+def search_alone(problem, z, number, how):
+    """Run the local search of this number from z (P,) as the first search of a problem."""
+    reference = problem.point(problem.start())
+    tolerance = {} if how[2] is None else {"tolerance": how[2]}
+    search = Search(problem, reference, lambda search: None, **tolerance)
+    search.take(reference)
+    search.start = number
+    run_local(search, z, Local(*how))
+
+
+def search_task(text, arrays, arguments, known):
+    """Return the new evaluations of `search_alone`; a task, see `tuning.cluster.ahead`."""
+    return recorded(text, arrays, search_alone, arguments, known)

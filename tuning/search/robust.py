@@ -3,9 +3,10 @@
 Imported by the command line and as `tuning.tune_robust`.
 """
 
+import functools
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.rig import check_limits
+from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
 from tuning.problem.result import Shown
@@ -141,6 +143,7 @@ def tune_robust(
     back_off: float = 0.0,
     tolerance: float = TOLERANCE,
     validation: int = 64,
+    cluster: Any = None,
     **options: Any,
 ) -> TuningResult:
     """Return the result of `tune` on `samples` drawn plants, every limit held on every plant.
@@ -160,6 +163,7 @@ def tune_robust(
     tolerance, options : as in `tune`.
     validation : runs of a case that has scenarios of its own, 0 for none (any other is validated on
         the new plants).
+    cluster : Dask cluster on which the local searches and the new plants run, as in `tune`.
 
     Returns
     -------
@@ -180,24 +184,24 @@ def tune_robust(
     objective, limits = as_measures(options.get("objective"), options.get("limits"))
     options |= {"objective": objective, "limits": limits}
     distributions = spread_of(case) if distributions is None else stated(distributions)
-    limits = check_limits(
-        case.loop, case.limits if options.get("limits") is None else options["limits"]
-    )
+    limits = check_limits(case.loop, case.limits if limits is None else limits)
     options["limits"] = _tightened(case, limits, back_off)
     plants = scenarios_of(case, distributions, samples, seed)
-    result = tune(
-        case, scenarios=plants, risk=risk, seed=seed, tolerance=tolerance, validation=0, **options
-    )
-    judge = Problem(case, options.get("free"), options.get("objective"), limits, None, seed)
-    # what is certified is the case's own run, what the answer is judged by is its scenarios
+    with connect(cluster) as engine:
+        options |= {"seed": seed, "tolerance": tolerance, "validation": 0, "cluster": engine}
+        result = tune(case, scenarios=plants, risk=risk, **options)
+        judge = Problem(case, options.get("free"), objective, limits, None, seed)
+        run = functools.partial(_run, distributions, limits, fresh, seed, engine)
+        # what is certified is the case's own run, what the answer is judged by is its scenarios
+        if case.scenarios:
+            broken = int(run(result.tuned, ())[1].sum())
+        else:
+            *found, broken = _on_new_plants(result, judge, run, distributions)
     if case.scenarios:
-        broken = int(_run(result.tuned, distributions, limits, (), fresh, seed)[1].sum())
         found = (None, None)
         if validation and result.status != "interrupted":
             values = {n: p["after"] for n, p in result.parameters.items()}
             found = validate(judge, judge.own_values(), values, validation, seed)
-    else:
-        *found, broken = _on_new_plants(result, judge, distributions, limits, fresh, seed)
     support = _support(result)
     interval = clopper_pearson(broken, fresh)
     certificate = Certificate(
@@ -283,20 +287,19 @@ def _tightened(case, limits, share):
     return {m: (v - share * ms.MEASURES[m].sense * np.abs(v)).tolist() for m, v in values.items()}
 
 
-def _run(case, distributions, limits, names, fresh, seed):
+def _run(distributions, limits, fresh, seed, cluster, case, names):
     """Return (Ensemble of new plants, (fresh,) True where one violates a limit or diverges)."""
-    found = cast(
-        Ensemble,
-        ensemble(
-            case,
-            distributions,
-            samples=fresh,
-            key=(SEED_OFFSET + seed) % 2**31,
-            measures=names,
-            limits=limits,
-            fan=False,
-        ),
+    found = ensemble(
+        case,
+        distributions,
+        samples=fresh,
+        key=(SEED_OFFSET + seed) % 2**31,
+        measures=names,
+        limits=limits,
+        fan=False,
+        cluster=cluster,
     )
+    assert isinstance(found, Ensemble)  # None for a shard
     past = [
         limit.margins(found.measures[limit.measure].reshape(fresh, -1)[:, limit.index]) < 0
         for limit in found.limits
@@ -304,20 +307,16 @@ def _run(case, distributions, limits, names, fresh, seed):
     return found, found.failed | np.any(past, axis=0) if past else found.failed
 
 
-def _on_new_plants(result, judge, distributions, limits, fresh, seed):
+def _on_new_plants(result, judge, run, distributions):
     """Return (summary, cloud, how many violate a limit after tuning) on new plants.
 
-    Before and after tuning on the same draws.
+    Before and after tuning on the same draws. run : `_run` of a case and measures.
     """
     names = tuple(dict.fromkeys([*judge.objective, "max_level"]))
-    sides = [
-        _run(case, distributions, limits, names, fresh, seed)
-        for case in (result.case, result.tuned)
-    ]
+    sides = [run(case, names) for case in (result.case, result.tuned)]
+    weights = judge.objective.items()
     costs = [
-        sum(
-            w * found.measures[m].reshape(fresh, -1).sum(axis=1) for m, w in judge.objective.items()
-        )
+        sum(w * found.measures[m].reshape(found.samples, -1).sum(axis=1) for m, w in weights)
         for found, _ in sides
     ]
     held = np.stack([~past for _, past in sides], axis=1)

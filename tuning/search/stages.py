@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from tuning.cluster.ahead import evaluate_ahead
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
 from tuning.search.driver import SETTLED, Search, event_of
-from tuning.search.first_order import minibatches
 from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
-from tuning.search.methods import METHODS, UNCONSTRAINED, approach, find_feasible, slsqp
+from tuning.search.methods import (
+    UNCONSTRAINED,
+    Local,
+    approach,
+    find_feasible,
+    run_local,
+    search_alone,
+    slsqp,
+)
 from tuning.search.screening import (
     MEMBERS,
     Population,
@@ -60,6 +68,12 @@ class Plan:
     seed: int
     batch: int | None
     tolerance: float | None
+    engine: Any = None  # of a cluster, on which the local searches run first
+
+    @property
+    def local(self) -> Local:
+        """How each local search runs."""
+        return Local(self.method, self.iterations, self.tolerance, self.batch, self.seed)
 
 
 @dataclasses.dataclass
@@ -104,7 +118,10 @@ def _run_stages(problem, first, plan, found, report):
     screened = Population(*measured)
     shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
     merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
-    for z in distinct_starts(screened.zs, merits, plan.starts, first):
+    starts = distinct_starts(screened.zs, merits, plan.starts, first)
+    searches = [(z, number, tuple(plan.local)) for number, z in enumerate(starts)]
+    evaluate_ahead(plan.engine, problem, searches, search_alone, lambda: report(search))
+    for z in starts:
         search.start = len(found.starts)
         _local_search(search, found, plan, z, len(search.history))
     _search_screened(search, found, plan, screened)
@@ -232,11 +249,7 @@ def _local_search(search, found, plan, z, count):
     count : evaluations before the first that belongs to this search.
     """
     search.exhausted = False
-    if plan.batch is None:
-        converged = METHODS[plan.method](search, z, plan.iterations)
-    else:
-        rng = np.random.default_rng([plan.seed, search.start])
-        converged = minibatches(search, z, plan.iterations, plan.batch, rng)
+    converged = run_local(search, z, plan.local)
     mine = search.history[count:]
     reached = min(mine, key=lambda h: (h[2] > 0, h[2] if h[2] > 0 else h[1]), default=None)
     if reached is None:  # every point it asked for was known already

@@ -16,6 +16,8 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from tuning.cluster.engine import connect
+from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
@@ -60,6 +62,7 @@ def tune(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     progress: Callable | None = None,
+    cluster: Any = None,
 ) -> TuningResult:
     """Return better values for the free parameters of a case, under its limits.
 
@@ -105,12 +108,13 @@ def tune(
     if isinstance(case, Problem) or isinstance(method, Solver):
         case, method, options = spelled_out(case, method, options)
     keep: dict[str, Any] = dict(checkpoint=folder, resume=resume)
-    if choices:
-        return tune_choices(tune, case, method, choices, **keep, **options)
-    return _tune(case, method, **keep, **options)
+    with connect(cluster) as engine:
+        if choices:
+            return tune_choices(tune, case, method, choices, cluster=engine, **keep, **options)
+        return _tune(case, method, engine, **keep, **options)
 
 
-def _tune(case, method, *, checkpoint, resume, validation, progress, **options):
+def _tune(case, method, engine, *, checkpoint, resume, validation, progress, **options):
     """Check everything, run the stages, and put the result together."""
     began = time.perf_counter()
     check_precision()
@@ -123,12 +127,14 @@ def _tune(case, method, *, checkpoint, resume, validation, progress, **options):
     plan = Plan(
         method=_method(method, problem, options["batch"]),
         seed=options["seed"],
+        engine=engine,
         **{n: options[n] for n in numbers},
     )
     first = problem.start()
     # a start that is not finite is an input error, reported by evaluate
     before = run_measures(case.loop, case.clock, key, problem.needed)
     _check_start(problem, before, first)
+    check_sent(engine, problem)
     if checkpoint is not None:
         problem.cache = EvaluationLog(checkpoint, _what(problem, plan, validation), resume)
     found = solve(problem, first, plan, progress)
@@ -155,7 +161,7 @@ def _what(problem, plan, validation):
         risk=problem.risk,
         validation=validation,
         **digests(problem.loop, problem.clock, problem.needed),
-        **vars(plan),
+        **{n: v for n, v in vars(plan).items() if n != "engine"},
     )
 
 

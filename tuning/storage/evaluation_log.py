@@ -52,8 +52,13 @@ class EvaluationCache:
         """Return compute(), or what it gave for the same kind and arguments (arrays, numbers)."""
         key = digest(kind, *arguments)
         if key not in self.found:
-            self.found[key] = self.keep(kind, key, compute())
+            self.enter(kind, key, compute())
         return self.found[key]
+
+    def enter(self, kind: str, key: str, result: Any) -> None:
+        """Enter a result under its key, unless there is one."""
+        if key not in self.found:
+            self.found[key] = self.keep(kind, key, result)
 
     def keep(self, kind: str, key: str, result: Any) -> Any:
         """Return `result`, entered wherever it is to be kept."""

@@ -60,14 +60,28 @@ class Runner:
         self.devices = jax.local_devices()[:devices]
         self.pool = ThreadPoolExecutor(devices)
 
-    def __call__(self, rows, indices):
-        """Return [{measure: (batch, ...), "failed": (batch,)}], at most one for each device."""
-        return list(self.pool.map(self._one, self.devices, rows, indices))
+    def each(self, numbers, rows_of):
+        """Yield (number, batch) in order; rows_of(number): (values, numbers of the draws).
+
+        batch : {measure: (batch, ...), "failed": (batch,)}
+        """
+        width = len(self.devices)
+        for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
+            rows, indices = zip(*map(rows_of, group))
+            yield from zip(group, self.pool.map(self._one, self.devices, rows, indices))
 
     def _one(self, device, rows, indices):
-        values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
-        found = _run(self.case.loop, values, indices, self.seed, self.case.clock, self.names)
-        return {n: np.asarray(v) for n, v in found.items()}
+        return run_batch(self.case, self.names, self.seed, rows, indices, device)
+
+
+def run_batch(case, names, seed, rows, indices, device=None):
+    """Return {measure: (batch, ...), "failed": (batch,)} of the draws `indices` at values `rows`.
+
+    device : None for the first one.
+    """
+    values, indices = jax.device_put((rows, indices.astype(np.uint32)), device)
+    found = _run(case.loop, values, indices, seed, case.clock, names)
+    return {n: np.asarray(v) for n, v in found.items()}
 
 
 @functools.partial(jax.jit, static_argnames=("clock", "names", "seed"), compiler_options=WIDE)
@@ -108,10 +122,14 @@ class Runs:
     Batches have one size, so that one compiled program serves; the case's own run goes first. After
     a call `nominal` (K,) holds its values and `failed` the number of other runs that stopped being
     finite.
+
+    each : as `_each`, in the place of the devices of this process.
     """
 
-    def __init__(self, case, draws, names, key, batch=None, progress=None, devices=1):
-        (self.group,) = sc.groups_of([sc.ScenarioRun("", case, key, 1.0)])
+    def __init__(
+        self, case, draws, names, key, batch=None, progress=None, devices=1, each: Any = None
+    ):
+        self.group, self.each = group_of(case, key), each or self._each
         self.own = {
             name: np.asarray(get_value(case.loop, name))[None]
             for name in draws.values(np.zeros((0, draws.dimensions)))
@@ -124,40 +142,51 @@ class Runs:
         self.failed = 0
         self.devices, self.pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
 
-    def _batch(self, device, values):
-        measures, broken = sc.values_of(self.group, self.names, jax.device_put(values, device))
-        flat = np.concatenate(
-            [np.asarray(measures[m])[:, 0].reshape(len(broken), -1) for m in self.names], axis=1
-        )
-        return np.where(np.asarray(broken), np.nan, flat), np.asarray(broken)[:, 0]
+    def _each(self, starts, rows_of):
+        """Yield (start, what `run_points` gives) in order; rows_of(start): values of a batch."""
+
+        def one(device, values):
+            return run_points(self.group, self.names, jax.device_put(values, device))
+
+        width = len(self.devices)
+        for group in (starts[i : i + width] for i in range(0, len(starts), width)):
+            yield from zip(group, self.pool.map(one, self.devices, map(rows_of, group)))
 
     def __call__(self, p):
         values = {
             name: np.concatenate([self.own[name], v]) for name, v in self.draws.values(p).items()
         }
-        total, found = len(p) + 1, []
+        total, found = len(p) + 1, {}
         size = min(self.batch, total)
         starts = range(0, total, size)
-        for group in (
-            starts[i : i + len(self.devices)] for i in range(0, len(starts), len(self.devices))
-        ):
-            rows = [
-                np.minimum(np.arange(start, start + size), total - 1) for start in group
-            ]  # the last run repeated to fill the batch
-            done = self.pool.map(
-                self._batch,
-                self.devices,
-                [{name: v[r] for name, v in values.items()} for r in rows],
-            )
-            for start, (flat, diverged) in zip(group, done):
-                found.append(flat[: total - start])
-                # the case's own run, the very first, is not counted
-                self.failed += int(diverged[int(start == 0) : total - start].sum())
+
+        def rows_of(start):  # the last run repeated to fill the batch
+            index = np.minimum(np.arange(start, start + size), total - 1)
+            return {name: v[index] for name, v in values.items()}
+
+        for start, (flat, diverged) in self.each(starts, rows_of):
+            found[start] = flat[: total - start]
+            # the case's own run, the very first, is not counted
+            self.failed += int(diverged[int(start == 0) : total - start].sum())
             if self.progress is not None:
-                self.progress(min(group[-1] + size, total) - 1, len(p))
-        found = np.concatenate(found)
-        self.nominal = found[0]
-        return found[1:]
+                self.progress(min(size * len(found), total) - 1, len(p))
+        joined = np.concatenate([found[start] for start in starts])
+        self.nominal = joined[0]
+        return joined[1:]
+
+
+def group_of(case, key):
+    """Return the Group of the case's own run alone; key: of its sensor noise, None without."""
+    return sc.groups_of([sc.ScenarioRun("", case, key, 1.0)])[0]
+
+
+def run_points(group, names, values):
+    """Return ((points, entries) of the measures, NaN where not finite, (points,) True there)."""
+    measures, broken = sc.values_of(group, names, values)
+    flat = np.concatenate(
+        [np.asarray(measures[m])[:, 0].reshape(len(broken), -1) for m in names], axis=1
+    )
+    return np.where(np.asarray(broken), np.nan, flat), np.asarray(broken)[:, 0]
 
 
 def fan_of(case, values, seed):

@@ -5,16 +5,21 @@ Made by `study`; imported by whoever reads an Ensemble.
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
 from tuning.problem.result import Result
+from tuning.storage.columns import column, row_blocks
 from tuning.uncertainty.sampling import clopper_pearson
 
 TAIL = 0.05
 """Share of the draws that the conditional value at risk is the mean of [-]."""
+
+LEVELS = (0.05, 0.5, 0.95)
+"""Levels of the percentiles [-]."""
 
 QUANTITIES = ("mean", "mean_interval95", "sd", "p05", "p50", "p95", "cvar95", "max")
 
@@ -30,10 +35,11 @@ class Ensemble(Result):
         {dotted name: distribution}.
     labels : list of str
         What varies, an array's entries by their index.
-    values : dict
+    values : mapping
         {name: (N, ...)} drawn parameters.
-    measures : dict
-        {name: (N, ...)}.
+    measures : mapping
+        {name: (N, ...)}. Above 16 MiB it and `values` are in a file without a name, mapped at each
+        look-up, rather than in memory.
     failed : (N,) array
         True where the run diverged: some number is not finite.
     infeasible : (N,) array or None
@@ -55,8 +61,8 @@ class Ensemble(Result):
     case: Any
     distributions: dict
     labels: list
-    values: dict
-    measures: dict
+    values: Mapping[str, Any]
+    measures: Mapping[str, Any]
     failed: np.ndarray
     infeasible: np.ndarray | None
     limits: list
@@ -81,8 +87,7 @@ class Ensemble(Result):
             lower one for a level's minimum. mean_interval95 is cut at what the measure cannot
             pass; it and sd are None for a single draw, all are None where no run is finite.
         """
-        finite = ~self.failed
-        return {name: _statistics(name, values[finite]) for name, values in self.measures.items()}
+        return {name: _statistics(self.measures, name, ~self.failed) for name in self.measures}
 
     def violations(self) -> list[dict[str, Any]]:
         """Return how often each limit is broken; a run that diverged counts as breaking it.
@@ -94,8 +99,10 @@ class Ensemble(Result):
         """
         rows = []
         for limit in self.limits:
-            values = self.measures[limit.measure].reshape(self.samples, -1)[:, limit.index]
-            broken = int(np.sum(self.failed | (limit.margins(values) < 0)))
+            broken = sum(
+                int(np.sum(self.failed[rows] | (limit.margins(values) < 0)))
+                for rows, values in self._of(limit)
+            )
             rows.append(
                 {
                     "name": limit.label,
@@ -108,32 +115,65 @@ class Ensemble(Result):
             )
         return rows
 
+    def _of(self, limit):
+        """(rows, values of what a limit is on) of all draws, some at a time."""
+        for rows in row_blocks(self.samples):
+            block = self.measures[limit.measure][rows]
+            yield rows, block.reshape(len(block), -1)[:, limit.index]
 
-def _statistics(name, values):
-    """QUANTITIES of a measure; values: (draws, ...) of finite runs."""
-    n = len(values)
-    if not n:
+
+def _statistics(measures, name, finite):
+    """QUANTITIES of a measure over the runs that are finite, each entry on its own."""
+    count = int(np.sum(finite))
+    if not count:
         return dict.fromkeys(QUANTITIES)
-    sense = ms.MEASURES[name].sense
-    with np.errstate(invalid="ignore"):
-        worst = sense * np.sort(sense * values, axis=0)[-max(1, math.ceil(TAIL * n)) :]
-        mean = values.mean(axis=0)
-        sd = values.std(axis=0, ddof=1) if n > 1 else np.zeros(values.shape[1:])
-        p05, p50, p95 = np.quantile(values, (0.05, 0.5, 0.95), axis=0, method="inverted_cdf")
-        half = 1.959964 * sd / math.sqrt(n)
-        interval = [_within(name, values, end) for end in (mean - half, mean + half)]
-        cvar95, highest = worst.mean(axis=0), values.max(axis=0)
-    if n == 1:
-        interval = sd = None
-    return dict(zip(QUANTITIES, (mean, interval, sd, p05, p50, p95, cvar95, highest)))
+    shape = measures[name].shape[1:]
+    rows = [_of_entry(measures, name, finite, i) for i in range(math.prod(shape))]
+    found = {
+        q: [np.reshape(ends, shape)[()] for ends in np.transpose(values)]
+        if q == "mean_interval95"
+        else np.reshape(values, shape)[()]
+        for q, values in zip(QUANTITIES, zip(*rows))
+    }
+    return found | ({"mean_interval95": None, "sd": None} if count == 1 else {})
 
 
-def _within(name, values, end):
+@np.errstate(invalid="ignore")
+def _of_entry(measures, name, finite, entry):
+    """QUANTITIES of one entry of a measure, of which one column is in memory, and no copy of it."""
+    several = measures[name].ndim > 1 and measures[name].shape[1] > 1
+    total = _sum_of_rows if several else np.sum
+    values = column(measures, name, entry, finite)
+    n, sense = len(values), ms.MEASURES[name].sense
+    mean, highest, ends = total(values) / n, values.max(), (values.min(), values.max())
+    values -= mean
+    values *= values
+    sd = np.sqrt(total(values) / (n - 1)) if n > 1 else 0.0
+    half = 1.959964 * sd / math.sqrt(n)
+    interval = [_within(name, ends, end) for end in (mean - half, mean + half)]
+    column(measures, name, entry, finite, out=values)
+    values *= sense
+    values.sort()
+    worst = sense * values[-max(1, math.ceil(TAIL * n)) :]
+    values *= sense
+    percent = np.quantile(values, LEVELS, method="inverted_cdf", overwrite_input=True)
+    return mean, interval, sd, *percent, total(worst) / len(worst), highest
+
+
+def _sum_of_rows(values):
+    """Sum of one column as numpy sums the rows of an array of several: one after the other."""
+    found = values[:0].sum()
+    for rows in row_blocks(len(values)):
+        found = np.cumsum(np.append(found, values[rows]))[-1]
+    return found
+
+
+def _within(name, ends, end):
     """Return `end` of an interval of a measure, moved to what the measure cannot pass.
 
-    values: (draws, ...) that it had; one of them that did pass it moves the bound.
+    ends: least and largest value that it had; one that did pass it moves the bound.
     """
     low, high = ms.MEASURES[name].low, ms.MEASURES[name].high
     if low is not None:
-        end = np.maximum(end, np.minimum(low, values.min(axis=0)))
-    return end if high is None else np.minimum(end, np.maximum(high, values.max(axis=0)))
+        end = np.maximum(end, np.minimum(low, ends[0]))
+    return end if high is None else np.minimum(end, np.maximum(high, ends[1]))

@@ -4,10 +4,13 @@ Imported by every study of `tuning`.
 """
 
 import numpy as np
-from scipy import stats
+import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
 from tuning.uncertainty.distributions import Correlated, Uniform
+
+METHODS = ("random", "latin", "sobol")
+"""Ways to draw points."""
 
 
 def check_whole(name, value, low, high=None):
@@ -41,11 +44,9 @@ def clopper_pearson(count, samples, level=0.95):
     >>> [round(end, 4) for end in clopper_pearson(0, 100)]
     [0.0, 0.0362]
     """
-    tail = (1.0 - level) / 2
-    low = 0.0 if count == 0 else float(stats.beta.ppf(tail, count, samples - count + 1))
-    high = (
-        1.0 if count == samples else float(stats.beta.ppf(1.0 - tail, count + 1, samples - count))
-    )
+    tail, beta = (1.0 - level) / 2, scipy.special.betaincinv  # quantile of the beta distribution
+    low = 0.0 if count == 0 else float(beta(count, samples - count + 1, tail))
+    high = 1.0 if count == samples else float(beta(count + 1, samples - count, 1.0 - tail))
     return [low, high]
 
 
@@ -67,16 +68,63 @@ def probabilities(method, dimensions, samples, seed):
     >>> probabilities("sobol", 2, 5, seed=0).shape
     (5, 2)
     """
-    if method == "random":
-        return np.random.default_rng(seed).random((samples, dimensions)).clip(1e-12, 1 - 1e-12)
-    if method == "latin":
-        return stats.qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed)).random(samples)
-    if method == "sobol":
-        points = stats.qmc.Sobol(
-            dimensions, scramble=True, rng=np.random.default_rng(seed)
-        ).random_base2((samples - 1).bit_length())
-        return points[:samples].clip(1e-12, 1 - 1e-12)
-    raise InputError(f"draws = {method!r}: must be random, latin or sobol")
+    return Points(method, dimensions, samples, seed).rows(0, samples)
+
+
+class Points:
+    """The rows of `probabilities`, some at a time: the same bits without an array of all of them.
+
+    Latin hypercube points are held all at once: each depends on all others.
+
+    Parameters
+    ----------
+    method : {"random", "latin", "sobol"}
+    dimensions, samples, seed : int
+
+    Raises
+    ------
+    InputError
+        For another method.
+
+    Examples
+    --------
+    >>> points = Points("random", 2, 1000, seed=0)
+    >>> bool(np.all(points.rows(990, 993) == probabilities("random", 2, 1000, 0)[990:993]))
+    True
+    """
+
+    def __init__(self, method, dimensions, samples, seed):
+        if method not in METHODS:
+            raise InputError(f"draws = {method!r}: must be random, latin or sobol")
+        self.method, self.dimensions, self.samples, self.seed = method, dimensions, samples, seed
+        qmc = None if method == "random" else scipy.stats.qmc
+        if qmc is not None and method == "latin":
+            hypercube = qmc.LatinHypercube(dimensions, rng=np.random.default_rng(seed))
+            self.all = hypercube.random(samples)
+        elif qmc is not None:
+            self.sobol = qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed))
+
+    def rows(self, start, stop):
+        """Return (stop - start, dimensions) points: those of the draws from start to below stop."""
+        if self.method == "latin":
+            return self.all[start:stop]
+        found = self._random(start, stop) if self.method == "random" else self._sobol(start, stop)
+        return found.clip(1e-12, 1 - 1e-12)
+
+    def _random(self, start, stop):
+        generator = np.random.PCG64(self.seed)  # that of default_rng
+        generator.advance(start * self.dimensions)  # one step for each number before
+        return np.random.Generator(generator).random((stop - start, self.dimensions))
+
+    def _sobol(self, start, stop):
+        """Points of the sequence; from its beginning a power of 2 is drawn, else scipy warns."""
+        if start < self.sobol.num_generated:
+            self.sobol.reset()
+        if start > self.sobol.num_generated:
+            self.sobol.fast_forward(start - self.sobol.num_generated)
+        if start == 0:
+            return self.sobol.random_base2((stop - 1).bit_length())[:stop]
+        return self.sobol.random(stop - start)
 
 
 def spread_of(case, share=None):

@@ -15,6 +15,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.loop import run as lp
+from tuning.cluster.engine import check_alone, connect
 from tuning.problem import scenarios as sc
 from tuning.problem.result import Result
 from tuning.uncertainty import indices
@@ -22,6 +23,7 @@ from tuning.uncertainty.batches import Runs, check_devices
 from tuning.uncertainty.distributions import Correlated, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.local import Column, entries_of, local_columns
+from tuning.uncertainty.remote import points_on
 from tuning.uncertainty.sampling import check_whole, spread_of
 
 METHODS = ("local", "morris", "sobol")
@@ -98,6 +100,7 @@ def sensitivity(
     seed: int = 0,
     batch: int | None = None,
     devices: int = 1,
+    cluster: Any = None,
     progress: Callable | None = None,
 ) -> SensitivityResult:
     """Return how sensitive measures of a case are to its uncertain parameters.
@@ -127,6 +130,9 @@ def sensitivity(
         Runs at once.
     devices : int
         Of this process; each takes batches of its own, to the same bits.
+    cluster : str, distributed.Client or None
+        Run the batches of morris and sobol on a Dask cluster, to the same bits: "HOST:PORT" of its
+        scheduler, "local:N" for N workers on this machine, or a Client.
     progress : callable or None
         Called with (runs done, runs in all).
 
@@ -163,6 +169,7 @@ def sensitivity(
     samples = check_samples(samples, method, notes)
     _check_arguments(given, method, seed, batch)
     check_devices(devices)
+    check_alone(cluster, devices=devices > 1)
     random = sc.noisy(case) or any(n.startswith("sensor.noise") for n in draws.labels)
     # one key for all runs: differences are the parameters' alone
     key = jax.random.key(seed) if random else None
@@ -170,11 +177,15 @@ def sensitivity(
     half_width, runs, failed = {}, 1, 0
     if method == "local":
         columns, half_width = local_columns(case, draws, names, key, progress)
+        if cluster is not None:
+            notes.append("the local method takes one run: the cluster is not used")
     else:
         make = indices.morris_points if method == "morris" else indices.sobol_points
         points = make(draws.dimensions, samples, seed)
-        run = Runs(case, draws, names, key, batch, progress, devices)
-        columns = _columns(case, names, method, points, run, seed)
+        with connect(cluster) as engine:
+            each = engine and points_on(case, names, seed if random else None, engine)
+            run = Runs(case, draws, names, key, batch, progress, devices, each)
+            columns = _columns(case, names, method, points, run, seed)
         runs, failed = points.shape[0] * points.shape[1], run.failed
     return SensitivityResult(
         case=case,

@@ -3,6 +3,7 @@
 Imported by `tuning` and its commands.
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -15,19 +16,22 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.loop import run as lp
+from tuning.cluster.engine import check_alone, connect
 from tuning.problem.functions import as_measures, digests
 from tuning.problem.limits import resolve_limits
 from tuning.problem.scenarios import noisy
 from tuning.storage.batch_store import BatchStore
 from tuning.storage.checkpoint import checkpoint_folder
+from tuning.storage.columns import Columns, row_blocks
 from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty import manifest as shards
 from tuning.uncertainty.batches import Runner, batch_size, check_devices, fan_of, gather
 from tuning.uncertainty.distributions import stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.needs import infeasible
+from tuning.uncertainty.needs import BLOCK, infeasible
+from tuning.uncertainty.remote import RemoteRunner
 from tuning.uncertainty.result import Ensemble
-from tuning.uncertainty.sampling import check_whole, probabilities, spread_of
+from tuning.uncertainty.sampling import Points, check_whole, spread_of
 
 FAN_DRAWS = 512
 """Draws of a fan chart."""
@@ -45,6 +49,7 @@ def ensemble(
     fan: bool = True,
     batch: int | None = None,
     devices: int = 1,
+    cluster: Any = None,
     shard: tuple[int, int] | None = None,
     folder: str | Path | None = None,
     checkpoint: str | Path | None = None,
@@ -77,6 +82,9 @@ def ensemble(
         Draws run at once on a device; a size that fits the case where None.
     devices : int
         Local devices to use.
+    cluster : str, distributed.Client or None
+        Run the batches on a Dask cluster: "HOST:PORT" of its scheduler, "local:N" for N workers on
+        this machine, or a Client. A worker that is killed or added changes no number.
     shard : (int, int) or None
         (i, n): run only the i-th of n shares of the batches, into the checkpoint (`merge` joins
         them). Under `jax.distributed` every process runs its share and all get the whole.
@@ -112,36 +120,33 @@ def ensemble(
     began, folder = time.perf_counter(), checkpoint_folder(checkpoint, folder=folder)
     _check_arguments(shard, samples, key)
     check_devices(devices)
+    check_alone(cluster, devices=devices > 1, shard=shard is not None, merge=merge)
     distributions = spread_of(case) if distributions is None else stated(distributions)
     limits = as_measures(None, limits)[1]
     limited = resolve_limits(case, limits)
     names = _measure_names(case, measures, limited)
     plan = _plan(case, Draws(case.loop, distributions), names, samples, key, draws, batch)
     store = None
-    if folder is not None:
-        what = _what(case, distributions, samples, key, draws, names, plan.batch)
-        origin = shards.origin_of(case, case.limits if limits is None else limits)
-        shared = shard is not None or jax.process_count() > 1
-        store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
-    batches = _batches(plan, store, Runner(case, names, plan.seed, devices), shard, merge, progress)
-    if shard is not None:
-        return None
-    if jax.process_count() > 1:
-        batches = gather(batches, plan.count)
-    joined = {
-        name: np.concatenate([batches[k][name] for k in range(plan.count)])[:samples]
-        for name in batches[0]
-    }
-    values = plan.space.values(plan.points)
-    first = {n: v[:FAN_DRAWS] for n, v in values.items()}
+    with _runner(case, names, plan.seed, devices, cluster) as runner:
+        if folder is not None:
+            what = _what(case, distributions, samples, key, draws, names, plan.batch)
+            origin = shards.origin_of(case, case.limits if limits is None else limits)
+            shared = shard is not None or jax.process_count() > 1
+            store = BatchStore(folder, what, origin, resume=resume, shared=shared, begin=not merge)
+        if shard is not None:
+            _batches(plan, store, runner, shard, merge, progress, lambda k, batch: None)
+            return None
+        joined = _joined(plan, store, runner, merge, progress)
+    values, beyond = _drawn(case, plan, folder)
+    first = {n: np.array(v[:FAN_DRAWS]) for n, v in values.items()}
     return Ensemble(
         case=case,
         distributions=distributions,
         labels=plan.space.labels,
         values=values,
-        measures={m: joined[m] for m in names},
-        failed=joined["failed"] > 0,
-        infeasible=infeasible(case, values),
+        measures=joined[0],
+        failed=joined[1],
+        infeasible=beyond,
         limits=limited,
         fan=fan_of(case, first, plan.seed) if fan else None,
         wall_s=time.perf_counter() - began,
@@ -177,11 +182,21 @@ class _Plan(NamedTuple):
     """What the batches of an ensemble are made of."""
 
     space: Draws
-    points: np.ndarray  # (samples, dimensions) probabilities
+    points: Points  # probabilities
     seed: int | None  # of the sensor noise
     batch: int  # draws in a batch
     count: int  # of batches
     shapes: dict  # {name: shape} of what a batch holds
+
+    def rows(self, k):
+        """Return ({name: (batch, ...)} values, (batch,) numbers) of the draws of batch k.
+
+        The last draw is repeated to fill the last batch.
+        """
+        indices = np.arange(k * self.batch, (k + 1) * self.batch)
+        inside = indices[indices < self.points.samples]
+        points = self.points.rows(int(inside[0]), int(inside[-1]) + 1)
+        return self.space.values(points[np.minimum(indices - indices[0], len(points) - 1)]), indices
 
 
 def _plan(case, space, names, samples, key, draws, batch):
@@ -189,7 +204,7 @@ def _plan(case, space, names, samples, key, draws, batch):
     random = noisy(case) or any(n.startswith("sensor.noise") for n in space.labels)
     lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
     batch = batch or batch_size(case, random, samples)
-    points = probabilities(draws, space.dimensions, samples, key)
+    points = Points(draws, space.dimensions, samples, key)
     shapes = {
         m: (batch,) if ms.MEASURES[m].per == "run" else (batch, ms.entries(m, case.loop.plant))
         for m in names
@@ -200,8 +215,49 @@ def _plan(case, space, names, samples, key, draws, batch):
     )
 
 
-def _batches(plan, store, runner, shard, merge, progress):
-    """Run the batches of this shard that the store lacks; returns {number: batch} of all of it."""
+@contextlib.contextmanager
+def _runner(case, names, seed, devices, cluster):
+    """Give what runs batches: the devices of this process, or the workers of a cluster."""
+    if cluster is None:
+        yield Runner(case, names, seed, devices)
+        return
+    with connect(cluster) as engine:
+        yield RemoteRunner(case, names, seed, engine)
+
+
+def _joined(plan, store, runner, merge, progress):
+    """Run the batches that the store lacks; returns (Columns of the measures, (draws,) failed)."""
+    folder, several = None if store is None else store.folder, jax.process_count() > 1
+    samples, mine = plan.points.samples, {}
+    failed, tables = np.zeros(samples, dtype=bool), []
+
+    def put(k, batch):
+        if not tables:
+            like = {n: batch[n] for n in plan.shapes if n != "failed"}
+            tables.append(Columns(like, samples, folder))
+        tables[0].put(k * plan.batch, batch)
+        rows = slice(k * plan.batch, min((k + 1) * plan.batch, samples))
+        failed[rows] = batch["failed"][: rows.stop - rows.start] > 0
+
+    _batches(plan, store, runner, None, merge, progress, mine.__setitem__ if several else put)
+    for k, batch in gather(mine, plan.count).items() if several else ():
+        put(k, batch)
+    return tables[0], failed
+
+
+def _drawn(case, plan, folder):
+    """(Columns of the drawn values, (draws,) True where infeasible or None), blocks at a time."""
+    space, samples = plan.space, plan.points.samples
+    values, beyond = Columns(space.values(plan.points.rows(0, 1)), samples, folder), []
+    for rows in row_blocks(samples, BLOCK):
+        block = space.values(plan.points.rows(rows.start, rows.stop))
+        values.put(rows.start, block)
+        beyond.append(infeasible(case, block))
+    return values, None if beyond[0] is None else np.concatenate(beyond)
+
+
+def _batches(plan, store, runner, shard, merge, progress, put):
+    """Run the batches of this shard that the store lacks; put(number, batch) takes each of them."""
     mine = _numbers(plan.count, shard)
     missing = [k for k in mine if store is None or not store.has(k)]
     if merge and missing:
@@ -211,33 +267,16 @@ def _batches(plan, store, runner, shard, merge, progress):
             f" them number {missing[0]}"
         )
     done = len(mine) - len(missing)
-
-    def report(batches):
+    for k, batch in runner.each(missing, plan.rows):
+        if store is not None:
+            store.put(k, batch)
+        put(k, batch)
+        done += 1
         if progress is not None:
-            progress(min(len(plan.points), plan.batch * (done + batches)))
-
-    found = _run_missing(plan, store, runner, missing, report)
+            progress(min(plan.points.samples, plan.batch * done))
     if shard is None and store is not None:
-        found |= {k: store.get(k, plan.shapes) for k in mine if k not in found}
-    return found
-
-
-def _run_missing(plan, store, runner, numbers, report):
-    """Run the batches of these numbers and keep them in the store; returns {number: batch}.
-
-    report: called with the number of batches run.
-    """
-    found, width, last = {}, len(runner.devices), len(plan.points) - 1
-    for group in (numbers[i : i + width] for i in range(0, len(numbers), width)):
-        indices = [np.arange(k * plan.batch, (k + 1) * plan.batch) for k in group]
-        # the last draw repeated to fill the last batch
-        rows = [plan.space.values(plan.points[np.minimum(i, last)]) for i in indices]
-        for k, measures in zip(group, runner(rows, indices)):
-            if store is not None:
-                store.put(k, measures)
-            found[k] = measures
-        report(len(found))
-    return found
+        for k in sorted(set(mine) - set(missing)):
+            put(k, store.get(k, plan.shapes))
 
 
 def _what(case, distributions, samples, key, draws, names, batch):

@@ -9,7 +9,7 @@ import scipy.linalg
 from jaxtank.analysis.frequency import OpenLoop, is_stable
 from jaxtank.analysis.margins import margins
 
-control = pytest.importorskip("control")
+control = pytest.importorskip("control", reason="python-control is the independent answer")
 
 
 @pytest.fixture(autouse=True, scope="module")

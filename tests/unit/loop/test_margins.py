@@ -27,7 +27,7 @@ from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
 from tuning.problem.limits import Limit
 
-control = pytest.importorskip("control")
+control = pytest.importorskip("control", reason="python-control is the independent answer")
 
 AREA, DRAIN, GAIN, KC, TI, DT = 100.0, 0.5, 10.0, 2.0, 30.0, 1.0
 
@@ -250,3 +250,11 @@ def test_simulate_prints_the_margins_of_every_plateau(capsys):
     assert found["units"]["phase_margin"] == "deg"
     assert main(asked) == 0
     assert "7 V (worst)" in capsys.readouterr().out
+
+
+def test_margins_of_what_cannot_be_run_are_refused():
+    loop, clock = one_tank()
+    with pytest.raises(InputError, match="clock"):
+        jaxtank.stability_margins(loop, None)
+    with pytest.raises(InputError, match="must be a ClosedLoop"):
+        jaxtank.stability_margins(clock, loop)

@@ -362,6 +362,7 @@ def has_no_slope(measures):
         (is_not_finite, "objective is_not_finite is not a number at the starting values"),
         (has_no_slope, r"function has_no_slope: its derivative by controller.Kc\[0\]"),
         (3.0, "objective = 3.0: must be {measure: weight}, a tuning.Objective or a function"),
+        ({lambda m: 0.0: 1.0, lambda m: 1.0: 1.0}, "two functions without a name, as lambdas"),
         (tuning.Objective("ise", is_not_finite), "measure 'ise' is built in"),
         (tuning.Objective("a b", is_not_finite), "measure 'a b': a name must be a text of letters"),
     ],
@@ -379,6 +380,8 @@ def test_a_constraint_has_one_finite_limit_and_a_name_of_its_own(watertank):
             tuning.Constraint("fastest", fastest_change, **limits)
     with pytest.raises(InputError, match=r"fastest: limit nan must be a finite number \[V/s\]"):
         tuning.Constraint("fastest", fastest_change, upper=np.nan, unit="V/s")
+    with pytest.raises(InputError, match=r"fastest: limit .*True.* must be a finite number"):
+        tuning.Constraint("fastest", fastest_change, upper=np.bool_(True))
     two = [
         tuning.Constraint("same", fastest_change, upper=1.0),
         tuning.Constraint("same", root_mean_square, upper=1.0),

@@ -154,3 +154,8 @@ def test_what_is_named_free_counts_for_the_kinds_that_have_it(watertank):
     )
     pid, other = (set(row["parameters"]) for row in result.choices)
     assert pid == {"controller.Kc[0]"} and other == {"controller.Tp"}
+
+
+def test_choices_that_are_no_mapping_are_refused(watertank):
+    with pytest.raises(InputError, match=r"choices = \['controller.kind'\]: must be \{name:"):
+        tuner.tune(watertank, choices=["controller.kind"], **QUICK)

@@ -80,6 +80,7 @@ def uncertainty(args):
     found = _ensemble(
         args,
         devices=devices,
+        cluster=args.cluster,
         shard=shard,
         folder=args.out,
         resume=args.resume is not None,
@@ -189,6 +190,7 @@ def sensitivity(args):
         samples=None if args.samples is None else whole("--samples", args.samples, 1, study.MOST),
         seed=seed,
         devices=devices,
+        cluster=args.cluster,
         progress=line.runs,
     )
     line.end()

@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
-from tuning.cli.arguments import option, repeatable, uncertain
+from tuning.cli.arguments import on_cluster, option, repeatable, uncertain
 from tuning.cli.interrupts import put_back
 from tuning.cli.options import (
     choices_of,
@@ -40,7 +40,7 @@ def add(commands, parents):
     """Add the command to the parser's `commands`."""
     one = commands.add_parser(
         "tune",
-        parents=[*parents, uncertain()],
+        parents=[*parents, uncertain(), on_cluster()],
         help="tune the gains of a case under its limits",
         epilog=CODES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -159,6 +159,7 @@ def _tune(args):
             log=folder,
             resume=args.resume is not None,
             progress=progress,
+            cluster=args.cluster,
         )
         progress.line.end()
         result = _besides(args, case, result, task, sweep, progress)

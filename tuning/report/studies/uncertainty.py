@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import math
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,12 @@ from tuning.problem.wording import count
 from tuning.report import artifacts, html, tables
 from tuning.report.panel import panel
 from tuning.storage.batch_store import remove_batches
+from tuning.storage.columns import row_blocks
 from tuning.uncertainty.distributions import Correlated, Discrete, LogUniform, Normal, Uniform
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
-
+LINES = 1 << 12
+"""Draws that are written as CSV at once."""
 
 INTERVALS = (
     "intervals are those of independent draws: exact for random draws, mostly too wide for latin"
@@ -179,23 +182,26 @@ def _extent(d):
 
 
 def draws_csv(ensemble):
-    """Return every draw as CSV: number, whether it diverged, parameters, measures.
+    """Return every draw as CSV, some lines at a time: number, whether it diverged, parameters,
+    measures.
 
     Units are in the header.
     """
-    columns = [("draw", np.arange(ensemble.samples)), ("failed", ensemble.failed.astype(int))]
-    for source, unit in ((ensemble.values, None), (ensemble.measures, ms.unit)):
-        for name, values in source.items():
-            flat = np.asarray(values).reshape(ensemble.samples, -1)
+    sources = ((ensemble.values, None), (ensemble.measures, ms.unit))
+    heads = ["draw", "failed"]
+    for source, unit in sources:
+        for name in source:
             units = "" if unit is None else f" [{unit(name, ensemble.case.loop.units)}]"
-            columns += [
-                (name + (f"[{i}]" if flat.shape[1] > 1 else "") + units, flat[:, i])
-                for i in range(flat.shape[1])
-            ]
-    out = io.StringIO()
-    out.write(",".join(f'"{head}"' for head, _ in columns) + "\n")
-    np.savetxt(out, np.column_stack([v for _, v in columns]), delimiter=",", fmt="%.10g")
-    return out.getvalue()
+            entries = math.prod(source[name].shape[1:])
+            heads += [name + (f"[{i}]" if entries > 1 else "") + units for i in range(entries)]
+    yield ",".join(f'"{head}"' for head in heads) + "\n"
+    for rows in row_blocks(ensemble.samples, LINES):
+        columns = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
+        for source, _ in sources:
+            columns += [source[name][rows].reshape(len(columns[0]), -1) for name in source]
+        out = io.StringIO()
+        np.savetxt(out, np.column_stack(columns), delimiter=",", fmt="%.10g")
+        yield out.getvalue()
 
 
 def figures(ensemble):

@@ -1,0 +1,126 @@
+"""Dask workers of this machine: two beside one, and drills in which processes are killed.
+
+    python tests/benchmarks/cluster.py [--rounds 3] [--samples 16384] [--kills 3]
+
+Time: an ensemble of gouta2015/backstepping (12,001 samples) in batches of 256 on one and on two
+workers, in turn, each with its program compiled before; wall time, core time of workers and of this
+process, and the load of the machine, without which a ratio of wall times means nothing.
+
+Drills: SIGKILL of one of two workers, of the scheduler (then --resume on another cluster), and of
+the command itself (then --resume), each at a random moment; draws.csv must have the bytes of one
+process.
+"""
+
+import argparse
+import contextlib
+import os
+import random
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import distributed
+import jax
+
+import tuning
+from jaxtank import presets, rig
+from tuning.cluster.local import local_workers
+
+COMMAND = ["uncertainty", "gouta2015/backstepping", "--set", "clock.dt=0.1", "--set"]
+COMMAND += ["sensor.noise=0.02", "--samples", "4096", "--quiet", "--json"]
+KINDS = ("worker", "scheduler", "command")
+
+
+@contextlib.contextmanager
+def cluster(count):
+    """A client of so many workers."""
+    with local_workers(count) as (address, _), distributed.Client(address) as client:
+        client.wait_for_workers(count, timeout=120)
+        yield client
+
+
+def times(case, samples, rounds):
+    """Print wall and core times on one and on two workers."""
+    options = {"measures": ["rms_error_total", "max_level"], "fan": False}
+    with cluster(1) as one, cluster(2) as two:
+        spent = {one: [], two: []}
+        for client in spent:  # every worker compiles, or has nothing to do at first
+            for _ in range(2):
+                tuning.ensemble(case, samples=2048, cluster=client, **options)
+        for _ in range(rounds):
+            for client, rows in spent.items():
+                before = sum(client.run(time.process_time).values())
+                began, mine = time.perf_counter(), time.process_time()
+                tuning.ensemble(case, samples=samples, cluster=client, **options)
+                wall, mine = time.perf_counter() - began, time.process_time() - mine
+                rows.append((wall, sum(client.run(time.process_time).values()) - before, mine))
+        for words, rows in zip(("one worker", "two workers"), spent.values()):
+            wall, theirs, mine = (statistics.median(column) for column in zip(*rows))
+            print(
+                f"{words}: {wall:.2f} s, core time {theirs:.2f} s of the workers,"
+                f" {1e3 * mine / (samples / 256):.1f} ms a batch of this process",
+                flush=True,
+            )
+        ratios = [a[0] / b[0] for a, b in zip(spent[one], spent[two])]
+        print(
+            f"two workers {statistics.median(ratios):.2f} x one ({min(ratios):.2f} to"
+            f" {max(ratios):.2f}); load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+        )
+
+
+def drill(kind, folder, whole, chance):
+    """Kill a process of a run at a random moment; returns whether draws.csv has the same bytes."""
+    with cluster(2) as client:
+        words = [sys.executable, "-m", "jaxtank", *COMMAND, "--cluster", client.scheduler.address]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        begun = subprocess.Popen([*words, "--out", folder], **quiet)
+        most = chance.randint(1, 12)  # of 16 batches
+        while begun.poll() is None and len(list(Path(folder).glob("part-*.npz"))) < most:
+            time.sleep(0.005)
+        pid = begun.pid
+        if kind == "scheduler":
+            pid = client.run_on_scheduler(os.getpid)
+        elif kind == "worker":
+            pid = chance.choice(list(client.run(os.getpid).values()))
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        error = begun.communicate()[1].decode().strip()
+        print(f"  {kind} killed after {most} batches: exit code {begun.returncode} {error}")
+    if begun.returncode:
+        with cluster(1) as client:
+            words = [sys.executable, "-m", "jaxtank", *COMMAND]
+            words += ["--cluster", client.scheduler.address, "--resume", folder]
+            subprocess.run(words, stdout=subprocess.DEVNULL, check=True)
+    return Path(folder, "draws.csv").read_bytes() == whole
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--samples", type=int, default=16_384)
+    parser.add_argument("--kills", type=int, default=3)
+    asked = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if asked.rounds:
+        case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1})
+        times(case, asked.samples, asked.rounds)
+    chance, survived = random.Random(0), 0
+    with tempfile.TemporaryDirectory() as top:
+        if asked.kills:
+            alone = [sys.executable, "-m", "jaxtank", *COMMAND, "--out", f"{top}/alone"]
+            subprocess.run(alone, stdout=subprocess.DEVNULL, check=True)
+            whole = Path(top, "alone", "draws.csv").read_bytes()
+            for i in range(asked.kills):
+                survived += drill(KINDS[i % len(KINDS)], f"{top}/{i}", whole, chance)
+            print(f"{survived} of {asked.kills} kills: the bytes of one process")
+    sys.exit(survived < asked.kills)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""The last step of the default answer: gains whose loop is fragile are moved back."""
+
+import numpy as np
+import pytest
+
+from jaxtank import presets, rig
+from tuning.answer import robustness
+from tuning.answer.setting import setting_of
+from tuning.answer.stay_put import LINE, Found
+from tuning.problem.problem import Problem
+from tuning.search.driver import Search
+
+
+@pytest.fixture(scope="module")
+def answered():
+    """(setting, problem, search) of the public two-tank rig on its nominal plant, two plateaus."""
+    case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 800.0})
+    setting = setting_of(case)
+    problem = Problem(setting.searched, None, setting.objective, {}, None, 0)
+    reference = problem.point(problem.start())
+    search = Search(problem, reference, lambda search: None, 1e-4)
+    search.take(reference)
+    return setting, problem, search
+
+
+def found_at(problem, search, Kc):
+    """The outcome of a search that ended at a gain Kc."""
+    low, high = problem.case.free["controller.Kc"][:2]
+    z = np.array([np.log(Kc / low) / np.log(high / low), problem.start()[1]])
+    search.take(search.point(z))
+    return Found(search=search, z=z, kept=np.array([False, True]))
+
+
+def peak(setting, problem, z):
+    case = setting.tuned(problem.values(z))
+    found = robustness.margin_measures(case.loop, case.clock)
+    return float(found["sensitivity_peak"])
+
+
+def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answered, monkeypatch):
+    setting, problem, search = answered
+    first = problem.start()
+    found = found_at(problem, search, 1.6)
+    before = found.z
+    monkeypatch.setattr(robustness, "PRICE", 1.0)
+    allowed = 1.1 * peak(setting, problem, first)
+    assert peak(setting, problem, before) > allowed > 2.0
+    robustness.move_back(setting, problem, found)
+    assert peak(setting, problem, found.z) <= allowed
+    assert peak(setting, problem, found.z - (first - before) / LINE) > allowed
+    assert found.kept.tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("Kc", "price"), [(1.04, 0.05), (1.25, 0.0)])
+def test_an_answer_stays_that_is_robust_enough_or_for_which_it_costs_too_much(
+    answered, monkeypatch, Kc, price
+):
+    setting, problem, search = answered
+    found = found_at(problem, search, Kc)
+    before = found.z
+    monkeypatch.setattr(robustness, "PRICE", price)
+    robustness.move_back(setting, problem, found)
+    assert found.z is before

@@ -1,0 +1,100 @@
+"""Local searches on workers: what they evaluate is entered into the evaluation cache of a problem.
+
+The search itself then runs as without a cluster, and finds its evaluations in the cache: the answer
+is the same to the bit. Imported by `tuning.search` and `tuning.answer`.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from tuning.cluster.engine import Engine
+from tuning.cluster.problems import received_problem, sent_problem
+from tuning.problem.problem import Problem
+from tuning.storage.evaluation_log import EvaluationCache
+from tuning.storage.fingerprint import digest
+
+
+def evaluate_ahead(
+    engine: Engine | None,
+    problem: Problem,
+    searches: Sequence[tuple],
+    run: Callable[..., Any],
+    waiting: Callable[[], Any],
+) -> None:
+    """Make searches on the workers, and enter what they evaluate into the cache of the problem.
+
+    What the cache holds already, of a run that is continued, is not evaluated again.
+
+    engine : None for nothing. searches : arguments of `run` after the problem, of each search.
+    run : makes a search of a problem. waiting : as in `Engine.run`.
+    """
+    if engine is None:
+        return
+    given = []
+    for number, arguments in enumerate(searches):
+        known = _Known(problem.cache)
+        try:
+            run(with_cache(problem, known), *arguments)
+        except _Missing:
+            given.append((number, (arguments, list(known.used.values()))))
+    if not given:
+        return
+    text, arrays = sent_problem(problem)
+    tasks = ((number, (text, arrays, *more)) for number, more in given)
+    for _, entries in engine.run("search", tasks, waiting):
+        for entry in entries:
+            problem.cache.enter(*entry)
+
+
+def recorded(
+    text: tuple, arrays: list, run: Callable[..., Any], arguments: tuple, known: list
+) -> list:
+    """Return the new evaluations of a search of the problem of `sent_problem`, on a worker.
+
+    known : [(kind, key, result)] evaluations that were made before, as those that are returned.
+    """
+    cache = _Recorded()
+    for entry in known:
+        cache.enter(*entry)
+    cache.entries.clear()
+    run(with_cache(received_problem(text, arrays), cache), *arguments)
+    return cache.entries
+
+
+def with_cache(problem: Problem, cache: EvaluationCache) -> Problem:
+    """Return a problem with another cache and counts of its own."""
+    found = copy.copy(problem)
+    found.cache = cache
+    return found
+
+
+class _Missing(Exception):
+    """An evaluation is not in the cache."""
+
+
+class _Known(EvaluationCache):
+    """The evaluations of another cache; `used` are those that were asked for."""
+
+    def __init__(self, cache: EvaluationCache):
+        super().__init__()
+        self.found, self.used = cache.found, {}
+
+    def recall(self, kind: str, arguments: Any, compute: Callable[[], Any]) -> Any:
+        key = digest(kind, *arguments)
+        if key not in self.found:
+            raise _Missing
+        self.used[key] = kind, key, self.found[key]
+        return self.found[key]
+
+
+class _Recorded(EvaluationCache):
+    """A cache that lists what is entered."""
+
+    def __init__(self):
+        super().__init__()
+        self.entries: list[tuple] = []
+
+    def keep(self, kind: str, key: str, result: Any) -> Any:
+        self.entries.append((kind, key, result))
+        return result

@@ -1,0 +1,73 @@
+"""A case as text, and the case that a worker makes of it: the same loop, to the bit, or an error.
+
+Imported by the tasks of `uncertainty` and `search`.
+"""
+
+import functools
+import json
+from collections.abc import Sequence
+
+from jaxtank import measures as ms
+from jaxtank import rig
+from jaxtank.case import Case
+from jaxtank.core.errors import InputError
+from tuning.storage.fingerprint import fingerprint
+
+
+def sent(case: Case, names: Sequence[str] = ()) -> str:
+    """Return a case as JSON: its rig file, and the fingerprint of its loop, clock and versions.
+
+    names : measures that the workers are to compute.
+
+    Raises InputError where no rig file describes the case, or a measure is a function of one's own:
+    neither is sent as code. What a package names in its entry points `jaxtank.components`, the
+    workers find, too.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> case = presets.find("cascaded/pi")
+    >>> received(sent(case)).name
+    'cascaded/pi'
+    """
+    if own := ms.functions(names):
+        raise InputError(
+            f"cluster: {next(iter(own))} is a function of your own, and workers are sent no code:"
+            " leave out the cluster, or use measures of the package"
+        )
+    try:
+        text = rig.dump(case)
+    except InputError as error:
+        raise InputError(
+            f"cluster: workers get a case as its rig file, and there is none for {case.name}"
+            f" ({error}); a class of a package that the workers have can be named there, by an"
+            " entry point jaxtank.components"
+        ) from None
+    return json.dumps({"rig": text, "fingerprint": fingerprint(case)})
+
+
+@functools.lru_cache(maxsize=8)
+def received(text: str) -> Case:
+    """Return the case of `sent`, made anew; the same object for the same text.
+
+    Raises InputError, naming what differs, where the loop made here is another one, where versions
+    of jaxtank or jax differ, and where jax had started without the options of jaxtank.
+    """
+    found = json.loads(text)
+    case = rig.loads(found["rig"], "rig file sent to this worker")
+    mine, theirs = fingerprint(case), found["fingerprint"]
+    differs = [name for name in theirs if mine.get(name) != theirs[name]]
+    if "xla_option" in differs:
+        raise InputError(
+            "cluster: jax had started on this worker before jaxtank, without its compiler options:"
+            " start workers with --preload jaxtank, or XLA_FLAGS set as where this was begun"
+        )
+    if differs:
+        names = ", ".join(f"{n} ({_short(mine.get(n))}, not {_short(theirs[n])})" for n in differs)
+        raise InputError(f"cluster: a worker differs from where this was begun: {names}")
+    return case
+
+
+def _short(value):
+    text = str(value)
+    return text if len(text) <= 20 else text[:12] + "..."

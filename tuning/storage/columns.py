@@ -1,0 +1,157 @@
+"""Arrays with a row for each draw, filled some rows at a time; large ones in a file, not in memory.
+
+Imported by `uncertainty`.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxtank.core.errors import InputError
+from tuning.storage.checkpoint import Folder
+
+IN_MEMORY = 1 << 24
+"""Bytes of all arrays up to which they are held in memory."""
+
+ROWS = 1 << 14
+"""Rows that are read at once."""
+
+Array = NDArray[Any]
+
+
+class Columns(Mapping[str, Array]):
+    """{name: (rows, ...) array}, filled some rows at a time.
+
+    Above IN_MEMORY bytes the arrays are in a file without a name, which ends with this object; each
+    look-up then maps the array anew, to be read, so that nothing stays in memory that is not held.
+    Pickled as a dict of arrays.
+
+    Parameters
+    ----------
+    like : {name: (any number, ...) array}
+        Whose entries have the shape and the type of each row.
+    rows : int
+    folder : path or None
+        Where the file is made; the folder of temporary files where None.
+
+    Raises
+    ------
+    InputError
+        Where the disk is full.
+
+    Examples
+    --------
+    >>> table = Columns({"level": np.zeros((1, 2))}, rows=3)
+    >>> table.put(1, {"level": np.array([[4.0, 5.0]])})
+    >>> table["level"].tolist()
+    [[0.0, 0.0], [4.0, 5.0], [0.0, 0.0]]
+    """
+
+    def __init__(self, like: Mapping[str, Array], rows: int, folder: Folder | None = None):
+        self.rows = rows
+        self.places: dict[str, tuple[int, Array]] = {}
+        end = 0
+        for name, one in like.items():
+            empty = np.zeros((0, *one.shape[1:]), one.dtype)
+            self.places[name] = end, empty
+            end += rows * _row_bytes(empty)
+        self.folder, self.size = folder, end
+        self.arrays: dict[str, Array] | None = None
+        self.file: Any = None
+        if end <= IN_MEMORY:
+            self.arrays = {
+                n: np.zeros((rows, *one.shape[1:]), one.dtype)
+                for n, (_, one) in self.places.items()
+            }
+        else:
+            self._open()
+
+    def _open(self) -> None:
+        """Make the file, all of it, so that a full disk is known at once."""
+        try:
+            self.file = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115  ends with this
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(self.file.fileno(), 0, self.size)
+            else:
+                self.file.truncate(self.size)
+        except OSError as error:
+            raise self._no_space(error) from None
+
+    def _no_space(self, error: OSError) -> InputError:
+        where = tempfile.gettempdir() if self.folder is None else str(self.folder)
+        other = ", or set TMPDIR to another folder" if self.folder is None else ""
+        return InputError(
+            f"{where!r} cannot hold {self.rows} draws, {self.size >> 20} MiB ({error.strerror}):"
+            f" free disk space{other}"
+        )
+
+    def put(self, start: int, block: Mapping[str, Array]) -> None:
+        """Set the rows from `start` on to those of `block`; rows beyond the last are dropped."""
+        for name, (place, empty) in self.places.items():
+            new = np.asarray(block[name], dtype=empty.dtype)[: self.rows - start]
+            if self.arrays is not None:
+                self.arrays[name][start : start + len(new)] = new
+                continue
+            try:
+                self.file.seek(place + start * _row_bytes(empty))
+                self.file.write(np.ascontiguousarray(new).tobytes())
+                self.file.flush()
+            except OSError as error:
+                raise self._no_space(error) from None
+
+    def __getitem__(self, name: str) -> Array:
+        place, empty = self.places[name]
+        if self.arrays is not None:
+            return self.arrays[name]
+        shape = (self.rows, *empty.shape[1:])
+        return np.memmap(self.file, empty.dtype, mode="r", offset=place, shape=shape)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, ({name: np.array(self[name]) for name in self},)
+
+
+def row_blocks(rows: int, size: int | None = None) -> Iterator[slice]:
+    """Return slices that cover so many rows, `size` at a time, ROWS where None.
+
+    Examples
+    --------
+    >>> list(row_blocks(5, 3))
+    [slice(0, 3, None), slice(3, 5, None)]
+    """
+    size = ROWS if size is None else size
+    return (slice(i, min(i + size, rows)) for i in range(0, rows, size))
+
+
+def column(
+    table: Mapping[str, Array], name: str, entry: int, kept: Array, out: Array | None = None
+) -> Array:
+    """Return one entry of an array over the rows where `kept` (rows,) is True, in `out` if given.
+
+    Examples
+    --------
+    >>> column({"a": np.array([[1.0, 2.0], [3.0, 4.0]])}, "a", 1, np.array([False, True])).tolist()
+    [4.0]
+    """
+    found = np.empty(int(np.sum(kept)), table[name].dtype) if out is None else out
+    end = 0
+    for rows in row_blocks(len(kept)):
+        block = table[name][rows]  # looked up anew: what was read before need not stay in memory
+        mine = block.reshape(len(block), -1)[kept[rows], entry]
+        found[end : end + len(mine)] = mine
+        end += len(mine)
+    return found
+
+
+def _row_bytes(empty: Array) -> int:
+    """Return the bytes of a row of an array."""
+    return int(np.prod(empty.shape[1:], dtype=int)) * empty.dtype.itemsize
