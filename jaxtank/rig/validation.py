@@ -176,15 +176,14 @@ def check_limits(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
             raise InputError(
                 f"limit {measure} = {shortened(value)}: must be a finite number [{unit}]{many}{rim}"
             )
-        low, high = MEASURES[measure].low, MEASURES[measure].high
-        if (low is not None and np.min(value) < low) or (high is not None and np.max(value) > high):
-            of = "" if unit == "-" else f" {unit}"
-            least = "" if low is None else f"at least {low:g}"
-            most = "" if high is None else f"at most {high:g}"
-            raise InputError(
-                f"limit {measure} = {shortened(value)}{of}: must be"
-                f" {' and '.join(filter(None, (least, most)))}{of}; no run has a value beyond"
-            )
+        of = "" if unit == "-" else f" {unit}"
+        for sign, words in ((1.0, "least"), (-1.0, "most")):
+            end = MEASURES[measure].low if sign > 0 else MEASURES[measure].high
+            if end is not None and np.any(sign * np.asarray(value) < sign * end):
+                raise InputError(
+                    f"limit {measure} = {shortened(value)}{of}: must be at {words} {end:g}{of}; no"
+                    " run has a value beyond"
+                )
     return dict(limits)
 
 

@@ -13,6 +13,7 @@ process.
 
 import argparse
 import contextlib
+import logging
 import os
 import random
 import signal
@@ -107,6 +108,7 @@ def main():
     parser.add_argument("--kills", type=int, default=3)
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # killed on purpose
     if asked.rounds:
         case = rig.set_values(presets.find("gouta2015/backstepping"), {"clock.dt": 0.1})
         times(case, asked.samples, asked.rounds)

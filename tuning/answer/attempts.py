@@ -17,6 +17,7 @@ from tuning.answer.setting import NEAR, PLANTS, Setting
 from tuning.answer.stay_put import Found, search_from
 from tuning.problem.problem import Problem
 from tuning.problem.scenarios import groups_of, with_noise_drawn
+from tuning.search.driver import event_of
 
 ATTEMPTS = 4
 """Answers that are judged, at most: with a filter, at the true step, with tighter limits."""
@@ -41,6 +42,8 @@ class Task:
         self.free, self.plan, self.samples, self.engine = free, plan, samples, engine
         self.progress, self.may_filter = progress, True
         self.cache: Any = None
+        self.stage = ""
+        self.last: dict[str, Any] | None = None
 
     def problem(self, setting: Setting, case: Case, checks: Checks | None) -> Problem:
         """Return the problem of the search on the plants of a case, and on those of `checks`."""
@@ -58,28 +61,21 @@ class Task:
             found.cache, self.cache = self.cache, None
         return found
 
-    def report(self, problem, unit):
+    def report(self, unit):
         """Return what a Search calls after every evaluation; unit : of the cost, None: unknown."""
 
         def report(search):
-            if self.progress is None or not search.history:
-                return
-            best, last = search.best, search.history[-1]
-            self.progress(
-                {
-                    "unit": unit,
-                    "start": search.start,
-                    "starts": self.plan["starts"],
-                    "evaluations": len(search.history),
-                    "cost": last[1],
-                    "violation": last[2],
-                    "best": None if best is None else best.cost,
-                    "best_violation": None if best is None else search.violation(best),
-                    "values": None if best is None else problem.values(best.z),
-                }
-            )
+            if self.progress is not None and search.history:
+                self.last = event_of(search, self.plan["starts"], unit=unit, stage=self.stage)
+                self.progress(self.last)
 
         return report
+
+    def enter(self, stage):
+        """Report what is done next, where no evaluation reports it; not before the first one."""
+        self.stage = stage
+        if self.progress is not None and self.last is not None:
+            self.progress(self.last | {"stage": stage})
 
 
 @dataclasses.dataclass
@@ -113,11 +109,13 @@ def attempts(task: Task, setting: Setting, near: np.ndarray) -> Outcome:
         case = setting.coarse() if coarse else setting.searched
         made = Outcome(setting, attempt=attempt)
         try:
+            task.stage = _words_of(setting, case)
             checks = _search(task, made, case, limits, least)
             if made.found.point is None:
                 return dataclasses.replace(made, attempt=0)
             move_back(setting, made.problem, made.found)
             tuned = _at(setting, values_of(made.problem, made.found))
+            task.enter(f"judging the answer on {task.samples} validation plants")
             made.after = judge(tuned, task.samples, task.plan["seed"], round_=attempt)
         except KeyboardInterrupt:
             found = made.found if last is None else last.found
@@ -152,7 +150,7 @@ def _search(task, made, case, limits, least):
             checks and stays
         ):  # a start that holds the limits as they are may stay where they are tighter
             found.slack = checks.slack(problem)
-        report = task.report(problem, setting.cost_unit)
+        report = task.report(setting.cost_unit)
         search_from(problem, task.plan, report, found, task.engine)
 
     if not limits:
@@ -172,6 +170,12 @@ def _search(task, made, case, limits, least):
         if checks.hold() or found.kept.all():
             break
     return checks
+
+
+def _words_of(setting, case):
+    """What a search is, in words."""
+    guard = " with a safety filter" if setting.filter is not None else ""
+    return f"search on {PLANTS} plants{guard}, step {case.clock.dt:g} s"
 
 
 def _holds(found):

@@ -99,7 +99,7 @@ def shared():
         run,
         "--out",
         "DIR",
-        "folder for result.json, CSV, pictures and the rig (attack: worst.toml)",
+        "folder for result.json, report.html, CSV, pictures and the rig (attack: worst.toml)",
     )
     return Shared(common, case, run)
 

@@ -28,4 +28,7 @@ def parser():
     commands, parents = top.add_subparsers(dest="command", metavar="COMMAND"), shared()
     for module in (case, explore, tuning, studies, falsification, identification, tools):
         module.add(commands, parents)
+    for one in commands._choices_actions:  # what the list of commands says, where nothing else is
+        own, text = commands.choices[one.dest], one.help or one.dest
+        own.description = own.description or f"{text[0].upper()}{text[1:]}."
     return top

@@ -19,8 +19,9 @@ from tuning.cluster.task import call
 CONNECT = 8.0
 """Time within which a scheduler must answer [s]."""
 
-AHEAD = 2
-"""Tasks that wait for each thread of the workers, so that none is idle."""
+AHEAD, LEAST = 2, 64
+"""Tasks that wait for each thread of the workers, so that none is idle; and tasks sent at least, so
+that a cluster that grows with its work does."""
 
 LOOK = 0.5
 """Time between two looks at the connection and at the number of threads [s]."""
@@ -70,7 +71,7 @@ class Engine:
         try:
             while True:
                 self._look(waiting)
-                while len(pending) < max(1, (1 + AHEAD) * self.threads):
+                while len(pending) < max(LEAST, (1 + AHEAD) * self.threads):
                     number, arguments = next(given, (None, None))
                     if arguments is None:
                         break

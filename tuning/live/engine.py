@@ -4,6 +4,7 @@ The text needs no page: node runs it too. Imported by the page.
 """
 
 import json
+import re
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -55,15 +56,17 @@ def engine(case: Case, filtered: Case | None = None) -> str:
         cases = [one for one in (case, filtered) if one is not None]
         loops = [whole_loop(one) for one in cases]
         facts = _facts(case, loops)
-        programs = ",\n".join(_program(loop, _tangents(loop.case)) for loop in loops)
+        shared: dict[str, str] = {}
+        own = ",\n".join(_program(loop, _tangents(loop.case), shared) for loop in loops)
+        programs = _with_functions(own, shared)
     driver = resources.files("tuning.live").joinpath("engine.js").read_text(encoding="utf-8")
     return "\n".join(
         [
             "const makeEngine=(()=>{",
             '"use strict";',
             f"const info={data(_packed(facts))};",
-            f"const programs=[{programs}];",
-            driver,
+            f"const programs={programs};",
+            bare(driver),
             "return makeEngine;",
             "})();",
         ]
@@ -92,6 +95,18 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
         groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(own)
     packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
     return {**facts, "leaves": packed}
+
+
+def bare(script: str) -> str:
+    """Return a script of ours without comments in blocks, indentation and empty lines.
+
+    Examples
+    --------
+    >>> bare("/* a\\nb */\\nif (x) {\\n  y = 1;\\n}")
+    'if (x) {\\ny = 1;\\n}'
+    """
+    lines = (line.strip() for line in re.sub(r"/\*.*?\*/", "", script, flags=re.S).splitlines())
+    return "\n".join(filter(None, lines))
 
 
 def data(value: Any) -> str:
@@ -127,23 +142,33 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     return (("mean_square_error", 1.0),) if ROOT in objective or not own else own
 
 
-def _program(loop: WholeLoop, tangents: TangentLoop) -> str:
-    """One loop as an object of its functions."""
+def _program(loop: WholeLoop, tangents: TangentLoop, shared: dict[str, str]) -> str:
+    """One loop as an object of its functions; functions on arrays are added to `shared`."""
     columns = [[f, len(found)] for f, found in loop.saved.items()]
     main, slopes = Printed(loop), PrintedTangents(tangents)
     along = [_name(*leaf) for leaf in tangents.leaves]
-    own = f"{_block(slopes, 'lead,signals,read,aim,push,slope', f'along:{data(along)}')}"
-    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}")
+    own = _block(slopes, "lead,signals,read,aim,push,slope", f"along:{data(along)}", shared)
+    return _block(main, "lead,signals,run,read", f"columns:{data(columns)},tangents:{own}", shared)
 
 
-def _block(printed: Printed, functions: str, facts: str) -> str:
-    """Functions in a scope of their own."""
-    body = "\n".join([*printed.helpers(), printed.text()])
-    body = "\n".join([*called(body), body])
+def _block(printed: Printed, functions: str, facts: str, shared: dict[str, str]) -> str:
+    """Functions in a scope of their own; shared: {text of a function on arrays: its name}."""
+    own = [
+        f"{name}={shared.setdefault(text, f'g{len(shared)}')}"
+        for name, text in printed.helpers().items()
+    ]
+    body = "\n".join([*([f"const {','.join(own)};"] if own else []), printed.text()])
     measures = data([[m, _size(m, found)] for m, found in printed.loop.measures.items()])
     leaves = data([_name(*leaf) for leaf in printed.loop.leaves])
     facts = f"streams:{len(printed.streams())},measures:{measures},leaves:{leaves},{facts}"
-    return f"(()=>{{{maths(body)}\n{body}\nreturn{{{functions},{facts}}};}})()"
+    return f"(()=>{{{body}\nreturn{{{functions},{facts}}};}})()"
+
+
+def _with_functions(programs: str, shared: dict[str, str]) -> str:
+    """An array of programs, with the functions that they call."""
+    own = "\n".join(f"const {name}={text};" for text, name in shared.items())
+    above = "\n".join([*map(bare, called(f"{own}\n{programs}")), own])
+    return f"(()=>{{{maths(f'{above} {programs}')}\n{above}\nreturn[{programs}];}})()"
 
 
 def _name(name, index):

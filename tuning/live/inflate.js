@@ -1,4 +1,4 @@
-// DEFLATE (RFC 1951) of base64 text, so that what is packed in the page is there when it opens.
+// DEFLATE (RFC 1951) of text in base 85, so that what is packed in the page is there when it opens.
 
 // codes of a Huffman tree from the lengths of its symbols: counts by length, symbols in order
 function huffman(lengths) {
@@ -23,8 +23,22 @@ function ranges(count, first, step) {
   return { base, extra };
 }
 
-function inflate(base64) {
-  const source = Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+const DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%,()*+-;.=:?@^_[{|}~";
+
+// four bytes of five digits, those of page.py
+function bytesOf(text) {
+  const value = new Uint8Array(128).fill(84), out = new Uint8Array(Math.floor((4 * text.length) / 5));
+  for (let i = 0; i < 85; i += 1) value[DIGITS.charCodeAt(i)] = i;
+  for (let i = 0, o = 0; i < text.length; i += 5, o += 4) {
+    let four = 0;
+    for (let j = 0; j < 5; j += 1) four = 85 * four + (i + j < text.length ? value[text.charCodeAt(i + j)] : 84);
+    for (let k = 3; k >= 0; k -= 1, four = Math.floor(four / 256)) out[o + k] = four % 256;
+  }
+  return out;
+}
+
+function inflate(text) {
+  const source = bytesOf(text);
   const lengths = ranges(29, 3, 4), distances = ranges(30, 1, 2);
   lengths.base[28] = 258;
   lengths.extra[28] = 0;

@@ -50,30 +50,78 @@ function effective() {
 
 const options = () => ({ seed: state.seed, filter: state.filter === true });
 
+// engine.run, as this page prints its measures
+function runOf({ values, options: own }) {
+  const found = engine.run(values, own);
+  if (!own.filter) delete found.measures.filter_active_fraction;
+  return found;
+}
+
+const request = (values, every) => ({ values, options: { ...options(), every } });
+
+const impossible = (text) => say(`This run is not possible: ${text}`);
+
+// a run at once, on this thread: for files, scripts and pins; null where there is none
 function run(values = effective(), every = data.drawn) {
   try {
-    const found = engine.run(values, { ...options(), every });
-    if (!state.filter) delete found.measures.filter_active_fraction;
-    return found;
+    return runOf(request(values, every));
   } catch (error) {
-    say(`This run is not possible: ${error.message}`);
+    impossible(error.message);
     return null;
   }
 }
 
-// --- one run per frame ------------------------------------------------------------------------
+// --- runs while sliders move --------------------------------------------------------------------
 
-let asked = false, resting = 0;
+const SLOW = 1000; // a run that takes longer waits for the button [ms]
+let asked = false, resting = 0, due = false, slow = false, done = 0;
 
-function touch() {
-  if (asked) return;
-  asked = true;
-  requestAnimationFrame(() => {
-    asked = false;
+const runner = makeRunner(newWorker, runOf, {
+  done(found, { options: own }, milliseconds) {
+    if (!own.filter) delete found.measures.filter_active_fraction;
+    current = found;
+    due = runner.busy;
+    slow = (done += 1) > 1 && milliseconds > SLOW; // the first is compiled while it runs
+    $("run").textContent = `Run (${shown(milliseconds / 1000, 2)} s)`;
+    mark();
+    if (done === 1 && milliseconds > SLOW) touch();
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame(() => {
+      asked = false;
+      show();
+      rest();
+    });
+  },
+  failed(text) {
+    due = runner.busy;
+    mark();
+    impossible(text);
+    rest();
+  },
+});
+
+// whether the picture is that of the sliders, and the button that makes it so
+function mark() {
+  $("run").hidden = !slow;
+  $("run").disabled = runner.busy;
+  $("slow-note").hidden = !slow;
+  $("panels").classList.toggle("stale", slow && due);
+}
+
+function touch(every = data.drawn, pressed = false) {
+  due = true;
+  if (!slow || pressed) runner.ask(request(effective(), every));
+  mark();
+}
+
+// the run of the sliders as they are; where a run takes long, the one that is shown
+function present() {
+  if (due && !slow) {
     current = run() ?? current;
     show();
-    rest();
-  });
+  }
+  return current;
 }
 
 function rest() {
@@ -83,11 +131,9 @@ function rest() {
 
 // once nothing moves: every sample of a part, the address, words for a screen reader, the plants
 function settle() {
+  if (runner.busy) return;
   const rows = ((view.to - view.from) / info.dt) / data.drawn;
-  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples) {
-    current = run(effective(), 1) ?? current;
-    show();
-  }
+  if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
   if (!framed) history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
   describe();
   if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants();
@@ -371,7 +417,7 @@ function refresh() {
 // --- buttons ----------------------------------------------------------------------------------
 
 function pin(name) {
-  if (!current) return;
+  if (!present()) return;
   const old = pins.findIndex((other) => other.name === name);
   if (old >= 0) pins.splice(old, 1);
   if (pins.length === PINS) pins.shift();
@@ -451,6 +497,7 @@ function tuneNow() {
     },
     tuned(found) {
       apply(found);
+      touch(data.drawn, true);
       say(`Tuned in ${found.iterations} iterations (${found.status}): ${words(found)}`);
       finish.resolve({ values: found.values, objective: found.objective, violation: found.violation });
     },
@@ -626,6 +673,7 @@ function listen() {
   let number = 0;
   $("pin").addEventListener("click", () => pin(`run ${(number += 1)}`));
   $("reset").addEventListener("click", reset);
+  $("run").addEventListener("click", () => touch(data.drawn, true));
   $("tune").addEventListener("click", () => (worker && $("tune").textContent === "Stop" ? tuneNow.stop() : tuneNow().catch(() => {})));
   $("plants").addEventListener("click", () => {
     const on = $("plants").getAttribute("aria-pressed") !== "true";
@@ -724,6 +772,11 @@ window.jaxtank = {
     state.broken.clear();
     const found = run(effective(), data.every);
     refresh();
+    if (found === null) throw new Error($("message").textContent);
+    current = found;
+    due = !slow;
+    mark();
+    show();
     const plain = (list) => list.map((one) => Array.from(one));
     const finite = (v) => (Number.isFinite(v) ? v : null);
     const measures = Object.fromEntries(info.measures.filter(({ name }) => name in found.measures).map(({ name }) => {

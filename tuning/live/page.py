@@ -1,7 +1,8 @@
 """The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
 
 Imported by the command `explore`, by reports and by notebooks. Beside it lie the parts of the page:
-page.html, page.css, core.js, charts.js, rig.js, page.js, worker.js, tune.js, and uPlot in vendor/.
+page.html, page.css, core.js, charts.js, rig.js, runner.js, page.js, worker.js, tune.js, and uPlot
+in vendor/.
 """
 
 import base64
@@ -27,9 +28,12 @@ from tuning.live.engine import engine
 from tuning.live.origin import both, entries, origin_of
 
 HERE = Path(__file__).parent
-SCRIPTS = ("charts", "rig", "page")
+SCRIPTS = ("charts", "rig", "runner", "page")
 LARGEST = 150_000
 """Characters of a page, above which the safety filter that a case has not is left out."""
+
+DIGITS = str.maketrans("&<>`", ",.:[")
+"""Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
 KEPT = 8
 """Engines that are kept in memory."""
@@ -250,9 +254,10 @@ def assemble(engine_text, name, data):
 
 
 def _packed(text):
-    """A text, deflated, in base64: half as long, and nothing in it can end a script element."""
+    """A text, deflated, in base 85: half as long, and nothing in it can end a script element."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
-    return base64.b64encode(deflate.compress(text.encode()) + deflate.flush()).decode()
+    found = base64.b85encode(deflate.compress(text.encode()) + deflate.flush()).decode()
+    return found.translate(DIGITS)
 
 
 def source_of(text):
@@ -276,7 +281,7 @@ def _read(name):
 def _style():
     """The style sheets, without comments and indentation."""
     text = re.sub(r"/\*.*?\*/", "", _read("vendor/uPlot.min.css") + _read("page.css"), flags=re.S)
-    return re.sub(r"\s+", " ", text)
+    return re.sub(r"\s*([{};])\s*", r"\1", re.sub(r"\s+", " ", text)).replace(": ", ":")
 
 
 @cache

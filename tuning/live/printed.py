@@ -68,12 +68,10 @@ class Printed:
         functions = [self._lead(), self._signals(), self._run(), self._read()]
         return "\n".join(functions)
 
-    def helpers(self) -> list[str]:
-        """Return the functions that the printed ones call."""
+    def helpers(self) -> dict[str, str]:
+        """Return {name: text} of the functions on arrays that the printed ones call."""
         own = {s.op for s in every(self.used()) if isinstance(s, Matrix)}
-        return [
-            f"function {name}{text}" for name, text in self.loop.functions.items() if name in own
-        ]
+        return {name: text for name, text in self.loop.functions.items() if name in own}
 
     def used(self) -> list[Statement]:
         """Return every statement that is printed."""

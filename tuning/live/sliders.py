@@ -27,6 +27,8 @@ GROUPS = {
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
+ABOVE = 1e-3
+"""Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
 NOISE = 0.02
 """Upper end of the sliders of noise, as a share of the height of the tanks [-]."""
 
@@ -84,6 +86,8 @@ def _ends(case, name, full, value, meta, group):
         low, high = sorted((least * value, most * value))
     if meta["low"] is not None:
         low = max(low, float(meta["low"]))
+        if meta.get("strict") and low <= float(meta["low"]):  # an end that is not allowed itself
+            low = float(meta["low"]) + ABOVE * (high - float(meta["low"]))
     if meta["high"] is not None:
         high = min(high, float(meta["high"]))
     return min(low, value), max(high, value)

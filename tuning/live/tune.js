@@ -19,10 +19,18 @@ function tune(engine, values, free, limits, onProgress, shouldStop, options) {
   let status = local(search, search.start, most, report, stop);
   // where no point that keeps the limits was found, the least violation may be far from here
   const wanted = search.found().violation > 0 ? Math.max(starts, 4) : starts;
-  for (const z of status === "stopped" ? [] : others(search, wanted, stop)) {
+  const screened = status === "stopped" ? [] : others(search, wanted, stop);
+  for (const z of screened) {
     const next = local(search, z, most, report, stop);
     if (next === "stopped") status = next;
     if (stop()) break;
+  }
+  if (search.found().violation > 0 && Number.isFinite(search.found().violation)) {
+    for (const z of [search.best.z, ...screened]) {
+      if (stop()) status = "stopped";
+      else if (search.best.violation > 0) restore(search, z, most, report, stop);
+    }
+    if (search.best.violation === 0 && !stop()) status = local(search, search.best.z, most, report, stop);
   }
   const found = search.found();
   if (status === "converged" && found.violation > 0) status = "limits not met";
@@ -35,6 +43,7 @@ function searchOf(engine, values, free, limits, options) {
   const boxes = free.map((name) => boxOf(info, name, values, logs));
   const weights = Object.entries(info.objective.measures);
   const start = boxes.map((box, j) => box.to(valueOf(info, values, free[j])));
+  const known = new Map(), ends = []; // points by where they are, where local searches ended
   let best = null, iterations = 0, evaluations = 0, scale = null;
 
   const at = (z) => {
@@ -55,13 +64,15 @@ function searchOf(engine, values, free, limits, options) {
     if (better) best = point;
     if (scale === null && finite) scale = Math.abs(cost) || 1;
     evaluations += 1;
+    known.set(z.join(), point);
     return point;
   }
 
   return {
     start, size: free.length, limits,
-    rows: limits.length,
+    rows: limits.length, ends,
     get scale() { return scale; },
+    get best() { return best; },
     next() { iterations += 1; },
     found() {
       const z = best ? best.z : start;
@@ -73,10 +84,13 @@ function searchOf(engine, values, free, limits, options) {
       };
     },
     value(z) {
-      const run = engine.run(at(z), { every: info.samples, ...options });
+      if (known.has(z.join())) return known.get(z.join());
+      const run = engine.tangents(at(z), [], options);
       return judged(z, run.measures, run.broken);
     },
     point(z) {
+      const before = known.get(z.join());
+      if (before && before.gradient) return before;
       const run = engine.tangents(at(z), free, options), P = free.length;
       const point = judged(z, run.measures, run.broken), per = boxes.map((box, j) => box.slope(z[j]));
       const gradient = new Float64Array(P);
@@ -145,48 +159,98 @@ function marginOf(limit, measures) {
 const INSIDE = 1e-7; // share of a limit that a search stays away from it
 const CLOSE = 1e-7; // predicted fall of the merit at which a search has converged
 
+const NEAR = 0.03; // of the end of another search, where nothing new is expected
+const FEW = 4; // free numbers up to which a step that may well be taken is tried with its derivatives
+
 /* A local search from z; returns its status. */
 function local(search, z, most, report, stop) {
   const P = search.size;
-  let point = search.point(z), damping = 1e-3, penalty = 10;
+  let point = search.point(z), damping = 1e-3, penalty = 10, taken = true, more = 8;
   if (!point.finite) return "not finite";
   const scale = search.scale;
   const merit = (p) => (p.finite
     ? p.cost / scale + penalty * p.margins.reduce((s, m) => s + Math.max(0, INSIDE - m), 0) : Infinity);
+  const known = () => search.ends.some((end) => merit(end) <= merit(point) &&
+    end.z.every((v, j) => Math.abs(v - point.z[j]) < NEAR));
   for (let i = 0; i < most; ++i) {
     if (stop()) return "stopped";
     search.next();
     report();
-    const { step, fall, forces } = stepOf(point, P, damping, penalty, scale);
+    let now = stepOf(point, P, damping, penalty, scale);
+    // a larger penalty, where it brings the limits closer by their slopes
+    while (penalty < 1e5 && now.left > 1e-9) {
+      const other = stepOf(point, P, damping, 10 * penalty, scale);
+      if (other.left > 0.9 * now.left) break;
+      penalty *= 10;
+      now = other;
+    }
+    const { step, fall, forces } = now;
     const stuck = point.margins.some((m, j) => m < 0 && forces[j] >= penalty * (1 - 1e-9));
     if (fall < CLOSE) {
-      if (!(stuck && penalty < 1e5)) return "converged";
+      if (!(stuck && penalty < 1e5)) break;
       penalty *= 10;
       continue;
     }
-    const tried = search.value(Array.from(point.z, (v, j) => Math.min(1, Math.max(0, v + step[j]))));
+    const next = moved(point.z, step), tried = taken && P <= FEW ? search.point(next) : search.value(next);
     const gained = (merit(point) - merit(tried)) / fall;
-    if (gained > 1e-4) {
+    taken = gained > 1e-4;
+    if (taken) {
       point = search.point(tried.z);
       damping = Math.max(1e-9, damping * (gained > 0.75 ? 0.1 : gained > 0.25 ? 0.5 : 2));
+      more = 8;
+      if (known()) return "converged";
     } else {
-      damping = Math.max(damping, 1e-6) * 8;
-      if (damping > 1e8) return "converged";
+      damping = Math.max(damping, 1e-6) * more;
+      more *= 2;
+      if (damping > 1e8) break;
     }
+    if (i === most - 1) return "limit of iterations";
   }
-  return "limit of iterations";
+  search.ends.push(point);
+  return "converged";
 }
 
-/* The step of least g'd + d'(B + damping) d / 2 + penalty (passed limits) within 0 <= z + d <= 1, and
-how far the merit falls by it. By coordinate ascent in the forces of limits and bounds. */
-function stepOf(point, P, damping, penalty, scale) {
+/* A search from z for the least violation, the largest share by which a limit is passed: the least t
+with margins + slopes d >= -t, by bisection, for steps d within a trust region. */
+function restore(search, z, most, report, stop) {
+  const P = search.size, none = new Float64Array(P);
+  let point = search.point(z), reach = 0.25;
+  for (let i = 0; i < most && point.finite && point.violation > 0 && reach > 1e-5; ++i) {
+    if (stop()) return;
+    search.next();
+    report();
+    let step = null, low = 0, high = point.violation;
+    for (let k = 0; k < 20; ++k) {
+      const t = (low + high) / 2, curvature = new Float64Array(P * P);
+      const relaxed = { ...point, gradient: none, curvature, margins: point.margins.map((m) => m + t + INSIDE) };
+      const found = stepOf(relaxed, P, 1e3, 1e3, 1, reach);
+      if (found.left < 1e-7) [high, step] = [t, found.step];
+      else low = t;
+    }
+    const fall = point.violation - high;
+    if (step === null || fall < CLOSE) return;
+    const tried = search.value(moved(point.z, step));
+    if (tried.finite && tried.violation < point.violation - 0.1 * fall) {
+      point = search.point(tried.z);
+      reach = Math.min(1, 2 * reach);
+    } else reach /= 4;
+  }
+}
+
+const moved = (z, step) => Array.from(z, (v, j) => Math.min(1, Math.max(0, v + step[j])));
+
+/* The step of least g'd + d'(B + damping) d / 2 + penalty (passed limits) within 0 <= z + d <= 1 and
+|d| <= reach, how far the merit falls by it, and what is left of the passed limits by their slopes.
+By coordinate ascent in the forces of limits and bounds. */
+function stepOf(point, P, damping, penalty, scale, reach = 1) {
   const B = point.curvature.map((v) => v / scale), g = Array.from(point.gradient, (v) => v / scale);
   const size = Math.max(1e-12, ...Array.from({ length: P }, (_, j) => B[j * P + j]));
   const H = B.map((v, i) => v + (i % (P + 1) === 0 ? damping * Math.max(size, 1e-3) : 0));
   const rows = point.slopes.map((a, i) => ({ a, b: point.margins[i] - INSIDE, top: penalty }));
   for (let j = 0; j < P; ++j) {
     const unit = (sign) => Float64Array.from({ length: P }, (_, i) => (i === j ? sign : 0));
-    rows.push({ a: unit(1), b: point.z[j], top: Infinity }, { a: unit(-1), b: 1 - point.z[j], top: Infinity });
+    const [down, up] = [Math.min(reach, point.z[j]), Math.min(reach, 1 - point.z[j])];
+    rows.push({ a: unit(1), b: down, top: Infinity }, { a: unit(-1), b: up, top: Infinity });
   }
   const inverse = inverseOf(H, P);
   const times = (v) => Array.from({ length: P }, (_, i) => dot(inverse.subarray(i * P, i * P + P), v));
@@ -210,7 +274,7 @@ function stepOf(point, P, damping, penalty, scale) {
     (s, row) => s + (row.top < Infinity ? penalty * Math.max(0, -row.b - (step ? dot(row.a, d) : 0)) : 0), 0);
   let bend = 0;
   for (let i = 0; i < P; ++i) for (let j = 0; j < P; ++j) bend += d[i] * B[i * P + j] * d[j];
-  return { step: d, forces, fall: passed(false) - passed(true) - dot(g, d) - bend / 2 };
+  return { step: d, forces, left: passed(true) / penalty, fall: passed(false) - passed(true) - dot(g, d) - bend / 2 };
 }
 
 function dot(a, b) {

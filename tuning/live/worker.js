@@ -1,4 +1,4 @@
-// In a worker, after the text of the engine, the tuner and core.js: searches and many plants.
+// In a worker, after the text of the engine, the tuner and core.js: runs, searches, many plants.
 
 const engine = makeEngine();
 
@@ -46,10 +46,20 @@ function many(message) {
   });
 }
 
+// the run that is asked for; its columns are handed over, not copied
+function one(message) {
+  const start = performance.now();
+  const run = engine.run(message.values, message.options);
+  const columns = Object.values(run).flatMap((v) => (ArrayBuffer.isView(v) ? [v] : Array.isArray(v) ? v : []));
+  const milliseconds = performance.now() - start;
+  postMessage({ kind: "run", run, milliseconds }, columns.map((column) => column.buffer));
+}
+
 onmessage = async (event) => {
   const message = event.data;
   try {
-    if (message.kind === "plants") many(message);
+    if (message.kind === "run") one(message);
+    else if (message.kind === "plants") many(message);
     else {
       const progress = (now) => postMessage({ kind: "progress", ...now });
       const { values, free, limits } = message;

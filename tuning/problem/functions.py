@@ -92,7 +92,7 @@ class Constraint:
         if (self.upper is None) == (self.lower is None):
             raise InputError(f"constraint {self.name}: must have either upper or lower")
         try:
-            finite = not isinstance(self.limit, bool | np.bool_) and math.isfinite(self.limit)
+            finite = np.asarray(self.limit).dtype.kind != "b" and math.isfinite(self.limit)
         except (TypeError, OverflowError):
             finite = False
         if not finite:

@@ -3,11 +3,13 @@
 Imported by the methods, which call nothing of the problem but this.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from jaxtank import measures as ms
 from tuning.problem.point import DIVERGED, Point
 from tuning.problem.problem import Problem
 
@@ -117,6 +119,64 @@ class Search:
         good = point if point.finite else self.last_finite
         slopes = good.margin_slopes / self.limit_scale[:, None]
         return good.margins / self.limit_scale - self.tightening, slopes
+
+
+def event_of(search: Search, starts: int, **more: Any) -> dict[str, Any]:
+    """Return what `progress` is called with after an evaluation: numbers of the search, and `more`.
+
+    "details" is a function without arguments: parameters and limits at the best point so far, as
+    `details_of` returns them.
+    """
+    best, last = search.best, search.history[-1]
+    return {
+        "start": search.start,
+        "starts": starts,
+        "evaluations": len(search.history),
+        "cost": last[1],
+        "violation": last[2],
+        "best": None if best is None else best.cost,
+        "best_violation": None if best is None else search.violation(best),
+        "values": None if best is None else search.problem.values(best.z),
+        "details": lambda: details_of(search.problem, best),
+        **more,
+    }
+
+
+def details_of(problem: Problem, best: Point | None) -> dict[str, Any]:
+    """Return the parameters and the limits of a problem at a point, as JSON objects.
+
+    {"parameters": [{"name", "unit", "low", "high", "before", "now"}], "limits": [{"name", "unit",
+    "value", "sense": 1 for an upper limit and -1 for a lower one, "margin": the smallest of all
+    runs}]}; "now" is None and "limits" is empty without a point.
+    """
+    now: dict[str, float] = {} if best is None else problem.values(best.z)
+    parameters = [
+        {
+            "name": b.name,
+            "unit": b.unit,
+            "low": b.low,
+            "high": b.high,
+            "before": before,
+            "now": now.get(b.name),
+        }
+        for b, before in zip(problem.bounds, problem.own_values().values())
+    ]
+    limits: dict[Any, dict[str, Any]] = {}
+    for limit, margin in zip(problem.limits, () if best is None else best.margins):
+        key = limit.measure, limit.index, limit.value
+        unit = ms.unit(limit.measure, problem.loop.units)
+        one = limits.setdefault(
+            key,
+            {
+                "name": dataclasses.replace(limit, scenario="").label,
+                "unit": unit,
+                "value": limit.value,
+                "sense": limit.sign,
+                "margin": float(margin),
+            },
+        )
+        one["margin"] = min(one["margin"], float(margin))
+    return {"parameters": parameters, "limits": list(limits.values())}
 
 
 class CoarseSearch(Search):

@@ -12,7 +12,7 @@ import numpy as np
 from tuning.cluster.ahead import evaluate_ahead
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
-from tuning.search.driver import SETTLED, Search
+from tuning.search.driver import SETTLED, Search, event_of
 from tuning.search.kkt import LOWER_BY, UNSTABLE, downhill, optimality
 from tuning.search.methods import (
     UNCONSTRAINED,
@@ -102,7 +102,7 @@ def solve(problem: Problem, first: np.ndarray, plan: Plan, progress: Callable | 
     """Return the Outcome of all stages from z = first (P,); Ctrl-C ends them early."""
     found = Outcome(idle=np.zeros(len(first), dtype=bool))
     try:
-        _run_stages(problem, first, plan, found, _reporter(progress, problem, plan.starts))
+        _run_stages(problem, first, plan, found, _reporter(progress, plan.starts))
     except KeyboardInterrupt:
         found.interrupted = True
     return found
@@ -312,23 +312,11 @@ def without_slope(search):
     return not np.any(search.best.gradient) and search.best.cost != 0.0
 
 
-def _reporter(progress, problem, starts):
+def _reporter(progress, starts):
     """Return what a Search calls after every evaluation: `progress` with a dict."""
 
     def report(search):
         if progress is not None and search.history:
-            best = search.best
-            progress(
-                {
-                    "start": search.start,
-                    "starts": starts,
-                    "evaluations": len(search.history),
-                    "cost": search.history[-1][1],
-                    "violation": search.history[-1][2],
-                    "best": None if best is None else best.cost,
-                    "best_violation": None if best is None else search.violation(best),
-                    "values": None if best is None else problem.values(best.z),
-                }
-            )
+            progress(event_of(search, starts))
 
     return report

@@ -7,16 +7,16 @@ import numpy as np
 from jax.core import eval_jaxpr
 
 from jaxtank.export.primitives import REDUCTIONS, no_code
-from jaxtank.export.whole.array_moves import view
-from jaxtank.export.whole.array_values import strides_of
+from jaxtank.export.whole.array_moves import place, view
+from jaxtank.export.whole.array_values import is_literal, strides_of
 
 FOLDS = {
-    "add": "(x,y)=>x+y",
-    "mul": "(x,y)=>x*y",
-    "max": "max",
-    "min": "min",
-    "and": "(x,y)=>x&&y",
-    "or": "(x,y)=>x||y",
+    "add": "{0}+{1}",
+    "mul": "{0}*{1}",
+    "max": "max({0},{1})",
+    "min": "min({0},{1})",
+    "and": "{0}&&{1}",
+    "or": "{0}||{1}",
 }
 
 
@@ -35,7 +35,13 @@ def _rows(text, eqn, operand, axes):
 def _reduce(op):
     def rule(text, eqn, operands):
         moved, rows, width = _rows(text, eqn, operands[0], list(eqn.params["axes"]))
-        return text.let(f"fold({FOLDS[op]},{rows},{width},{moved})")
+        if is_literal(moved):
+            moved = text.filled(rows * width, "", moved)
+        at = "0" if rows == 1 else f"x*{width}"
+        s, k = next(text.names), next(text.names)
+        next_ = FOLDS[op].format(s, f"{moved}[{place(at, [(k, 1)])}]")
+        lines = f"let {s}={moved}[{at}];for(let {k}=1;{k}<{width};++{k}){s}={next_};"
+        return text.filled(rows, lines, s)
 
     return rule
 
@@ -46,7 +52,8 @@ def _cumulate(op):
         if eqn.params["reverse"]:
             raise no_code("it sums an array from its end")
         moved, rows, width = _rows(text, eqn, operands[0], [axis])
-        done = text.let(f"running({FOLDS[op]},{rows},{width},{moved})")
+        f = FOLDS[op].format("x", "y")
+        done = text.let(f"running((x,y)=>{f},{rows},{width},{moved})")
         order = [*(d for d in range(len(shape)) if d != axis), axis]
         if order == list(range(len(shape))):
             return done
@@ -71,7 +78,7 @@ def _dot(text, eqn, operands):
         sides.append(operand)
         sizes.append([int(np.prod([shape[d] for d in part])) for part in (batch, free, own)])
     (b, m, k), (_, n, _) = sizes
-    return text.let(f"matmul({b},{m},{k},{n},{sides[0]},{sides[1]})")
+    return text.product((b, m, k, n), *sides)
 
 
 def _solve(text, eqn, operands):

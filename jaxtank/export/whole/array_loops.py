@@ -8,6 +8,7 @@ import re
 import numpy as np
 
 from jaxtank.export.whole.array_dependence import needed
+from jaxtank.export.whole.array_values import is_literal
 
 
 def _block_lines(text, jaxpr, consts, arguments):
@@ -17,18 +18,31 @@ def _block_lines(text, jaxpr, consts, arguments):
     return inner, results
 
 
-def _state(text, eqn, starts, size_of):
-    """Variables of a loop with their first values, as lines."""
-    own = [next(text.names) for _ in starts]
-    lines = [f"let {n}=flat({size},{start});" for n, start, size in zip(own, starts, size_of)]
-    return own, lines
+def _state(text, starts, sizes):
+    """Variables of a loop, and lines that give them their first values."""
+    own = [text.array(size) for size in sizes]
+    return own, [_set(n, size, start) for n, size, start in zip(own, sizes, starts)]
 
 
-def _moved(text, own, new, sizes):
+def _set(name, size, value):
+    """The line that puts a value into a variable of a loop."""
+    if is_literal(value):
+        return f"{name}.fill({value});"
+    return f"{name}.set(flat({size},{value}));"
+
+
+def _moved(text, inner, own, new, sizes):
     """Lines that give the variables of a loop their next values, all at once."""
-    temporary = [next(text.names) for _ in own]
-    first = [f"const {t}=flat({s},{e});" for t, e, s in zip(temporary, new, sizes)]
-    return first + [f"{n}={t};" for n, t in zip(own, temporary)]
+    first, last = [], []
+    for name, value, size in zip(own, new, sizes):
+        if value == name:
+            continue
+        if not is_literal(value) and value not in inner.made:  # perhaps another variable
+            copy = next(text.names)
+            first.append(f"const {copy}=flat({size},{value}).slice();")
+            value = copy
+        last.append(_set(name, size, value))
+    return first + last
 
 
 def _loop(text, own, lines):
@@ -48,10 +62,9 @@ def scan(text, eqn, operands, wanted=None):
     state = needed(closed.jaxpr, consts, carry, wanted)
     sequences = [i for i in wanted if i >= carry]
     sizes = [int(np.prod(eqn.outvars[i].aval.shape)) for i in state]
-    own, lines = _state(text, eqn, [operands[consts + i] for i in state], sizes)
-    counter, outs = next(text.names), [next(text.names) for _ in sequences]
+    own, lines = _state(text, [operands[consts + i] for i in state], sizes)
     totals = [int(np.prod(eqn.outvars[i].aval.shape)) for i in sequences]
-    lines += [f"const {n}=new Float64Array({s});" for n, s in zip(outs, totals)]
+    counter, outs = next(text.names), [text.array(size) for size in totals]
     first, up = (count - 1, "--") if p["reverse"] else (0, "++")
     end = f"{counter}>=0" if p["reverse"] else f"{counter}<{count}"
     lines.append(f"for(let {counter}={first};{end};{up}{counter}){{")
@@ -74,7 +87,7 @@ def scan(text, eqn, operands, wanted=None):
     for name, total, e in zip(outs, totals, results[len(state) :]):
         each = total // count
         lines.append(f"{name}.set(flat({each},{e}),{counter}*{each});")
-    lines += [*_moved(text, own, results[: len(state)], sizes), "}"]
+    lines += [*_moved(text, inner, own, results[: len(state)], sizes), "}"]
     _loop(text, [*own, *outs], lines)
     found = dict(zip([*state, *sequences], [*own, *outs]))
     return [found[i] for i in wanted]
@@ -84,12 +97,12 @@ def while_(text, eqn, operands):
     p = eqn.params
     first, last = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
     sizes = [int(np.prod(v.aval.shape)) for v in eqn.outvars]
-    own, lines = _state(text, eqn, operands[last:], sizes)
+    own, lines = _state(text, operands[last:], sizes)
     test, body = p["cond_jaxpr"], p["body_jaxpr"]
     inner, (on,) = _block_lines(text, test.jaxpr, test.consts, [*operands[:first], *own])
     lines += ["for(;;){", *inner.live([on]), f"if(!flat(1,{on})[0])break;"]
     inner, results = _block_lines(text, body.jaxpr, body.consts, [*operands[first:last], *own])
-    lines += [*inner.live(results), *_moved(text, own, results, sizes), "}"]
+    lines += [*inner.live(results), *_moved(text, inner, own, results, sizes), "}"]
     _loop(text, own, lines)
     return own
 

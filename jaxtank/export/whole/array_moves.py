@@ -14,8 +14,51 @@ from jaxtank.export.whole.array_values import is_literal, listed, strides_of
 
 
 def view(text, operand, shape, strides, start: Any = 0):
-    """A view of an array as a new one; itself where nothing moves."""
-    return text.let(f"view({operand},{listed(shape)},{listed(strides)},{start})")
+    """A view of an array as a new one, entry by entry."""
+    size = int(np.prod(shape))
+    axes = merged(shape, strides)
+    if is_literal(operand):
+        return text.constant(np.full(size, float(operand)))
+    if len(axes) <= 1:
+        step = axes[0][1] if axes else 0
+        return text.filled(size, "", f"{operand}[{place(start, [('x', step)])}]")
+    name, counters = text.array(size), [next(text.names) for _ in axes]
+    loops = "".join(f"for(let {i}=0;{i}<{n};++{i})" for i, (n, _) in zip(counters, axes))
+    at = place(start, [(i, step) for i, (_, step) in zip(counters, axes)])
+    text.line(name, f"{{let x=0;{loops}{name}[x++]={operand}[{at}];}}")
+    return name
+
+
+def merged(shape, strides):
+    """Return [(length, stride)] of the axes, without those of length 1, runs of them as one.
+
+    Examples
+    --------
+    >>> merged((2, 1, 3), (3, 3, 1)), merged((3, 2), (1, 3))
+    ([(6, 1)], [(3, 1), (2, 3)])
+    """
+    axes: list[tuple[int, int]] = []
+    for length, stride in zip(shape, strides):
+        if length == 1:
+            continue
+        if axes and axes[-1][1] == stride * length:
+            axes[-1] = axes[-1][0] * length, stride
+        else:
+            axes.append((length, stride))
+    return axes
+
+
+def place(start, terms):
+    """Return the text of an index: start + counter stride + ...
+
+    Examples
+    --------
+    >>> place(0, [("x", 1)]), place(5, [("i", 0), ("j", -2)]), place("k", [("i", 3)])
+    ('x', '5+j*-2', 'k+i*3')
+    """
+    parts = [] if start == 0 or start == "0" else [str(start)]
+    parts += [i if step == 1 else f"{i}*{step}" for i, step in terms if step]
+    return "+".join(parts) or "0"
 
 
 def spread(text, v, out, operand):

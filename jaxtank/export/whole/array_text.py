@@ -19,7 +19,7 @@ from jaxtank.export.simplify import FUNCTIONS, OPERATORS
 from jaxtank.export.statements import Ref
 from jaxtank.export.whole import array_algebra, array_loops, array_moves
 from jaxtank.export.whole.array_dependence import CONTROL
-from jaxtank.export.whole.array_moves import spread
+from jaxtank.export.whole.array_moves import spread, view
 from jaxtank.export.whole.array_values import called_by, constant, is_literal
 from jaxtank.export.whole.compact import Text
 
@@ -45,10 +45,17 @@ RULES: dict[str, Callable[..., Any]] = {
 
 
 class ArrayText:
-    """The lines of a function on arrays. Values are texts: names of arrays, or numbers."""
+    """The lines of a function on arrays. Values are texts: names of arrays, or numbers.
+
+    An array that a line fills is made once and for all, for the engine of a browser takes longer to
+    make one of more than eight entries than to fill it: it holds its entries until the line is
+    executed again. What a function returns is a copy.
+    """
 
     def __init__(self, names, outer=None):
         self.names = names
+        self.sizes: dict[str, int] = outer.sizes if outer else {}
+        self.made: set[str] = set()  # arrays that lines of this block fill
         self.lines: list[tuple[str, str, frozenset]] = []
         self.constants: dict[str, str] = outer.constants if outer else {}
         self.numbers: dict[str, np.ndarray] = outer.numbers if outer else {}
@@ -67,24 +74,40 @@ class ArrayText:
         self.numbers[self.constants[text]] = np.ravel(array)
         return self.constants[text]
 
-    def live(self, results, top=False):
-        """Return the lines that results depend on; top: with the constants that they read."""
+    def live(self, results):
+        """Return the lines that results depend on."""
         wanted, kept = set(re.findall(r"\w+", " ".join(results))), []
         for name, line, reads in reversed(self.lines):
             if name in wanted:
                 kept += [line] if line else []
                 wanted |= reads
-        if top:
-            kept += [f"const {n}={t};" for t, n in self.constants.items() if n in wanted]
         return kept[::-1]
+
+    def kept(self, lines):
+        """Return the lines that make the arrays which lines read and are there before them."""
+        read = set(re.findall(r"\w+", " ".join(lines)))
+        found = [f"const {n}={t};" for t, n in self.constants.items() if n in read]
+        own = [n for n in self.sizes if n in read]
+        if own:
+            sizes = ",".join(str(self.sizes[n]) for n in own)
+            found.append(f"const[{','.join(own)}]=arrays({sizes});")
+        return found
+
+    def array(self, size):
+        """Return the name of an array that lines fill."""
+        name = next(self.names)
+        self.sizes[name] = size
+        self.made.add(name)
+        return name
 
     def let(self, expression):
         """Return the name of a new constant."""
         name = next(self.names)
-        self._line(name, f"const {name}={expression};")
+        self.line(name, f"const {name}={expression};")
         return name
 
-    def _line(self, name, line):
+    def line(self, name, line):
+        """Add a line that defines a name."""
         self.lines.append((name, line, frozenset(re.findall(r"\w+", line))))
 
     def run(self, jaxpr, consts, arguments):
@@ -144,18 +167,21 @@ class ArrayText:
         """The matrix operations of `jaxtank.analysis.elimination`."""
         shape = eqn.invars[0].aval.shape
         n = shape[-1]
-        turn = f"[{n},{n}],[1,{n}],0"
+
+        def turned(operand):
+            return view(self, operand, [n, n], [1, n])
+
         if eqn.params["name"] == "_cholesky":
-            return self.let(f"view(cholesky({n},{operands[0]}),{turn})")
+            return turned(self.let(f"cholesky({n},{operands[0]})"))
         if eqn.params["name"] == "_cholesky_solve":
             upper, b = operands
-            return self.let(
-                f"backward({n},1,view({upper},{turn}),forward({n},1,view({upper},{turn}),{b}))"
-            )
+            lower = turned(upper)
+            return self.let(f"backward({n},1,{lower},forward({n},1,{lower},{b}))")
         g, weight = operands
         rows = shape[0]
-        scaled = f"map((x,y)=>x*y,{rows * n},{g},view({weight},[{rows},{n}],[1,0],0))"
-        return self.let(f"matmul(1,{n},{rows},{n},view({scaled},[{n},{rows}],[1,{n}],0),{g})")
+        scaled = self.array(rows * n)
+        self.line(scaled, f"scaled({rows},{n},{g},{weight},{scaled});")
+        return self.product((1, n, rows, n), scaled, g)
 
     def _elementwise(self, eqn, operands):
         """An operation on each element, by the expression that single elements have."""
@@ -167,21 +193,37 @@ class ArrayText:
             invars=[_scalar(v) for v in eqn.invars], outvars=[_scalar(v) for v in eqn.outvars]
         )
         (out,) = writer.equation(scalar, inputs)
-        text = Text({Ref(x): x for x in "xyz"}, (f"x{i}" for i in itertools.count()))
         e = np.asarray(out, dtype=object).item()
-        lines = text.write(writer.scopes[0], [e])
-        body = text.of(e)
-        if body == "x":
+        if e == Ref("x"):
             return operands[0]
         operands = [spread(self, v, eqn.outvars[0], o) for v, o in zip(eqn.invars, operands)]
-        arguments = ",".join("xyz"[: len(operands)])
-        f = (
-            f"({arguments})=>{{{''.join(lines)}return {body}}}"
-            if lines
-            else f"({arguments})=>{body}"
-        )
         size = int(np.prod(eqn.outvars[0].aval.shape))
-        return self.let(f"map({f},{size},{','.join(operands)})")
+        own = [entry(o, v.aval.size, size) for v, o in zip(eqn.invars, operands)]
+        text = Text({Ref(x): o for x, o in zip("xyz", own)}, (f"x{i}" for i in itertools.count()))
+        lines = text.write(writer.scopes[0], [e])
+        return self.filled(size, "".join(lines), text.of(e))
+
+    def filled(self, size, lines, body):
+        """Return the name of an array filled with `body` of its entry x, after `lines`."""
+        name = self.array(size)
+        place = "0" if size == 1 else "x"
+        inside = f"{lines}{name}[{place}]={body};"
+        inside = f"{{{inside}}}" if lines else inside
+        self.line(name, inside if size == 1 else f"for(let x=0;x<{size};++x){inside}")
+        return name
+
+    def product(self, sizes, left, right):
+        """Return the name of the matrix product of sizes (batch, m, k, n)."""
+        name = self.array(sizes[0] * sizes[1] * sizes[3])
+        self.line(name, f"matmul({','.join(map(str, sizes))},{left},{right},{name});")
+        return name
+
+
+def entry(operand, size, of):
+    """Return the text of entry x of an operand with `size` entries, in an array of `of`."""
+    if is_literal(operand):
+        return f"({operand})" if operand.startswith("-") else operand
+    return f"{operand}[{0 if size == 1 or of == 1 else 'x'}]"
 
 
 def is_known(text, name):

@@ -66,6 +66,7 @@ def library() -> dict[str, str]:
         **own,
         "rint": ROUND.strip(),
         "part": PART,
+        "arrays": "const arrays=(...sizes)=>sizes.map((n)=>new Float64Array(n));",
         "F": "const F=(...v)=>new Float64Array(v);",
     }
 

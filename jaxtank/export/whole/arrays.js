@@ -1,12 +1,6 @@
 /* Operations on arrays, row by row in a Float64Array; a number stands for an array of equal entries.
 A text holds those that it calls. */
 
-function map(f, n, a, b, c) {
-  const out = new Float64Array(n), x = flat(n, a), y = flat(n, b), z = flat(n, c);
-  for (let i = 0; i < n; ++i) out[i] = f(x[i], y[i], z[i]);
-  return out;
-}
-
 function flat(n, a) {
   if (a === undefined) return [];
   if (typeof a === "number") return new Float64Array(n).fill(a);
@@ -56,16 +50,6 @@ function chain(outer, sizes, parts) {
   return out;
 }
 
-function fold(f, rows, width, a) {
-  const out = new Float64Array(rows), from = flat(rows * width, a);
-  for (let i = 0; i < rows; ++i) {
-    let s = from[i * width];
-    for (let k = 1; k < width; ++k) s = f(s, from[i * width + k]);
-    out[i] = s;
-  }
-  return out;
-}
-
 function running(f, rows, width, a) {
   const out = Float64Array.from(flat(rows * width, a));
   for (let i = 0; i < rows; ++i)
@@ -73,8 +57,9 @@ function running(f, rows, width, a) {
   return out;
 }
 
-function matmul(batch, m, k, n, a, b) {
-  const out = new Float64Array(batch * m * n), x = flat(batch * m * k, a), y = flat(batch * k * n, b);
+function matmul(batch, m, k, n, a, b, out) {
+  out.fill(0);
+  const x = flat(batch * m * k, a), y = flat(batch * k * n, b);
   for (let p = 0; p < batch; ++p)
     for (let i = 0; i < m; ++i)
       for (let l = 0; l < k; ++l) {
@@ -82,7 +67,12 @@ function matmul(batch, m, k, n, a, b) {
         if (v !== 0)
           for (let j = 0; j < n; ++j) out[(p * m + i) * n + j] += v * y[(p * k + l) * n + j];
       }
-  return out;
+}
+
+/* rows x n: the transpose of g with each row times its weight */
+function scaled(rows, n, g, weight, out) {
+  const w = flat(rows, weight);
+  for (let i = 0; i < rows; ++i) for (let j = 0; j < n; ++j) out[j * rows + i] = g[i * n + j] * w[i];
 }
 
 function pick(places, ...parts) {

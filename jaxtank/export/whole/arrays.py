@@ -70,11 +70,17 @@ class ArrayWriter(Writer):
             found = RULES[eqn.primitive.name](text, eqn, own, wanted)
         else:
             found = text.equation(eqn, own)
-        result = found[0] if len(found) == 1 else f"chain(1,{listed(sizes)},[{','.join(found)}])"
-        body = [*text.live(found, top=True), f"return {result};"]
+        if len(found) > 1:
+            result = f"chain(1,{listed(sizes)},[{','.join(found)}])"
+        else:
+            result = f"{found[0]}.slice()" if found[0] in text.sizes else found[0]
+        body = [*text.live(found), f"return {result};"]
         read = set(re.findall(r"\w+", " ".join(body)))
         used = [i for i, n in enumerate(own) if n in read and not is_known(text, n)]
-        body = f"({','.join(own[i] for i in used)}){{" + "\n".join(body) + "}"
+        kept = text.kept(body)
+        body = f"({','.join(own[i] for i in used)})=>{{" + "\n".join(body) + "}"
+        if kept:
+            body = "(()=>{" + "\n".join(kept) + f"\nreturn{body}}})()"
         names = {v: k for k, v in self.functions.items()}
         function = names.get(body) or f"f{len(self.functions)}"
         self.functions[function] = body

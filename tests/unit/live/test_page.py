@@ -336,6 +336,18 @@ def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, wri
     assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
 
 
+def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, written):
+    with opened(browser, written) as live:
+        assert not live.page.is_visible("#run") and not live.page.is_visible("#slow-note")
+        before = live.text("#measures")
+        live("Worker.prototype.postMessage = () => {}")  # no answer: the page stays responsive
+        set_all(live, {"controller.Kc[0]": 2.0})
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 2.0}
+        assert live.text("#measures") == before
+        live.page.click("#pin")  # of the sliders as they are
+        assert "run 1" in live.text("#legend") and live.text("#measures") != before
+
+
 def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
     with opened(browser, written) as live:
         live.page.click("#tune")

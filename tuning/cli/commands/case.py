@@ -26,7 +26,7 @@ def add(commands, parents):
     one = commands.add_parser(
         "simulate",
         parents=[common, case, run],
-        help="one run: measures; with --out its trajectory, pictures and a page",
+        help="one run: measures; with --out its trajectory, pictures and report.html",
     )
     one.set_defaults(run=simulate)
     one.add_argument(
@@ -37,7 +37,8 @@ def add(commands, parents):
     one.add_argument(
         "--margins",
         action="store_true",
-        help="also the stability margins of the linearised loop at each plateau of the reference",
+        help="also print the stability margins of the linearised loop at each plateau of the"
+        " reference",
     )
     _add_init(commands, [common, case])
     _add_export(commands, [common, case])

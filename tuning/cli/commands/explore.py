@@ -17,6 +17,9 @@ def add(commands, parents):
         "explore",
         parents=[parents.common, changes()],
         help="one HTML file in which the loop runs and is tuned while its sliders move",
+        description="Write the closed loop of a case as one HTML file that needs no network: in a"
+        " browser it runs again whenever a slider moves, it is tuned there, and it gives the"
+        " command, the rig file and the CSV file of what it shows.",
     )
     one.set_defaults(run=explore)
     one.add_argument(

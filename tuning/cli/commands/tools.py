@@ -31,6 +31,9 @@ def add(commands, parents):
         parents=[parents.common],
         help="where compiled programs are kept, and their size; cache clear removes them"
         " (JAXTANK_CACHE=0: none are kept; JAXTANK_CACHE=DIR: there)",
+        description="Print where the programs that XLA has compiled are kept for the next call, and"
+        " their size. With JAXTANK_CACHE=0 none are kept, with JAXTANK_CACHE=DIR they are kept in"
+        " DIR.",
     )
     one.set_defaults(run=cache)
     one.add_argument("what", nargs="?", metavar="clear", help="remove the programs of all versions")

@@ -7,7 +7,7 @@ from typing import Any
 
 from jaxtank.core.errors import InputError
 from tuning.cli.arguments import on_cluster, option, repeatable, uncertain
-from tuning.cli.interrupts import Interrupts, put_back
+from tuning.cli.interrupts import put_back
 from tuning.cli.options import (
     choices_of,
     distributions_of,
@@ -17,9 +17,10 @@ from tuning.cli.options import (
     scenarios_of,
     tradeoff_of,
 )
-from tuning.cli.terminal import Line
+from tuning.cli.progress import Progress
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
+from tuning.cli.watch import watch_of
 
 CODES = """exit codes:
   0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
@@ -107,6 +108,12 @@ def _add_search(one):
     text = "iterations of each local search (default 40; --nominal: 60)"
     option(one, "--iterations", "N", text)
     option(one, "--batch", "N", "scenarios drawn for each step of method adam (default all)")
+    one.add_argument(
+        "--watch",
+        action="store_true",
+        help="with --out DIR: DIR/watch.html follows the search while it runs; so it does without"
+        " the option where stderr is a terminal",
+    )
     text = "go on where a killed run with --out DIR ended, to the same answer"
     option(one, "--resume", "DIR", text)
 
@@ -140,21 +147,27 @@ def _tune(args):
     finder, case, own = _finder(args, case, task)
     folder = args.resume or args.out
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
-    progress = Progress(unit, args.quiet, None if args.robust or args.nominal else args)
-    result = finder(
-        case,
-        **{k: v for k, v in task.items() if k != "scenarios"},
-        **own,
-        **_numbers(args),
-        log=folder,
-        resume=args.resume is not None,
-        progress=progress,
-        cluster=args.cluster,
-    )
-    progress.line.end()
-    result = _besides(args, case, result, task, sweep, progress)
-    args.out = folder
-    _finish(args, result)
+    option = None if args.robust or args.nominal or args.quiet else _goes_with_nominal(args)
+    progress = Progress(unit, args.quiet, option)
+    progress.watch = watch_of(args, case, folder, progress.line)
+    with contextlib.nullcontext() if progress.watch is None else progress.watch:
+        result = finder(
+            case,
+            **{k: v for k, v in task.items() if k != "scenarios"},
+            **own,
+            **_numbers(args),
+            log=folder,
+            resume=args.resume is not None,
+            progress=progress,
+            cluster=args.cluster,
+        )
+        progress.line.end()
+        result = _besides(args, case, result, task, sweep, progress)
+        args.out = folder
+        _finish(args, result)
+        if progress.watch is not None:
+            stopped = progress.stop or result.status == "interrupted"
+            progress.watch.end("interrupted" if stopped else "ended", str(result).split("\n")[:1])
     return progress.code if progress.stop else EXIT[result.status]
 
 
@@ -315,35 +328,3 @@ def _finish(args, result):
     report_unreachable(result.tuned, written, args)
     if not args.out and not args.json and not args.quiet:
         print("Add --out DIR for the tuned rig, the trajectory and pictures.", file=sys.stderr)
-
-
-class Progress(Interrupts):
-    """A line per evaluation on a terminal, a line per local search elsewhere.
-
-    Ctrl-C is taken between evaluations, from the second on: the first is of the values that the
-    case has, and what follows it is compiled first.
-    """
-
-    def __init__(self, unit, quiet, args=None):
-        super().__init__()
-        self.unit, self.last, self.line = unit, None, Line(quiet)
-        option = None if args is None or quiet else _goes_with_nominal(args)
-        self.note = option and f"{option} goes with --nominal: the optimum of the case as it is"
-        self.line.compiling("the simulation and its derivatives", 15)
-
-    def __call__(self, event):
-        if self.note:  # not before the search begins: an error is one line
-            print(f"jaxtank: note: {self.note}", file=sys.stderr)
-            self.note = None
-        if event["evaluations"] > 1:
-            self.check()
-        if not self.line.terminal and event["start"] == self.last:
-            return
-        self.last = event["start"]
-        breaks = " (breaks a limit)" if event["best_violation"] else ""
-        unit = event.get("unit") or self.unit
-        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {unit}{breaks}"
-        self.line.show(
-            f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
-            f" {event['evaluations']}  best {best}"
-        )

@@ -1,0 +1,41 @@
+"""What `tune` reports of its search while it runs. Imported by that command."""
+
+import sys
+
+from tuning.cli.interrupts import Interrupts
+from tuning.cli.terminal import Line
+from tuning.cli.watch import Watch
+
+
+class Progress(Interrupts):
+    """A line per evaluation on a terminal, a line per local search elsewhere.
+
+    Ctrl-C is taken between evaluations, from the second on: the first is of the values that the
+    case has, and what follows it is compiled first. `watch`: the page that follows the search.
+    """
+
+    def __init__(self, unit, quiet, option=None):
+        super().__init__()
+        self.unit, self.last, self.line = unit, None, Line(quiet)
+        self.watch: Watch | None = None
+        self.note = option and f"{option} goes with --nominal: the optimum of the case as it is"
+        self.line.compiling("the simulation and its derivatives", 15)
+
+    def __call__(self, event):
+        if self.note:  # not before the search begins: an error is one line
+            print(f"jaxtank: note: {self.note}", file=sys.stderr)
+            self.note = None
+        if event["evaluations"] > 1:
+            self.check()
+        if self.watch is not None:
+            self.watch(event | {"unit": event.get("unit") or self.unit})
+        if not self.line.terminal and event["start"] == self.last:
+            return
+        self.last = event["start"]
+        breaks = " (breaks a limit)" if event["best_violation"] else ""
+        unit = event.get("unit") or self.unit
+        best = "none yet" if event["best"] is None else f"{event['best']:.6g} {unit}{breaks}"
+        self.line.show(
+            f"start {min(event['start'] + 1, event['starts'])}/{event['starts']}  evaluation"
+            f" {event['evaluations']}  best {best}"
+        )
