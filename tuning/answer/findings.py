@@ -25,13 +25,15 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 
 from tuning.answer.answer import Answer
-from tuning.answer.robustness import PEAK, highest_peak
 from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
 from tuning.problem.wording import numbered
 from tuning.search.result import Message, TuningResult
 
 Found = Iterator[Message]
+
+PEAK = 2.0
+"""Sensitivity peak above which a loop that became less robust is reported [-]."""
 
 BUSIER = 20.0
 """Growth of the rms change of the inputs per sample above which it is reported [-]."""
@@ -140,7 +142,7 @@ def _busier(result, answer) -> Found:
 
 def _less_robust(result, answer) -> Found:
     peaks = [float(m.get("sensitivity_peak", np.nan)) for m in answer.measures.values()]
-    if len(peaks) == 2 and peaks[1] > highest_peak(peaks[0]):
+    if len(peaks) == 2 and peaks[1] > max(PEAK, 1.05 * peaks[0]):
         words = "unstable" if np.isinf(peaks[1]) else f"{peaks[1]:.3g}, {peaks[0]:.3g} before"
         yield Message(
             "sensitivity-peak",

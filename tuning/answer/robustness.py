@@ -1,6 +1,6 @@
 """A last step of the default answer: gains that make the linearised loop fragile are moved back.
 
-Imported by `attempts` and `findings`.
+Imported by `attempts`.
 """
 
 from typing import Any
@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 
 from tuning.answer.setting import Setting
-from tuning.answer.stay_put import LINE, STRIDE, Found
+from tuning.answer.stay_put import LINE, STRIDE, WORTH, Found
 from tuning.problem.reported import margin_measures
 
-PEAK = 2.0
-"""Sensitivity peak Ms that an answer may have, whatever the first values have [-]: the textbook
-range is 1.4 to 2."""
-
-GROWTH = 1.1
-"""Factor by which Ms may rise above that of the first values [-]."""
+PEAK = 2.5
+"""Sensitivity peak Ms that an answer may have, unless that of the first values is higher [-].
+Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken back."""
 
 PRICE = 0.05
 """Share of the cost that a lower Ms may cost: half of it as a share of the error [-]."""
@@ -28,10 +25,10 @@ def highest_peak(before: float) -> float:
 
     Examples
     --------
-    >>> highest_peak(1.4), round(highest_peak(2.28), 3)
-    (2.0, 2.508)
+    >>> highest_peak(1.4), highest_peak(2.9)
+    (2.5, 2.9)
     """
-    return max(PEAK, GROWTH * before)
+    return max(PEAK, before)
 
 
 def move_back(setting: Setting, problem: Any, found: Found) -> None:
@@ -39,8 +36,9 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
 
     Along the straight line in the search's coordinates, to the first of LINE points whose
     sensitivity peak (of the nominal loop, at the case's own step, the worst of its plateaus) is low
-    enough, whose cost is within PRICE of the answer's, and that keeps the limits as well. The
-    answer stays where there is none, or where the loop has no sensitivity peak.
+    enough, whose cost is within PRICE of the answer's, and that keeps the limits as well; to the
+    first values themselves where they fit and cost less than WORTH more than that point. The answer
+    stays where there is none, or where the loop has no sensitivity peak.
 
     Parameters
     ----------
@@ -63,7 +61,12 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
             continue
         costs, _ = problem.screen(some)
         for each in some[low & (costs <= ceiling)]:
-            if search.violation(search.point(each)) <= violation:
+            there = search.point(each)
+            if search.violation(there) <= violation:
+                dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
+                here = search.point(first)
+                if here.cost <= dearest and search.violation(here) <= violation:
+                    each = first.copy()
                 found.z, found.kept = each, each == first
                 return
 

@@ -110,7 +110,7 @@ def _values(result, answer):
     rows = []
     for name, p in result.parameters.items():
         stays = answer.kept.get(name, False)
-        remark = "kept (costs less than 1 % in all)" if stays else ""
+        remark = "kept (a change gains little)" if stays else ""
         remark = remark if p["exercised"] else "kept: no effect in any run"
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] and not remark else remark
         digits = [number(p[side], 4) for side in ("before", "after")]
