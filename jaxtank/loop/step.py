@@ -147,8 +147,8 @@ def move(
     plant = loop.plant
     if loop.faults is not None and now.fault is not None:
         faults: Any = loop.faults
-        change = faults.apply_arrays if is_array(state.x) else faults.apply
-        plant = change(plant, now.fault)
+        faulty = faults.apply_arrays if is_array(state.x) else faults.apply
+        plant = faulty(plant, now.fault)
     driving, u = like(loop.actuator.driving(u), state.x), like(u, state.x)
     if not is_array(u):  # arrays have been so since `decide`
         driving = materialised(driving)

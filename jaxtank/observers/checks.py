@@ -45,7 +45,7 @@ def check_tanks(observer, name, plant, least=1):
         )
 
 
-def check_disturbed(observer, plant, levels):
+def check_disturbed(observer, plant, levels, shares=1.0):
     """Raise InputError unless the disturbances of a Kalman filter can be found.
 
     A constant disturbance of the rates of the tanks `disturbed` shows in the readings if [[A, E],
@@ -56,7 +56,8 @@ def check_disturbed(observer, plant, levels):
     ----------
     observer : with `disturbed`, `measured` and `walk`
     plant : of the loop
-    levels : (n,) at which A is taken [cm]
+    levels, shares : (n,) A is taken at shares * levels [-], [cm]; nothing is checked where they or
+        the model are traced
     """
     check_tanks(observer, "disturbed", plant, least=0)
     if not observer.disturbed:
@@ -71,14 +72,14 @@ def check_disturbed(observer, plant, levels):
     if any(isinstance(v, Tracer) for v in jax.tree.leaves(traced)):
         return
     eye, still = np.eye(plant.tanks), np.zeros(plant.pumps)
-    A = np.asarray(linearise(observer.model, levels, still)[0])
+    A = np.asarray(linearise(observer.model, np.asarray(levels) * shares, still)[0])
     # each state in units of what it does in a time constant: all entries are near 1
     A = A / max(np.abs(A).max(), 1e-300)
     E, C = eye[:, list(observer.disturbed)], eye[list(observer.measured)]
     none = np.zeros((len(C), E.shape[1]))
     if np.linalg.matrix_rank(np.block([[A, E], [C, none]]), 1e-9) < plant.tanks + E.shape[1]:
         raise InputError(
-            f"observer.disturbed = {observer.disturbed}: the readings of observer.measured ="
-            f" {observer.measured} do not tell so many disturbances apart: name fewer tanks, at"
-            " most one for each that is measured and acts on it"
+            f"observer.disturbed = {observer.disturbed}: these disturbances are not identifiable"
+            f" from observer.measured = {observer.measured}: name at most as many tanks as are"
+            " measured, each connected to a measured tank"
         )

@@ -160,8 +160,7 @@ class ExtendedKalman(Observer):
         check_model(self, plant)
         check_tanks(self, "measured", plant)
         # half full, each tank a little differently: levels at which no two flows cancel
-        typical = np.asarray(self.model.rim) * (0.5 + 0.01 * np.arange(plant.tanks))
-        check_disturbed(self, plant, typical)
+        check_disturbed(self, plant, self.model.rim, 0.5 + 0.01 * np.arange(plant.tanks))
 
 
 def _symmetric(P):

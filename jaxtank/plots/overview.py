@@ -50,7 +50,7 @@ def size(tanks):
     Examples
     --------
     >>> [round(v, 2) for v in size(100)]
-    [7.2, 4.06]
+    [7.2, 4.13]
     """
     columns = per_line(tanks)
     lines = math.ceil(tanks / columns)

@@ -96,6 +96,7 @@ READ = {
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.report.html", "style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",
+    ("tuning.live.watch", "_read", "read_text"): "watch.js and watch.css of the package",
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
     ("jaxtank.export.whole.array_values", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",

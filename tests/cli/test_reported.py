@@ -53,6 +53,7 @@ def test_one_tank_is_one_tank(capsys):
     assert "The rig: 2 tanks, 1 pump; " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_moving_picture_of_an_earlier_run_does_not_stay(tmp_path):
     words = ["simulate", ONE_TANK, "--set", "clock.duration=4", "--out", str(tmp_path), "--quiet"]
     foreign = tmp_path / "other"

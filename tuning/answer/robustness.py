@@ -54,9 +54,9 @@ def move_back(setting: Setting, problem: Any, found: Found) -> None:
     if not _peak(setting, problem, z) > allowed:  # NaN: it has none
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
-    steady = np.array([_peak(setting, problem, each) <= allowed for each in line])
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
-    for some, low in zip(np.split(line, LINE // STRIDE), np.split(steady, LINE // STRIDE)):
+    for some in np.split(line, LINE // STRIDE):
+        low = np.array([_peak(setting, problem, each) <= allowed for each in some])
         if not low.any():
             continue
         costs, _ = problem.screen(some)

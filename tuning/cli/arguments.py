@@ -155,7 +155,7 @@ def on_cluster():
         "--cluster",
         "ADDRESS",
         "run on a Dask cluster: HOST:PORT of its scheduler, or local:N for N workers on this"
-        " machine (pip install distributed)",
+        ' machine (pip install ".[cluster]")',
     )
     return found
 

@@ -18,7 +18,7 @@ class Progress(Interrupts):
         super().__init__()
         self.unit, self.last, self.line = unit, None, Line(quiet)
         self.watch: Watch | None = None
-        self.note = option and f"{option} goes with --nominal: the optimum of the case as it is"
+        self.note = option and f"{option} implies --nominal: the optimum of the case as it is"
         self.line.compiling("the simulation and its derivatives", 15)
 
     def __call__(self, event):

@@ -82,20 +82,25 @@ class Watch:
                 self.written(self.folder / PAGE)
         self.took = time.perf_counter() - began
 
-    def end(self, state: str, lines: list[str] | tuple[str, ...] = ()) -> None:
+    def end(
+        self, state: str, lines: list[str] | tuple[str, ...] = (), result: bool = False
+    ) -> None:
         """Write the last page, if there was one before; state : "ended", "interrupted", "failed".
 
-        lines : sentences about the result.
+        lines : sentences about the result. result : whether it was written, with a report; one
+        that is in the folder may be that of an earlier search.
         """
         if not self.there:
             return
         report = "report.html"
         self.state.state, self.state.answer = state, tuple(lines)
-        self.state.report = report if (self.folder / report).exists() else None
+        self.state.report = report if result and (self.folder / report).exists() else None
         self.write()
 
     def __enter__(self) -> "Watch":
-        self.leaving = before_leaving(lambda: self.end("interrupted", ["It was stopped at once."]))
+        self.leaving = before_leaving(
+            lambda: self.end("interrupted", ["Stopped by a second signal: no result was written."])
+        )
         self.leaving.__enter__()
         return self
 

@@ -68,6 +68,12 @@ class Engine:
         config: Any = jax.config
         x64, done = bool(config.jax_enable_x64), queue.SimpleQueue()
         given, pending = iter(given), {}
+
+        def send(number, arguments):
+            future = self._submit(task, x64, arguments)
+            pending[future.key] = number, arguments, future
+            future.add_done_callback(done.put)
+
         try:
             while True:
                 self._look(waiting)
@@ -75,18 +81,20 @@ class Engine:
                     number, arguments = next(given, (None, None))
                     if arguments is None:
                         break
-                    future = self._submit(task, x64, arguments)
-                    pending[future.key] = number, future
-                    future.add_done_callback(done.put)
+                    send(number, arguments)
                 if not pending:
                     return
                 with contextlib.suppress(queue.Empty):
                     future = done.get(timeout=LOOK)
-                    number, _ = pending.pop(future.key)
-                    yield number, self._result(future)
+                    number, arguments, _ = pending.pop(future.key)
+                    found = self._result(future, waiting)
+                    if found is None:  # lost with its worker
+                        send(number, arguments)
+                    else:
+                        yield number, found[0]
         finally:
             with contextlib.suppress(Exception):  # the connection has gone
-                self.client.cancel([future for _, future in pending.values()])
+                self.client.cancel([future for *_, future in pending.values()])
 
     def _submit(self, task, x64, arguments):
         try:
@@ -116,22 +124,31 @@ class Engine:
             )
         self.threads, self.looked = found, now
 
-    def _result(self, future):
-        """Return what a task returned; raise what it raised, in one line."""
-        if future.status == "finished":
+    def _result(self, future, waiting):
+        """Return (what a task returned,), None where that was lost with its worker; raise what it
+        raised, in one line.
+        """
+        while future.status == "finished":
             try:
-                processor, found = future.result()  # computed again, if its worker has gone now
+                processor, found = future.result(timeout=CONNECT)
+            except TimeoutError:  # its worker has gone: is there another one?
+                self._look(waiting)
+                continue
             except Exception as error:
+                if future.status == "lost":
+                    return None
                 raise self._lost(error) from None
             self._same(processor)
-            return found
+            return (found,)
+        if future.status in ("lost", "pending") and self.client.status == "running":
+            return None
         if future.status != "error":
             raise self._lost()
         error = future.exception()
         if type(error).__name__ == "KilledWorker":
             raise InputError(
-                f"cluster {self.address}: a task has ended several workers (out of memory?): give"
-                " them more, or --resume with other ones"
+                f"cluster {self.address}: several workers ended while they ran the same task,"
+                " probably out of memory: start workers with more memory, and --resume DIR"
             )
         if isinstance(error, ImportError):
             raise InputError(
@@ -154,8 +171,8 @@ class Engine:
     def _lost(self, error=None):
         why = f" ({type(error).__name__})" if error is not None else ""
         return InputError(
-            f"cluster {self.address}: the connection to the scheduler was lost{why}; with --out DIR"
-            " what is done is kept: --resume DIR"
+            f"cluster {self.address}: the connection to the scheduler was lost{why}; finished"
+            " batches are kept if --out DIR was given: continue with --resume DIR"
         )
 
 

@@ -91,4 +91,6 @@ def _address(file, scheduler):
 def _last_line(folder):
     """Return the end of what the processes printed."""
     lines = Path(folder, "log.txt").read_text(errors="replace").split("\n")
-    return next((line.strip()[:200] for line in reversed(lines) if line.strip()), "without a word")
+    return next(
+        (line.strip()[:200] for line in reversed(lines) if line.strip()), "no message was printed"
+    )

@@ -6,6 +6,9 @@ Imported by the tasks of `uncertainty` and `search`.
 import functools
 import json
 from collections.abc import Sequence
+from typing import Any
+
+import jax
 
 from jaxtank import measures as ms
 from jaxtank import rig
@@ -43,7 +46,7 @@ def sent(case: Case, names: Sequence[str] = ()) -> str:
             f" ({error}); a class of a package that the workers have can be named there, by an"
             " entry point jaxtank.components"
         ) from None
-    return json.dumps({"rig": text, "fingerprint": fingerprint(case)})
+    return json.dumps({"rig": text, "fingerprint": _fingerprint(case)})
 
 
 @functools.lru_cache(maxsize=8)
@@ -55,17 +58,26 @@ def received(text: str) -> Case:
     """
     found = json.loads(text)
     case = rig.loads(found["rig"], "rig file sent to this worker")
-    mine, theirs = fingerprint(case), found["fingerprint"]
+    mine, theirs = _fingerprint(case), found["fingerprint"]
     differs = [name for name in theirs if mine.get(name) != theirs[name]]
     if "xla_option" in differs:
         raise InputError(
             "cluster: jax had started on this worker before jaxtank, without its compiler options:"
-            " start workers with --preload jaxtank, or XLA_FLAGS set as where this was begun"
+            " start workers with --preload jaxtank, or with the XLA_FLAGS of this command"
         )
     if differs:
-        names = ", ".join(f"{n} ({_short(mine.get(n))}, not {_short(theirs[n])})" for n in differs)
-        raise InputError(f"cluster: a worker differs from where this was begun: {names}")
+        names = ", ".join(
+            f"{n} ({_short(mine.get(n))} there, {_short(theirs[n])} here)" for n in differs
+        )
+        raise InputError(f"cluster: a worker differs from this process: {names}")
     return case
+
+
+def _fingerprint(case):
+    """Return `fingerprint` with what decides precision and random numbers on a worker, too."""
+    config: Any = jax.config
+    generator = config.jax_default_prng_impl, config.jax_threefry_partitionable
+    return fingerprint(case, x64=bool(config.jax_enable_x64), random=list(map(str, generator)))
 
 
 def _short(value):

@@ -188,6 +188,7 @@ function local(search, z, most, report, stop) {
     const stuck = point.margins.some((m, j) => m < 0 && forces[j] >= penalty * (1 - 1e-9));
     if (fall < CLOSE) {
       if (!(stuck && penalty < 1e5)) break;
+      if (i === most - 1) return "limit of iterations";
       penalty *= 10;
       continue;
     }

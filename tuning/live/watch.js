@@ -19,7 +19,7 @@
     document.getElementById("time").textContent = words(Date.now() / 1000 - Number(began));
     const note = document.getElementById("age");
     note.hidden = age < 30;
-    note.textContent = `No news for ${words(age)}: another program is being compiled, or the search was killed.`;
+    note.textContent = `No update for ${words(age)}: a program is being compiled, or the search was killed.`;
   }
   // a page of a file can read no other file but a script
   function again() {

@@ -180,7 +180,7 @@ def picture(watched: Watched) -> str:
         parts.append(f'<path class="best" d="{"".join(steps)}"/>')
     words = f"best cost {_number(watched.best)} {watched.unit} after {watched.evaluations} runs"
     key = (
-        "line: best point so far; dots: evaluations; hollow: a limit is passed; a new line begins"
+        "line: best point so far; dots: evaluations; hollow: a limit is violated; a new line begins"
         " where a new search does"
     )
     return (
@@ -227,7 +227,7 @@ def _held(w: Watched) -> str:
         return "not known yet"
     if not w.limits:
         return "none in this search"
-    return "hold" if w.violation <= 0 else f"passed by {100 * w.violation:.3g} %"
+    return "hold" if w.violation <= 0 else f"violated by {100 * w.violation:.3g} %"
 
 
 def _parameters(w: Watched) -> str:
@@ -245,12 +245,18 @@ def _parameters(w: Watched) -> str:
     return _table("What is tuned", ("", "was", "now", "from", "to", "in its range"), rows)
 
 
+def _tightness(limit: dict[str, Any]) -> float:
+    """Return the margin of a limit as a share of it; the least where it has none."""
+    share = limit["margin"] / (abs(limit["value"]) or 1.0)
+    return -math.inf if math.isnan(share) else share
+
+
 def _limits(w: Watched) -> str:
     rows = []
-    for one in sorted(w.limits, key=lambda one: one["margin"] / (abs(one["value"]) or 1.0)):
+    for one in sorted(w.limits, key=_tightness):
         sign = "at most" if one["sense"] > 0 else "at least"
         name = html.escape(f"{one['name']} {sign} {_number(one['value'])} {one['unit']}")
-        kind = ' class="bad"' if one["margin"] < 0 else ""
+        kind = "" if one["margin"] >= 0 else ' class="bad"'
         rows.append(
             f'<tr{kind}><th scope="row">{name}</th><td>{_number(one["margin"], 4)}</td></tr>'
         )

@@ -61,7 +61,7 @@ def _limits(case, values):
         words = f"{limit.label}: {tables.number(value)} {unit}, the limit of {most} {side}"
         found.append((words, margin))
     if len(found) > tables.MANY:  # the tightest ones
-        found = sorted(found, key=lambda one: one[1])
+        found = sorted(found, key=lambda one: -np.inf if np.isnan(one[1]) else one[1])
         found, rest = found[:WORST], found[WORST:]
         passed = sum(not margin >= 0.0 for _, margin in rest)
         words = f"{len(rest)} further limits have larger margins"

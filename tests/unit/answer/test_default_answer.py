@@ -297,7 +297,7 @@ def test_input_that_cannot_be_used_is_an_error_before_anything_runs(case, option
 def test_options_of_the_nominal_optimum_imply_it_and_say_so(path):
     words = ["tune", path, "--starts", "1", "--validation", "0"]
     said = command(*words, "--method", "slsqp", "--iterations", "2")
-    assert "note: --method goes with --nominal" in said.err
+    assert "note: --method implies --nominal" in said.err
     assert "validation" not in said.out and "what it gives" not in said.out
 
 

@@ -143,6 +143,47 @@ def test_what_is_known_is_not_sent_again(case, tmp_path):
         tuning.tune(case, **SEARCH, cluster=Refusing())
 
 
+class Losing:
+    """A client whose first result of a task is lost with its worker before it is fetched."""
+
+    status, keys = "running", iter(range(99))
+
+    def __init__(self):
+        self.lost = set()
+
+    def nthreads(self):
+        return {"worker": 1}
+
+    def cancel(self, futures):
+        pass
+
+    def submit(self, function, task, x64, number, pure):
+        lose = number not in self.lost
+        self.lost.add(number)
+        return Future(next(self.keys), lose, number)
+
+
+class Future:
+    def __init__(self, key, lose, number):
+        self.key, self.lose, self.number, self.status = key, lose, number, "finished"
+
+    def add_done_callback(self, done):
+        done(self)
+
+    def result(self, timeout):
+        if self.lose:
+            self.status = "lost"
+            raise TimeoutError
+        return "processor", 10 * self.number
+
+
+def test_a_result_that_is_lost_before_it_is_fetched_is_computed_again():
+    client = Losing()
+    client.scheduler = type("Scheduler", (), {"address": "nowhere"})
+    given = ((n, (n,)) for n in range(5))
+    assert sorted(Engine(client).run("batch", given)) == [(n, 10 * n) for n in range(5)]
+
+
 def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, whole, tmp_path):
     with local_workers(1) as (address, _):
         with distributed.Client(address) as found:
@@ -266,7 +307,7 @@ def test_a_worker_that_differs_is_refused(case, monkeypatch):
     assert np.array_equal(*(jax.tree.leaves(c.loop)[0] for c in (received(text), case)))
     received.cache_clear()
     monkeypatch.setattr("jaxtank.__version__", "0.0.0")
-    with pytest.raises(InputError, match=r"a worker differs .*: jaxtank \(0\.0\.0, not"):
+    with pytest.raises(InputError, match=r"a worker differs .*: jaxtank \(0\.0\.0 there,"):
         received(text)
     monkeypatch.setenv("XLA_FLAGS", "")  # as where jax had started first
     with pytest.raises(InputError, match=r"jax had started on this worker before jaxtank"):

@@ -112,6 +112,7 @@ def test_names_of_logs_in_what_is_found(say, tmp_path):
     assert f"{ESCAPED}: 12 samples" in err and ESCAPED in out and "\033" not in out + err
 
 
+@pytest.mark.slow
 def test_names_of_rigs_and_folders(say, tmp_path):
     """A note about a rig file, and where the result went."""
     _, text, _ = say("init", "cascaded/pi", "--short")

@@ -55,6 +55,7 @@ def test_the_worst_plant_and_reading_error_of_one_tank_are_those_of_its_closed_f
     assert np.min(one.values["error"]) == pytest.approx(-0.06)
 
 
+@pytest.mark.slow
 def test_slopes_of_the_objective_are_those_of_central_differences():
     """By each kind of variable: coefficients constant and in windows, start, bias, one reading."""
     case = rig.set_values(

@@ -52,6 +52,7 @@ def test_the_filter_of_a_step_is_an_exponential_and_its_rates_are_its_slopes():
     np.testing.assert_allclose(np.gradient(rate, 0.1)[inner], second[inner], atol=2e-4)
 
 
+@pytest.mark.slow_for("calofir/backstepping")
 @pytest.mark.parametrize(
     "name",
     ["calofir/backstepping", pytest.param("gouta2015/backstepping-ff", marks=pytest.mark.slow)],

@@ -136,7 +136,7 @@ EPISODES = {
     # an outlet that closes, a leak, an orifice that is another one
     "calofir/backstepping-perturbed": {"clock.duration": 1050.0},
     # a weak pump, inflows, an ADC, a dead zone
-    "gouta2022/chadpc": {"clock.dt": 0.2, "clock.duration": 500.0},
+    "gouta2022/chadpc": {"clock.dt": 0.2, "clock.duration": 500.0, "observer.l": [9.0, 9.0]},
     "gouta2015/backstepping-boxqp": {"clock.dt": 0.5, "clock.duration": 150.0},
     "mirakhorli/hybrid": {"clock.duration": 100.0, "actuator.delay": 0.0},
     "cascaded/pi": {"plant.rim[1]": 6.0},
@@ -172,6 +172,7 @@ def pumps_and_sensors(case):
     "khalid/laguerre-constrained-own",
     "mirakhorli/hybrid-lag-delay-noise-offset-adc",
     "mirakhorli/hybrid-own",
+    "gouta2022/chadpc-lag-delay-noise-offset-adc",
 )
 @pytest.mark.parametrize(
     "change", [lambda case: case, pumps_and_sensors], ids=["own", "lag-delay-noise-offset-adc"]
@@ -216,6 +217,7 @@ def test_an_episode_is_the_run_of_the_rig(name, change):
         assert np.abs(run.y - run.x).max() > 0.01 * size
 
 
+@pytest.mark.slow
 def test_a_safety_filter_limits_the_actions_as_the_inputs_of_a_controller():
     """Pumps of gouta2015 at full by actions, and by an open-loop controller: the same run."""
     pytest.importorskip("gymnasium")

@@ -55,7 +55,9 @@ def test_a_page_shows_what_a_search_has_found(watch):
         watch(event(number, cost, best, stage="search"))
     text = (watch.folder / "watch.html").read_text()
     assert "Running: search, local search 1 of 2" in text and "2 cm" in text
-    assert "passed by 2 %" in text and "max_level at most 30 cm" in text and "<td>-0.5</td>" in text
+    assert (
+        "violated by 2 %" in text and "max_level at most 30 cm" in text and "<td>-0.5</td>" in text
+    )
     # of the best: 4 at the first evaluation, 2 at the second and third, as an SVG path
     y = [float(v) for v in re.findall(r'class="best" d="M[\d.]+ ([\d.]+)H[\d.]+V([\d.]+)', text)[0]]
     dots = [float(v) for v in re.findall(r'<circle class="held" cx="[\d.]+" cy="([\d.]+)', text)]
@@ -70,7 +72,7 @@ def test_an_ended_search_links_its_report_and_is_not_loaded_again(watch):
     watch(event(1, 4.0, 4.0))
     assert "refresh" in (watch.folder / "watch.html").read_text()
     (watch.folder / "report.html").touch()
-    watch.end("ended", ["it converged"])
+    watch.end("ended", ["it converged"], result=True)
     text = (watch.folder / "watch.html").read_text()
     assert 'href="report.html"' in text and "it converged" in text and "refresh" not in text
 
@@ -78,9 +80,11 @@ def test_an_ended_search_links_its_report_and_is_not_loaded_again(watch):
 def test_a_search_that_fails_or_is_stopped_at_once_says_so(watch):
     with pytest.raises(RuntimeError), watch:
         watch(event(1, 4.0, None))
+        (watch.folder / "report.html").touch()  # of an earlier search
         raise RuntimeError
     text = (watch.folder / "watch.html").read_text()
     assert "Stopped without a result" in text and "none yet" in text
+    assert "report.html" not in text
 
 
 def test_pages_are_written_once_a_second_and_a_failure_ends_nothing(watch):
@@ -131,7 +135,7 @@ def test_an_open_page_follows_the_file_without_a_network(watch):
             watch(event(2, 3.0, 3.0))
             tab.locator("dl", has_text="3 cm").wait_for(timeout=10_000)
             (watch.folder / "report.html").touch()
-            watch.end("ended")
+            watch.end("ended", result=True)
             tab.locator("text=Report of the result").wait_for(timeout=10_000)
             assert tab.title().startswith("ended 3") and faults == []
             assert tab.evaluate("document.documentElement.scrollWidth") <= 390

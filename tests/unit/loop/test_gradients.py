@@ -264,6 +264,7 @@ def test_by_the_duration_of_ramps_setpoints_and_the_filter_of_the_reference(gout
     assert np.all(np.abs(found) > 1e-6)
 
 
+@pytest.mark.slow
 def test_by_the_duration_of_a_ramp_and_its_target_through_a_run():
     """Forward mode alone, of a small rig; the ramps end between two samples."""
     case = presets.find("calofir/backstepping")

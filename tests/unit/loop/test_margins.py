@@ -109,6 +109,7 @@ def test_derivatives_of_the_margins_are_those_of_differences_on_several_plants()
     np.testing.assert_allclose(reverse, slope[0], rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_four_tanks_under_two_pi_loops_have_the_margins_of_the_loops_closed_one_by_one():
     rig = presets.find("mirakhorli/sfc").loop
     gains = dict(Kc=[0.6, 0.9], Ti=[60.0, 40.0], Tt=[60.0, 40.0], bias=[3.0, 3.0])

@@ -135,6 +135,7 @@ def registered():
             table.pop(key, None)
 
 
+@pytest.mark.slow
 def test_a_registered_measure_is_evaluated_with_its_derivative(registered):
     case = rig.loads(RIG)
     run = jaxtank.simulate(case.loop, case.clock)

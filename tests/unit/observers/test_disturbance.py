@@ -210,18 +210,34 @@ def four(**changes):
         ),
         (
             ExtendedKalman(**four(disturbed=(0, 1, 2)), spread=[0.0] * 4),
-            "do not tell so many disturbances apart",
+            "disturbances are not identifiable",
         ),
         # both upper tanks, from one lower level
         (
             Kalman(**four(measured=(0,), disturbed=(2, 3)), levels=[8.0] * 4, inputs=[3.0, 3.0]),
-            "do not tell so many disturbances apart",
+            "disturbances are not identifiable",
         ),
     ],
 )
 def test_by_input_validation(observer, words):
     with pytest.raises(InputError, match=words):
         observer.check(FOUR)
+
+
+@pytest.mark.parametrize(
+    "observer",
+    [
+        ExtendedKalman(**four(disturbed=(0,)), spread=[0.0] * 4),
+        Kalman(**four(disturbed=(0,)), levels=[8.0] * 4, inputs=[3.0, 3.0]),
+        DisturbanceObserver(model=FOUR, l=[1.0] * 4),
+    ],
+)
+def test_an_observer_whose_leaves_are_traced_passes(observer):
+    def checked(own):
+        own.check(FOUR)
+        return 0.0
+
+    assert jax.jit(checked)(observer) == 0.0
 
 
 def test_a_gain_too_large_for_the_sampling_period_is_refused():

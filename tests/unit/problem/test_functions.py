@@ -289,6 +289,7 @@ def test_the_default_answer_takes_functions(watertank):
     assert result.objective["after"] == pytest.approx(same.objective["after"], rel=0.01)
 
 
+@pytest.mark.slow
 def test_two_functions_share_no_checkpoint(watertank, tmp_path):
     """The same name, and code that differs by a number that it closes over alone."""
 

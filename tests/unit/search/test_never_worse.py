@@ -291,6 +291,7 @@ def test_a_start_at_a_constant_setpoint_is_no_change(watertank):
         tuning.tune(case, nominal=True, limits={"rise_time": 5.0}, starts=1)
 
 
+@pytest.mark.slow
 def test_an_infeasible_value_of_a_trade_off_is_the_least_violation_of_a_grid(watertank):
     """A rise time is a count of samples: no slope leads to the least violation."""
     limits = {"overshoot_percent": 5.0}

@@ -430,6 +430,7 @@ def test_defaults_are_the_cases_own(case):
 SHORT = ("cascaded/pi", "--set", "clock.duration=400")
 
 
+@pytest.mark.slow_for("local-5-tornado")
 @pytest.mark.parametrize(
     ("method", "samples", "picture"),
     [("local", "5", "tornado"), ("morris", "4", "tornado"), ("sobol", "20", "sobol")],

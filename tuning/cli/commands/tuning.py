@@ -111,8 +111,8 @@ def _add_search(one):
     one.add_argument(
         "--watch",
         action="store_true",
-        help="with --out DIR: DIR/watch.html follows the search while it runs; so it does without"
-        " the option where stderr is a terminal",
+        help="write DIR/watch.html, a page that shows the running search (needs --out DIR; written"
+        " without the option too where stderr is a terminal)",
     )
     text = "go on where a killed run with --out DIR ended, to the same answer"
     option(one, "--resume", "DIR", text)
@@ -167,7 +167,8 @@ def _tune(args):
         _finish(args, result)
         if progress.watch is not None:
             stopped = progress.stop or result.status == "interrupted"
-            progress.watch.end("interrupted" if stopped else "ended", str(result).split("\n")[:1])
+            state = "interrupted" if stopped else "ended"
+            progress.watch.end(state, str(result).split("\n")[:1], result=True)
     return progress.code if progress.stop else EXIT[result.status]
 
 
