@@ -6,6 +6,7 @@ Imported by the observers of this folder.
 import jax
 import numpy as np
 from jax.core import Tracer
+from numpy.typing import ArrayLike
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.core.errors import InputError
@@ -45,7 +46,7 @@ def check_tanks(observer, name, plant, least=1):
         )
 
 
-def check_disturbed(observer, plant, levels, shares=1.0):
+def check_disturbed(observer, plant, levels, shares: ArrayLike = 1.0):
     """Raise InputError unless the disturbances of a Kalman filter can be found.
 
     A constant disturbance of the rates of the tanks `disturbed` shows in the readings if [[A, E],
@@ -56,7 +57,7 @@ def check_disturbed(observer, plant, levels, shares=1.0):
     ----------
     observer : with `disturbed`, `measured` and `walk`
     plant : of the loop
-    levels, shares : (n,) A is taken at shares * levels [-], [cm]; nothing is checked where they or
+    levels, shares : (n,) A is taken at levels [cm] times shares [-]; nothing is checked where they or
         the model are traced
     """
     check_tanks(observer, "disturbed", plant, least=0)
