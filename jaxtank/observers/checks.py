@@ -57,8 +57,8 @@ def check_disturbed(observer, plant, levels, shares: ArrayLike = 1.0):
     ----------
     observer : with `disturbed`, `measured` and `walk`
     plant : of the loop
-    levels, shares : (n,) A is taken at levels [cm] times shares [-]; nothing is checked where they or
-        the model are traced
+    levels, shares : (n,) A is taken at levels [cm] times shares [-]; nothing is checked where
+        they or the model are traced
     """
     check_tanks(observer, "disturbed", plant, least=0)
     if not observer.disturbed:
