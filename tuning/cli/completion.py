@@ -147,7 +147,7 @@ def gather():
     from jaxtank import presets
     from jaxtank.core.clock import CLOCK
     from jaxtank.core.tree import walk
-    from jaxtank.measures import MEASURES
+    from jaxtank.measures import MEASURES, functions
 
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():
@@ -158,7 +158,8 @@ def gather():
                 if not isinstance(v, tuple)
             }
     lines = [f"cases {c}" for c in presets.names()] + [f"parameters {n}" for n in sorted(names)]
-    return "\n".join([*lines, *(f"measures {m}" for m in MEASURES)]) + "\n"
+    known = [m for m in MEASURES if m not in functions(MEASURES)]  # without a user's own functions
+    return "\n".join([*lines, *(f"measures {m}" for m in known)]) + "\n"
 
 
 def refresh():
