@@ -201,7 +201,7 @@ def contents(base: Path) -> dict[str, tuple[int, int]]:
 
     Examples
     --------
-    >>> contents(Path("/no/such/folder"))
+    >>> contents(Path("no-such-folder"))
     {}
     """
     found: dict[str, tuple[int, int]] = {}
@@ -216,7 +216,7 @@ def clear(base: Path) -> int:
 
     Examples
     --------
-    >>> clear(Path("/no/such/folder"))
+    >>> clear(Path("no-such-folder"))
     0
     """
     count = 0

@@ -240,7 +240,7 @@ tls://HOST:PORT, or local:N for N workers on this machine, from 1 to 1024
         import distributed
     except ImportError:
         raise InputError(
-            'cluster: Dask is not installed: pip install distributed, or "jaxtank[cluster]"'
+            'cluster: Dask is not installed: pip install distributed, or ".[cluster]"'
         ) from None
     if not isinstance(cluster, str | distributed.Client) or (
         isinstance(cluster, distributed.Client) and cluster.asynchronous
