@@ -104,8 +104,8 @@ def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
 
     Examples
     --------
-    >>> base_folder("/tmp/kept")
-    PosixPath('/tmp/kept')
+    >>> base_folder("kept") == Path("kept").absolute()
+    True
     """
     given = os.environ.get(SWITCH, "") if folder is None else os.fspath(folder)
     if folder is None and given.lower() in OFF:
