@@ -1,6 +1,7 @@
 """`--watch`: a page in the folder of a search that follows it. Imported by the command `tune`."""
 
 import contextlib
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -83,17 +84,23 @@ class Watch:
         self.took = time.perf_counter() - began
 
     def end(
-        self, state: str, lines: list[str] | tuple[str, ...] = (), result: bool = False
+        self,
+        state: str,
+        lines: list[str] | tuple[str, ...] = (),
+        result: bool = False,
+        values: dict[str, float] | None = None,
     ) -> None:
         """Write the last page, if there was one before; state : "ended", "interrupted", "failed".
 
         lines : sentences about the result. result : whether it was written, with a report; one
-        that is in the folder may be that of an earlier search.
+        that is in the folder may be that of an earlier search. values : {name: value} of the
+        result.
         """
         if not self.there:
             return
         report = "report.html"
         self.state.state, self.state.answer = state, tuple(lines)
+        self.state.values = values or {}
         self.state.report = report if result and (self.folder / report).exists() else None
         self.write()
 
@@ -126,6 +133,17 @@ def watch_of(args: Any, case: Any, folder: str | None, line: Any) -> Watch | Non
             print(f"jaxtank: note: {printable(str(path))} follows the search", file=sys.stderr)
 
     return Watch(folder, case, written)
+
+
+def first_sentence(text: str) -> str:
+    """Return the first lines of a result up to the one that ends in its time, as one line.
+
+    Examples
+    --------
+    >>> first_sentence("paper/case: converged;\\n2 gains changed (3.0 s)\\nand a table")
+    'paper/case: converged; 2 gains changed (3.0 s)'
+    """
+    return re.split(r"(?<= s\))\n|\n\n", text, maxsplit=1)[0].replace("\n", " ")
 
 
 def _stage(event):

@@ -34,7 +34,8 @@ class Watched:
     costs : [(number of the evaluation, cost, whether every limit holds)]. bests : [[(number, best
     cost so far)] of each search]. parameters, limits : as `tuning.search.driver.details_of`.
     violation : of the best point, as a share of a limit; None without one. answer : sentences about
-    the result. report : name of the page of the result, None while there is none.
+    the result. values : {name: value} of the result, which may be another point than the best of
+    the search. report : name of the page of the result, None while there is none.
 
     Examples
     --------
@@ -57,6 +58,7 @@ class Watched:
     parameters: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     limits: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     answer: tuple[str, ...] = ()
+    values: dict[str, float] = dataclasses.field(default_factory=dict)
     report: str | None = None
 
 
@@ -231,18 +233,20 @@ def _held(w: Watched) -> str:
 
 
 def _parameters(w: Watched) -> str:
-    rows = []
+    rows, ended = [], bool(w.values)
     for p in w.parameters:
-        part = _share(p["now"], p["low"], p["high"])
+        answer = w.values.get(p["name"], p["now"])
+        part = _share(answer, p["low"], p["high"])
         bar = (
             f'<meter min="0" max="1" value="{part:.3f}" aria-label="position in the range"></meter>'
         )
-        numbers = (p["before"], p["now"], p["low"], p["high"])
+        numbers = (p["before"], *[answer] * ended, p["now"], p["low"], p["high"])
         cells = "".join(f"<td>{_number(v)}</td>" for v in numbers)
         unit = f" [{p['unit']}]" if p["unit"] and p["unit"] != "-" else ""
         name = html.escape(printable(f"{p['name']}{unit}"))
         rows.append(f'<tr><th scope="row">{name}</th>{cells}<td>{bar}</td></tr>')
-    return _table("What is tuned", ("", "was", "now", "from", "to", "in its range"), rows)
+    now = ("result", "best in search") if ended else ("now",)
+    return _table("What is tuned", ("", "was", *now, "from", "to", "in its range"), rows)
 
 
 def _tightness(limit: dict[str, Any]) -> float:

@@ -72,8 +72,9 @@ def test_an_ended_search_links_its_report_and_is_not_loaded_again(watch):
     watch(event(1, 4.0, 4.0))
     assert "refresh" in (watch.folder / "watch.html").read_text()
     (watch.folder / "report.html").touch()
-    watch.end("ended", ["it converged"], result=True)
+    watch.end("ended", ["it converged"], result=True, values={EVIL: 0.7})
     text = (watch.folder / "watch.html").read_text()
+    assert "<td>1</td><td>0.7</td><td>4</td>" in text  # the result beside the best of the search
     assert 'href="report.html"' in text and "it converged" in text and "refresh" not in text
 
 
@@ -173,3 +174,5 @@ def test_the_command_writes_the_page(tmp_path, kind):
     text = (tmp_path / "watch.html").read_text()
     assert done.code in (0, 3) and "watch.html follows the search" in done.err
     assert 'href="report.html"' in text and "controller.Kc[0]" in text and "Ended" in text
+    found = json.loads((tmp_path / "result.json").read_text())["parameters"]["controller.Kc[0]"]
+    assert f"<td>1</td><td>{found['after']:.5g}</td>" in text and re.search(r" s\)</p>", text)

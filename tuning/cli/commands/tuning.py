@@ -20,7 +20,7 @@ from tuning.cli.options import (
 from tuning.cli.progress import Progress
 from tuning.cli.values import number, once, open_case, pair, span, whole
 from tuning.cli.values import seed as seed_of
-from tuning.cli.watch import watch_of
+from tuning.cli.watch import first_sentence, watch_of
 
 CODES = """exit codes:
   0    converged (two searches within 1 % of each other (--nominal: 0.1 %), or differential
@@ -168,7 +168,8 @@ def _tune(args):
         if progress.watch is not None:
             stopped = progress.stop or result.status == "interrupted"
             state = "interrupted" if stopped else "ended"
-            progress.watch.end(state, str(result).split("\n")[:1], result=True)
+            values = {name: result[name].after for name in result}
+            progress.watch.end(state, [first_sentence(str(result))], True, values)
     return progress.code if progress.stop else EXIT[result.status]
 
 
