@@ -205,3 +205,11 @@ def objective_unit(terms, rig_units=DEFAULT):
     """
     found = {ms.unit(m, rig_units) for m in terms}
     return found.pop() if len(found) == 1 else "-"
+
+
+def cost_unit(result):
+    """Return the unit of the objective of a TuningResult; a default answer knows that of its own,
+    whose price on changes of the inputs is in the unit of the squared error.
+    """
+    own = result.answer and result.answer.setting.cost_unit
+    return own or objective_unit(result.objective["terms"], result.tuned.loop.units)

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.report.artifacts import run_for_people
-from tuning.report.tables import number, objective_unit
+from tuning.report.tables import cost_unit, number
 from tuning.report.tuned.tables import worst_of_scenarios
 
 
@@ -39,7 +39,7 @@ def figures(result, runs=None):
         **_search_figures(result),
     }
     if result.tradeoff:
-        unit = objective_unit(result.objective["terms"], loop.units)
+        unit = cost_unit(result)
         limited = ms.unit(result.tradeoff["measure"], loop.units)
         drawn |= pictures.tradeoff(result.tradeoff, limited, unit)
     return drawn
@@ -67,7 +67,7 @@ def _title(result):
         for side, table in result.tables.items():
             broken = (result.problem.margins(table) < 0).any()
             held[side] = ", breaks a limit" if broken else ", holds all limits"
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    unit = cost_unit(result)
     unit = "" if unit == "-" else f" {unit}"
     before, after = (number(result.objective[side], 4) for side in ("before", "after"))
     gains = ", ".join(
@@ -85,7 +85,7 @@ def _search_figures(result):
 
     from jaxtank.plots import responses
 
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    unit = cost_unit(result)
     drawn = {}
     with responses.styled():
         if result.cloud is not None and len(result.cloud["objective"]):

@@ -10,7 +10,7 @@ from jaxtank.loop.trajectory import csv
 from tuning.report import html
 from tuning.report.artifacts import earlier, rig_text, run_for_people, write_result
 from tuning.report.panel import panel
-from tuning.report.tables import clean, dumps, measures_json, number, objective_unit, reasons, units
+from tuning.report.tables import clean, cost_unit, dumps, measures_json, number, reasons, units
 from tuning.report.tuned import answer
 from tuning.report.tuned.figures import CAPTIONS, figures, result_key
 from tuning.report.tuned.tables import parts_of, scenario_rows
@@ -62,7 +62,7 @@ def lines(result):
 
 def _facts(result, broken):
     """(name, number) of what stands at the top of the page; broken : limits that are violated."""
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units).replace("-", "")
+    unit = cost_unit(result).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
     held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
     facts = [

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from tuning.problem.problem import TAIL
-from tuning.report.tables import clean, number, numbers, objective_unit, table, undefined
+from tuning.report.tables import clean, cost_unit, number, numbers, table, undefined
 
 COSTLIEST, MANY = 5, 12
 """Scenarios in a table that would have more than MANY rows."""
@@ -65,7 +65,7 @@ def _measure_table(result):
     """The objective and the measures of the case's own run, and a line on which run they are of."""
     units = result.tuned.loop.units
     objective, measures = result.objective, result.measures
-    unit = objective_unit(objective["terms"], units)
+    unit = cost_unit(result)
     rows = [["objective", unit, number(objective["before"]), number(objective["after"])]]
     shown = []
     alone = set(objective["terms"])
@@ -289,7 +289,7 @@ def _choice_table(result):
         ]
         for c in result.choices
     ]
-    unit = objective_unit(result.objective["terms"], result.tuned.loop.units)
+    unit = cost_unit(result)
     sides = [f"objective {side} [{unit}]" for side in ("before", "after")]
     return [table(rows, ["choice", "status", *sides]), ""]
 
