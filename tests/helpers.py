@@ -6,6 +6,8 @@ import contextlib
 import dataclasses
 import io
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +28,7 @@ TESTS = ROOT / "tests"
 DATA = TESTS / "data"
 RIGS = DATA / "rigs"
 CASCADED_TANKS = DATA / "cascaded_tanks.csv"  # its source and licence: data/README.md
+NODE = shutil.which("node")
 
 # Folders of both packages: a folder imports those of its own or of an earlier line.
 RANKS = [
@@ -137,3 +140,11 @@ def registries_kept():
             table.update(old)
         presets.PAPERS[:] = papers
         presets._load.cache_clear()
+
+
+def node(script, given=None):
+    """What a script prints, as JSON; it knows `given` as GIVEN."""
+    text = f"const GIVEN = {json.dumps(given)};\n{script}"
+    done = subprocess.run([NODE, "-"], input=text, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

@@ -159,7 +159,9 @@ function noteFilter() {
   $("filter-note").hidden = !(state.filter && moved);
 }
 
-function changed() {
+// own: by the search that runs; whatever else changes the loop ends it
+function changed(own = false) {
+  if (!own) tuneNow.stop?.("Tuning stopped: the loop was changed");
   noteFilter();
   bands = null;
   touch();
@@ -451,7 +453,7 @@ function newWorker() {
 
 function stop() {
   if (worker) worker.terminate();
-  worker = null;
+  worker = tuneNow.stop = null;
   $("tune").textContent = "Tune";
   document.body.removeAttribute("aria-busy");
 }
@@ -480,13 +482,14 @@ function tuneNow() {
     for (const name of names)
       if (found.values && Number.isFinite(found.values[name])) state.values[name] = found.values[name];
     rows.forEach(({ update }) => update());
-    changed();
+    changed(true);
   };
   if (!names.length) {
     say("Mark at least one parameter with tune.");
     return Promise.reject(new Error("no free parameter"));
   }
   pin("before tuning");
+  const alone = data.scenarios ? ` For this run alone; jaxtank tune takes the mean of ${data.scenarios} scenario${data.scenarios > 1 ? "s" : ""}.` : "";
   const words = (found) => `objective ${shown(found.objective)}${
     found.violation > 0 ? `, limits exceeded by ${shown(100 * found.violation, 3)} %` : ""}`;
   ask({ kind: "tune", values: start, free: names, limits: info.limits, ...options() }, {
@@ -498,7 +501,7 @@ function tuneNow() {
     tuned(found) {
       apply(found);
       touch(data.drawn, true);
-      say(`Tuned in ${found.iterations} iterations (${found.status}): ${words(found)}`);
+      say(`Tuned in ${found.iterations} iterations (${found.status}): ${words(found)}.${alone}`);
       finish.resolve({ values: found.values, objective: found.objective, violation: found.violation });
     },
     failed({ text }) {
@@ -507,15 +510,16 @@ function tuneNow() {
     },
   });
   $("tune").textContent = "Stop";
-  tuneNow.stop = () => {
+  tuneNow.stop = (why = "Tuning stopped") => {
     stop();
-    say(best ? `Stopped; the best so far is set: ${words(best)}` : "Stopped before the first iteration.");
+    say(`${why}; ${best ? `the best so far is set: ${words(best)}` : "nothing was found yet"}.`);
     finish.resolve(best);
   };
   return promise;
 }
 
 function manyPlants() {
+  tuneNow.stop?.();
   const spread = {}, values = {};
   const now = effective();
   for (const leaf of leaves) {
@@ -583,6 +587,7 @@ function command() {
 const toml = () => tomlOf(data.toml, leaves, effective(), state.filter);
 
 function reset() {
+  tuneNow.stop?.();
   stop();
   state.values = {};
   state.broken.clear();
@@ -674,13 +679,13 @@ function listen() {
   $("pin").addEventListener("click", () => pin(`run ${(number += 1)}`));
   $("reset").addEventListener("click", reset);
   $("run").addEventListener("click", () => touch(data.drawn, true));
-  $("tune").addEventListener("click", () => (worker && $("tune").textContent === "Stop" ? tuneNow.stop() : tuneNow().catch(() => {})));
+  $("tune").addEventListener("click", () => (tuneNow.stop ? tuneNow.stop() : tuneNow().catch(() => {})));
   $("plants").addEventListener("click", () => {
     const on = $("plants").getAttribute("aria-pressed") !== "true";
     $("plants").setAttribute("aria-pressed", String(on));
     if (on) manyPlants();
     else {
-      if ($("tune").textContent !== "Stop") stop();
+      if (!tuneNow.stop) stop();
       bands = null;
       makeLegend();
       show();
@@ -719,8 +724,9 @@ function open() {
   const asked = location.hash.length > 1;
   if (asked) {
     state.values = found.values;
+    state.broken.clear(); // the link has the values with what is broken
     state.seed = found.seed;
-    if (found.filter !== null) state.filter = found.filter;
+    if (info.filter.present) state.filter = found.filter ?? data.filter;
     if (found.notes.length) say(found.notes.slice(0, 3).join(" "));
   } else {
     for (const one of data.presets) {

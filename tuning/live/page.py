@@ -35,6 +35,9 @@ LARGEST = 150_000
 DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
+END = "\0"
+"""What stands between the parts of a page that are packed; JSON escapes it."""
+
 KEPT = 8
 """Engines that are kept in memory."""
 
@@ -109,8 +112,8 @@ def data_of(case, presets=(), source=None):
     -------
     {"version", "origin": an Origin, "filter": whether it is on, "every" and "drawn": strides of the
     rows of a CSV file and of a picture [samples], "toml": rig file of the case, "rig": `drawing`,
-    "presets", "breaks": faults that can be switched on, "uncertain": {dotted name: half-width as a
-    share}}
+    "scenarios": how many `jaxtank tune` takes the mean of, 0 where it has the run alone, "presets",
+    "breaks": faults that can be switched on, "uncertain": {dotted name: half-width as a share}}
 
     Examples
     --------
@@ -132,6 +135,7 @@ def data_of(case, presets=(), source=None):
         "drawn": stride(case.clock.samples, 6000),
         "toml": toml,
         "rig": drawing(case.loop.plant),
+        "scenarios": len(case.scenarios or ()),
         "presets": [
             {"name": name, "values": entries(case.loop, values), "filter": on, "text": name}
             for name, values, on in presets
@@ -210,7 +214,7 @@ def assemble(engine_text, name, data):
     --------
     >>> text = assemble("function makeEngine() {}", "a <b>", {"toml": "</script>"})
     >>> "a &lt;b&gt;" in text, text.count("</script>")
-    (True, 7)
+    (True, 2)
     """
     uplot, core, own = _read("vendor/uPlot.iife.min.js"), _script("core"), _own()
     # the scripts of the page are one function, as loader.js joins them
@@ -227,14 +231,8 @@ def assemble(engine_text, name, data):
         ]
     )
     search = f"const tune=(()=>{{\n{_script('tune')}\nreturn tune;\n}})();"
-    packed = {
-        "engine": engine_text,
-        "uplot": uplot,
-        "core": core,
-        "page": own,
-        "worker": f"{search}\n{_script('worker')}",
-        "data": json.dumps(data, allow_nan=False, separators=(",", ":")),
-    }
+    facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
+    parts = [uplot, own, core, f"{search}\n{_script('worker')}", facts, engine_text]
     return "\n".join(
         [
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -243,10 +241,7 @@ def assemble(engine_text, name, data):
             f"<title>{html.escape(name)}: live</title>",
             f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
             _read("page.html"),
-            *(
-                f'<script type="text/plain" id="{n}">{_packed(t)}</script>'
-                for n, t in packed.items()
-            ),
+            f'<script type="text/plain" id="packed">{_packed(END.join(parts))}</script>',
             f"<script>{_loader()}</script>",
             "</body>\n</html>\n",
         ]

@@ -268,7 +268,11 @@ def test_the_answer_is_a_rig_that_is_left_alone_when_tuned_again(result, tmp_pat
     page = (tmp_path / "report.html").read_text()
     assert "what it gives" in page and "what to set" in page
     assert "plants that keep every limit" in page and "-&gt; 100 %" in page
-    assert f"{saved.loop.units[0]}^2</dd>" in page  # the objective, with its unit
+    # the errors on all plants at the top, in the unit of the levels
+    sides = (result.answer.before, result.answer.after)
+    errors = [f"{side.error.mean():.3g}" for side in sides]
+    words = f"<dd>{' -&gt; '.join(errors)} {saved.loop.units[0]}</dd>"
+    assert f"<dt>error, mean of 24 plants</dt>{words}" in page.replace("\n", "")
 
 
 def test_a_limit_that_no_gain_can_hold_is_said_and_ends_with_4(path):

@@ -1,14 +1,12 @@
 """The engine of a live page, run by node, against the library: runs, noise, slopes, searches."""
 
 import dataclasses
-import json
-import shutil
-import subprocess
 from importlib import resources
 
 import jax
 import numpy as np
 import pytest
+from helpers import NODE, node
 
 import jaxtank
 from jaxtank import presets, rig
@@ -17,7 +15,6 @@ from jaxtank.core.tree import get_value
 from jaxtank.export.whole.loop import served
 from tuning.live.engine import data, describe, engine, squares_of
 
-NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 # {case: what makes it short}
 SHORT = {
@@ -63,18 +60,6 @@ setTimeout(() => {
   console.log(JSON.stringify({ sent, shown, quiet }));
 }, 5);
 """
-SEARCH = """
-const e = makeEngine();
-console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 3 })));
-"""
-
-
-def node(script, given=None):
-    """What a script prints, as JSON; it knows `given` as GIVEN."""
-    text = f"const GIVEN = {json.dumps(given)};\n{script}"
-    done = subprocess.run([NODE, "-"], input=text, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
 
 
 def short(name):
@@ -220,49 +205,6 @@ def test_derivatives_are_those_of_the_library(name):
         size = np.max(np.abs(expected))
         np.testing.assert_allclose(slopes, expected, rtol=0, atol=1e-9 * max(size, 1e-9))
     np.testing.assert_allclose(matrix, np.ravel(found[2]), rtol=1e-8, atol=1e-12)
-
-
-def test_a_search_ends_where_a_scan_has_its_minimum():
-    """Of one gain, within 0.5 % of the cost of the best of 60 values."""
-    case = presets.find("cascaded/pi").replace(limits={})
-    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
-    found = node(engine(case) + search + SEARCH)
-    scan = []
-    for gain in np.geomspace(0.05, 3.3, 60):
-        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
-        scan.append(
-            float(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"])
-        )
-    assert found["status"] == "converged" and found["violation"] == 0
-    assert found["objective"] <= 1.005 * min(scan)
-
-
-def test_a_search_keeps_the_limits():
-    """The answer, run by the library: no limit is passed."""
-    case = short("gouta2015/backstepping").replace(limits={"max_level": 17.0})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
-    found = node(engine(case) + search + SEARCH)
-    loop = jaxtank.with_values(case.loop, found["values"])
-    levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
-    start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
-    assert np.max(start) > 17.0 >= np.max(levels) > 16.9
-
-
-def test_a_search_without_a_way_ends_at_the_least_violation():
-    """Of one gain, against the least of the largest violation on a scan of 60 values."""
-    case = presets.find("cascaded/pi").replace(limits={"max_level": [6.0, 5.0]})
-    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
-    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
-    found = node(engine(case) + search + SEARCH)
-    scan = []
-    for gain in np.geomspace(0.05, 3.3, 60):
-        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
-        levels = np.asarray(jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"])
-        scan.append(np.max(levels / [6.0, 5.0] - 1.0))
-    assert found["status"] == "limits not met" and min(scan) > 0.01
-    assert found["violation"] == pytest.approx(min(scan), rel=0.01, abs=1e-4)
-    assert found["violation"] <= min(scan) + 1e-6
 
 
 def test_of_runs_asked_for_meanwhile_the_newest_is_sent_and_without_a_worker_it_runs_here():

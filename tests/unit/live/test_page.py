@@ -355,8 +355,44 @@ def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
         live.page.click("#tune")
         live.wait("document.querySelector('#message').textContent.startsWith('Tuning')")
         live.page.click("#tune")
-        assert "Stopped" in live.text("#message") or "Tuned in" in live.text("#message")
+        text = live.text("#message")
+        assert text.startswith("Tuning stopped; the best so far is set: ") or "Tuned in" in text
         live.wait("document.querySelector('#tune').textContent === 'Tune'")
+
+
+@pytest.mark.parametrize("change", ["slider", "reset", "plants"])
+def test_whatever_changes_the_loop_ends_a_search(browser, written, change):
+    """Else its next point would be put on a loop that it was not found for."""
+    with opened(browser, written) as live:
+        live("() => { window.found = jaxtank.tune(); }")
+        if change == "slider":
+            live.page.locator("input[aria-label^='plant.rim[0]']").evaluate(
+                "node => { node.value = 9; node.dispatchEvent(new Event('input')); }"
+            )
+        else:
+            live.page.click(f"#{change}")
+        live("window.found")  # what asked for the search is answered
+        live.wait("document.querySelector('#tune').textContent === 'Tune'")
+        text, values = live.text("#message"), live("jaxtank.state().values")
+        if change == "slider":
+            assert text.startswith("Tuning stopped: the loop was changed; ") or "Tuned" in text
+            assert values["plant.rim[0]"] == 9.0
+        if change == "reset":
+            live.page.wait_for_timeout(300)
+            assert live("jaxtank.state().values") == {} and text == "Reset to the case."
+
+
+def test_a_link_replaces_what_is_broken(browser, written):
+    with opened(browser, written) as live:
+        live.page.click("#breaks summary")
+        live.page.click("#breaks button >> nth=0")
+        gain = live("jaxtank.state().values")["plant.pump_gain[0]"]
+        live("() => { location.hash = '#v1&controller.Kc%5B0%5D=2'; }")
+        live.wait("'controller.Kc[0]' in jaxtank.state().values")
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 2.0} and gain > 0.0
+        assert live("document.querySelector('#breaks button').getAttribute('aria-pressed')") == (
+            "false"
+        )
 
 
 @pytest.mark.slow

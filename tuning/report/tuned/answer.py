@@ -156,6 +156,18 @@ def _effects(answer):
     return table(rows, heads[: 1 + len(sides)])
 
 
+def facts_of(answer):
+    """(name, value before -> after) of the errors on the plants that judged an Answer."""
+    if answer.after is None:
+        return []
+    unit, sides = answer.setting.case.loop.units[0], (answer.before, answer.after)
+    rows = [
+        (f"error, mean of {answer.after.samples} plants", [_mean(s.error, s) for s in sides]),
+        ("error, nominal plant", [number(e, 3) for e in answer.nominal.values()]),
+    ]
+    return [(name, f"{' -> '.join(cells)} {unit}") for name, cells in rows]
+
+
 def _margins(answer):
     """The rows of the sensitivity peak and the delay margin of the linearised nominal loop."""
     sides = [m for m in answer.measures.values() if "sensitivity_peak" in m]

@@ -61,13 +61,22 @@ def lines(result):
 
 
 def _facts(result, broken):
-    """(name, number) of what stands at the top of the page; broken : limits that are violated."""
+    """(name, number) of what stands at the top of the page; broken : limits that are violated.
+
+    Of a default answer the errors in the unit of the levels, unless the user has minimised
+    something else.
+    """
     unit = cost_unit(result).replace("-", "")
     before, after = result.objective["before"], result.objective["after"]
     held = f"{len(result.constraints) - broken} of {len(result.constraints)} hold"
-    facts = [
+    own = [
         ("objective before", f"{number(before)} {unit}".strip()),
         ("objective after", f"{number(after)} {unit}".strip()),
+    ]
+    if result.answer and not result.answer.setting.own_objective:
+        own = answer.facts_of(result.answer) or own
+    facts = [
+        *own,
         ("limits", held if result.constraints else "none"),
         ("gains tuned", str(sum(p["exercised"] for p in result.parameters.values()))),
         ("simulations", str(result.evaluations["simulations"])),

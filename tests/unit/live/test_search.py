@@ -1,0 +1,121 @@
+"""The search of a live page, run by node, against scans and the search of the command."""
+
+from importlib import resources
+
+import numpy as np
+import pytest
+from helpers import NODE, node
+
+import jaxtank
+from jaxtank import presets, rig
+from tuning.live.engine import engine
+from tuning.problem.limits import limit_scale, resolve_limits
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
+SEARCH = """
+const e = makeEngine();
+console.log(JSON.stringify(tune(e, {}, e.info.free, e.info.limits, null, null, { starts: 3 })));
+"""
+
+
+def test_a_search_ends_where_a_scan_has_its_minimum():
+    """Of one gain, within 0.5 % of the cost of the best of 60 values."""
+    case = presets.find("cascaded/pi").replace(limits={})
+    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    scan = []
+    for gain in np.geomspace(0.05, 3.3, 60):
+        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
+        scan.append(
+            float(jaxtank.evaluate(loop, case.clock, ["rms_error_total"])["rms_error_total"])
+        )
+    assert found["status"] == "converged" and found["violation"] == 0
+    assert found["objective"] <= 1.005 * min(scan)
+
+
+def test_a_search_keeps_the_limits():
+    """The answer, run by the library: no limit is passed."""
+    case = rig.set_values(
+        presets.find("gouta2015/backstepping"), {"clock.dt": 0.5, "clock.duration": 300.0}
+    ).replace(limits={"max_level": 17.0})
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    loop = jaxtank.with_values(case.loop, found["values"])
+    levels = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
+    start = jaxtank.evaluate(case.loop, case.clock, ["max_level"])["max_level"]
+    assert np.max(start) > 17.0 >= np.max(levels) > 16.9
+
+
+def test_a_search_without_a_way_ends_at_the_least_violation():
+    """Of one gain, against the least of the largest violation on a scan of 60 values."""
+    case = presets.find("cascaded/pi").replace(limits={"max_level": [6.0, 5.0]})
+    case = case.replace(free={"controller.Kc": (0.05, 3.3, "log")})
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    scan = []
+    for gain in np.geomspace(0.05, 3.3, 60):
+        loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
+        levels = np.asarray(jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"])
+        scan.append(np.max(levels / [6.0, 5.0] - 1.0))
+    assert found["status"] == "limits not met" and min(scan) > 0.01
+    assert found["violation"] == pytest.approx(min(scan), rel=0.01, abs=1e-4)
+    assert found["violation"] <= min(scan) + 1e-6
+
+
+def ends_like_the_command(name):
+    """Within 0.5 % of `tune --nominal` of the case's own run, with the same limits passed.
+
+    Of the same point: the library runs what the search in JavaScript has found.
+    """
+    import tuning
+
+    case = presets.find(name).replace(scenarios=())
+    search = resources.files("tuning.live").joinpath("tune.js").read_text("utf-8")
+    found = node(engine(case) + search + SEARCH)
+    wanted = tuning.tune(case, nominal=True, validation=0)
+    loop = jaxtank.with_values(case.loop, found["values"])
+    measures = [*case.objective, *(limit.measure for limit in resolve_limits(case))]
+    own = jaxtank.evaluate(loop, case.clock, list(dict.fromkeys(measures)))
+    cost = sum(weight * float(np.sum(own[m])) for m, weight in case.objective.items())
+    assert found["objective"] == pytest.approx(cost, rel=1e-6)
+    assert found["objective"] <= 1.005 * wanted.objective["after"]
+    passed = max(
+        [0.0]
+        + [
+            float(limit.sign * (np.ravel(own[limit.measure])[limit.index] - limit.value))
+            / float(limit_scale(limit, case.loop))
+            for limit in resolve_limits(case)
+        ]
+    )
+    assert found["violation"] == pytest.approx(passed, abs=1e-6)
+    return found["violation"], wanted
+
+
+def test_a_search_ends_where_that_of_the_command_ends():
+    assert ends_like_the_command("dts200/pi")[0] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "calofir/backstepping",
+        "cascaded/pi",
+        "gouta2015/backstepping",
+        "gouta2022/chadpc",
+        "gouta2022/pi",
+        "johansson/pi-minimum",
+        "khalid/gpc",
+        "mirakhorli/sfc",
+    ],
+)
+def test_searches_of_all_papers_end_where_those_of_the_command_end(name):
+    assert ends_like_the_command(name)[0] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gouta2015/backstepping-ff", "gouta2015/ngpc"])
+def test_limits_that_no_gains_keep_are_passed_as_little_as_by_the_command(name):
+    violation, wanted = ends_like_the_command(name)
+    assert violation > 0.01 and not wanted.success
