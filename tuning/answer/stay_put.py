@@ -38,6 +38,9 @@ an earlier answer, which may cost WORTH already, on plants and limits that diffe
 TOLERANCE = 1e-4
 """Change of the cost, as a share of its first value, at which a search has converged [-]."""
 
+FINE = 0.1
+"""Share of WORTH to which the cost with some gains at their first values is searched [-]."""
+
 PROBES = 3
 """Differential evolutions that are tried, at most, until one finds nothing better."""
 
@@ -81,7 +84,8 @@ class Subspace(Search):
 
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
         # its owner reports every evaluation already
-        super().__init__(owner.problem, owner.last_finite, lambda search: None, owner.tolerance)
+        tolerance = max(owner.tolerance, FINE * WORTH)
+        super().__init__(owner.problem, owner.last_finite, lambda search: None, tolerance)
         self.scale, self.owner, self.fixed = owner.scale, owner, z
         self.free: np.ndarray = np.asarray(free)
 

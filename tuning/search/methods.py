@@ -27,6 +27,8 @@ ITERATION_LIMIT = 9
 COARSE_TOLERANCE = 1e-4
 """Tolerance of the search at a tenth of the samples, whose own error is larger [-]."""
 
+EXACT = 1e-8
+"""Tolerance of a search up to which Gauss-Newton goes on to rounding: it takes few steps there."""
 
 RESTORED = 5
 """Points from which the least violation is searched for, where no search met the limits."""
@@ -134,10 +136,13 @@ def _epigraph(search, z, iterations, tolerance):
 def trf(search, z, iterations, tolerance=1e-10):
     """Return True if a bounded Gauss-Newton trust region converged, without the limits.
 
+    tolerance: share of the cost, of the step and of the slope at which it ends, or that of the
+    search where this is wider than EXACT: what a mean over plants is worth.
     On P + 1 residuals that have the cost's value, gradient and second derivative, the latter
     without the residuals' own curvature: with value c, gradient g and normal matrix L L', the
     residuals are (L^-1 g, sqrt(c - |L^-1 g|^2)) and their Jacobian is (L', 0).
     """
+    tolerance = max(tolerance, search.tolerance) if search.tolerance > EXACT else tolerance
     squared = search.problem.model == "square"
     weight = search.problem.objective[ROOT] if squared else 1.0
 
