@@ -60,7 +60,7 @@ class Partition(NamedTuple):
 
 
 # the values as a tuple: a dict would come back with its keys sorted
-@compiled("clock", "names", "order", "squares", "batched")
+@compiled("clock", "names", "order", "squares", "batched", keep=True)
 def sensitivities_compiled(
     loop: ClosedLoop,
     clock: Clock,

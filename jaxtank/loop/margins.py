@@ -110,12 +110,14 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             f"stability margins need a reference that holds setpoints: a {kind} has none"
             " (signals.Ramps and signals.Constant have)"
         )
-    r: Any = jnp.stack([jnp.stack([jnp.asarray(v, jnp.float64) for v in row]) for row in held])
+    traced = any(isinstance(v, Tracer) for v in jax.tree.leaves((loop, held)))
+    xp: Any = jnp if traced else np
+    r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in held])
     bare = dataclasses.replace(
         loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None
     )
     one = functools.partial(_compiled, bare, dataclasses.replace(clock, duration=clock.dt))
-    if any(isinstance(v, Tracer) for v in jax.tree.leaves((bare, r))):
+    if traced:
         # one after the other: a program for one of them is compiled in half the time
         return (r, *cast(tuple[Any, ...], jax.lax.map(one, r)))
     rows = [one(v) for v in r]  # by one program, however many there are
@@ -123,10 +125,10 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
 
 
 def _stacked(*values: Any) -> Any:
-    return jnp.stack(values)
+    return np.stack([np.asarray(v) for v in values])
 
 
-@compiled("clock")
+@compiled("clock", keep=True)
 def _compiled(loop: ClosedLoop, clock: Clock, r: Any) -> tuple[Any, am.Margins]:
     """(Linearised, Margins) of one plateau with setpoints r (outputs,)."""
     found = linearised(loop, clock, r)
@@ -141,13 +143,14 @@ def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
     infinite for the margins.
     """
     _, linear, found = _of_plateaus(loop, clock)
+    xp: Any = np if isinstance(linear.why, np.ndarray) else jnp  # by numpy nothing is compiled
     good, unstable = linear.why == 0, (linear.why == 0) & ~found.stable
 
     def least(values: Any) -> Any:
         used = good.reshape(-1, *(1,) * (values.ndim - 1))
-        chosen = jnp.min(jnp.where(used, values, jnp.inf), axis=0)
-        chosen = jnp.where(jnp.any(unstable), -jnp.inf, chosen)
-        return jnp.where(jnp.any(good), chosen, jnp.nan)
+        chosen = xp.min(xp.where(used, values, np.inf), axis=0)
+        chosen = xp.where(xp.any(unstable), -np.inf, chosen)
+        return xp.where(xp.any(good), chosen, np.nan)
 
     return ms.Worst(
         -least(-found.sensitivity_peak),

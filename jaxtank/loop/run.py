@@ -227,7 +227,7 @@ def _names(measures: str | Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]
     return names
 
 
-@compiled("clock", "names", "checkpoint")
+@compiled("clock", "names", "checkpoint", keep=True)
 def evaluate_compiled(
     loop: ClosedLoop, clock: Clock, names: tuple[str, ...], key: jax.Array | None, checkpoint: bool
 ) -> tuple[dict[str, jax.Array], jax.Array]:

@@ -17,6 +17,7 @@ from jaxtank.measures.accumulators import ACCUMULATORS, Accumulator, Context
 from jaxtank.measures.catalogue import MEASURES
 from jaxtank.measures.functions import from_function, functions
 from jaxtank.measures.measure import Measure
+from jaxtank.xla.signatures import OWN
 
 BUILT_IN = frozenset(MEASURES)
 GROUP = "jaxtank.measures"
@@ -98,6 +99,7 @@ def register(
         jax.clear_caches()  # compiled runs know a measure by its name
     ACCUMULATORS.update(own)
     MEASURES[name] = _COMPILED[name] = measure
+    OWN.add(name)
     return measure
 
 

@@ -1,15 +1,26 @@
-"""`jax.jit` with the type of the function that it compiles kept. May import nothing of ours."""
+"""`jax.jit` with the type of the function that it compiles kept. Imports `xla` only."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, cast
 
 import jax
 
+from jaxtank.xla.executables import Kept
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(*static: str) -> Callable[[F], F]:
-    """Return `jax.jit` as a decorator; static: names of the arguments that are part of the program.
+def compiled(
+    *static: str, options: Mapping[str, Any] | None = None, keep: bool = False
+) -> Callable[[F], F]:
+    """Return `jax.jit` as a decorator.
+
+    Parameters
+    ----------
+    static : names of the arguments that are part of the program.
+    options : of the compiler.
+    keep : whether programs are kept between processes, where the user keeps any (`jaxtank.cache`):
+        for those that take long to trace.
 
     Examples
     --------
@@ -22,6 +33,7 @@ def compiled(*static: str) -> Callable[[F], F]:
 
     def decorate(function: F) -> F:
         jit: Any = jax.jit
-        return cast(F, jit(function, static_argnames=static))
+        made = jit(function, static_argnames=static, compiler_options=options)
+        return cast(F, Kept(function, made, static) if keep else made)
 
     return decorate

@@ -23,8 +23,14 @@ OFF = ("0", "off", "false", "no")
 LARGEST = 128 * 2**20
 """Bytes of the programs of one version above which those compiled first are removed."""
 
+HALF_WRITTEN = 600.0
+"""Age of a temporary file at which no process writes it any more [s]."""
+
 ENTRY, DIGEST = "-cache", ".sha256"
 """Ends of the names of an entry, as jax writes it, and of the digest beside it."""
+
+folder: Path | None = None
+"""Where this process keeps its programs, once `cache` or `keep_for_this_process` has said so."""
 
 VERSION_FOLDER = re.compile(r"\d[\w.+]*-[0-9a-f]{12}")
 """Folder of the programs of one version of jaxtank on one sort of processor."""
@@ -70,6 +76,7 @@ def cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
         config.update("jax_compilation_cache_dir", str(found))
         for name, value in SETTINGS.items():
             config.update(name, value)
+        _remember(found)
     return found
 
 
@@ -93,10 +100,17 @@ def keep_for_this_process() -> str:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
         for name, value in SETTINGS.items():
             os.environ.setdefault(name.upper(), str(value))
+        _remember(folder)
         # of an entry that another process has removed or is writing: it is compiled again
         words = "Error (reading|writing) persistent compilation cache"
         warnings.filterwarnings("ignore", message=words)
     return why
+
+
+def _remember(found: Path) -> None:
+    """Keep whole programs (`executables`) there too."""
+    global folder
+    folder = found
 
 
 def base_folder(folder: str | os.PathLike[str] | None = None) -> Path | None:
@@ -264,7 +278,10 @@ def processor() -> str:
 
 
 def _check_entries(folder: Path) -> None:
-    """Remove entries that are damaged, and the oldest ones of too many."""
+    """Remove entries that are damaged, the oldest ones of too many, and what was half written."""
+    for path in folder.glob(f"*{ENTRY}.[0-9]*"):
+        if path.stat().st_mtime < time.time() - HALF_WRITTEN:
+            path.unlink(missing_ok=True)
     sound: list[tuple[float, int, Path]] = []
     for path in _entries(folder):
         try:

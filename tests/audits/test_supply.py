@@ -79,6 +79,7 @@ READS = {
 MADE = {
     ("tuning.answer.answer", "_lines", "import_module"): "its own report, by a constant name",
     ("jaxtank", "__getattr__", "import_module"): "names of its own table, in its own package",
+    ("jaxtank.xla.executables", "_tree", "import_module"): "of a named tuple of ours, of an entry",
     ("tuning", "__getattr__", "import_module"): "names of its own table, in its own package",
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
@@ -104,6 +105,8 @@ READ = {
     ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "in a folder of mode 700 and"
     " the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
+    ("jaxtank.xla.executables", "_read", "read_bytes"): "an entry of that folder, checked by its"
+    " digest when the process began; jax unpickles it, as it loads native code",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",

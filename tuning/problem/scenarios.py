@@ -26,6 +26,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla import flags
+from jaxtank.xla.jit import compiled
 
 MANY = 1024
 """Scenarios that one tuning may have."""
@@ -273,9 +274,7 @@ def _first_axis(value: Any) -> Any:
     return value[None]
 
 
-@functools.partial(
-    jax.jit, static_argnames=("shape", "clock", "names"), compiler_options=flags.WIDE
-)
+@compiled("shape", "clock", "names", options=flags.WIDE, keep=True)
 def _values(
     leaves: Any, keys: Any, shape: Shape, clock: Clock, names: tuple[str, ...], points: Any
 ) -> Any:
@@ -288,11 +287,7 @@ def _values(
     return jax.vmap(at)(points)
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=("shape", "clock", "names", "order", "squares"),
-    compiler_options=flags.WIDE,
-)
+@compiled("shape", "clock", "names", "order", "squares", options=flags.WIDE, keep=True)
 def _slopes(
     leaves: Any,
     keys: Any,

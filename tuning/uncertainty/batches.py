@@ -1,6 +1,5 @@
 """Batches of runs of one case on drawn parameters, on one device or many; used by the studies."""
 
-import functools
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,6 +11,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.xla.flags import WIDE
+from jaxtank.xla.jit import compiled
 from tuning.problem import scenarios as sc
 from tuning.uncertainty.sampling import check_whole
 
@@ -84,7 +84,7 @@ def run_batch(case, names, seed, rows, indices, device=None):
     return {n: np.asarray(v) for n, v in found.items()}
 
 
-@functools.partial(jax.jit, static_argnames=("clock", "names", "seed"), compiler_options=WIDE)
+@compiled("clock", "names", "seed", options=WIDE, keep=True)
 def _run(loop, values, indices, seed, clock, names):
     def one(values, index):
         noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
@@ -228,7 +228,7 @@ def fan_of(case, values, seed):
     }
 
 
-@functools.partial(jax.jit, static_argnames=("seed", "clock", "every"))
+@compiled("seed", "clock", "every", keep=True)
 def _trajectories(loop, values, indices, seed, clock, every):
     def one(values, index):
         noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)

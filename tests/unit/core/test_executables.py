@@ -1,0 +1,148 @@
+"""Whole programs kept between processes: the same bits, and found only where all is the same."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import measures, presets
+from jaxtank.loop.run import evaluate_compiled
+from jaxtank.xla import executables, program_cache, signatures
+
+SCRIPT = """
+import json, sys, jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_log_compiles", True)
+import jaxtank
+from jaxtank import presets
+if sys.argv[1] != "none":
+    jaxtank.cache(sys.argv[1])
+case = presets.find("cascaded/pi")
+clock = jaxtank.Clock(dt=4.0, duration=400.0)
+names = ["rms_error_total", "input_deviation", "settling_time"]
+found = jaxtank.evaluate(case.loop, clock, names)
+slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.Kc": [1.0]})
+flat = [v for part in (found, *slopes[:2]) for v in part.values()] + [slopes[2]]
+print(json.dumps([[float(x).hex() for x in jax.numpy.ravel(v)] for v in flat]))
+"""
+
+
+def run(folder):
+    """(what the script prints, names of the programs that it has compiled)."""
+    env = {n: v for n, v in os.environ.items() if not n.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(folder)], capture_output=True, text=True, env=env
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stderr.splitlines() if "Compiling" in line]
+    large = [n for n in ("evaluate_compiled", "sensitivities_compiled") if n in " ".join(lines)]
+    return json.loads(done.stdout), large
+
+
+def whole(folder):
+    return sorted(folder.glob(f"*/*{executables.ENDING}"))
+
+
+def test_a_program_that_is_known_is_not_traced_and_gives_the_same_bits(tmp_path):
+    """With LAPACK in it, whose functions a new process has not looked up yet; and damaged."""
+    folder = tmp_path / "kept"
+    plain, compiled = run("none")
+    assert compiled == ["evaluate_compiled", "sensitivities_compiled"]
+    first, compiled = run(folder)
+    assert len(compiled) == 2 and len(whole(folder)) == 2
+    assert any(b'"lapack": true' in path.read_bytes()[:300] for path in whole(folder))
+    second, compiled = run(folder)
+    assert compiled == [] and plain == first == second
+    assert not list(folder.glob("*/*.tried"))
+    one, other = whole(folder)
+    one.with_name(f"{one.name}.tried").touch()  # a process ended in its first run
+    other.write_bytes(other.read_bytes()[:-50])
+    third, compiled = run(folder)
+    assert len(compiled) == 2 and third == first
+    assert run(folder) == (first, [])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(program_cache, "folder", tmp_path)
+    monkeypatch.setattr(evaluate_compiled, "programs", {})
+    return tmp_path
+
+
+def evaluated(loop, names=("iae",), dt=4.0, duration=104.0):
+    return jaxtank.evaluate(loop, jaxtank.Clock(dt=dt, duration=duration), list(names))
+
+
+def names_of(folder):
+    return {path.name for path in folder.glob(f"*{executables.ENDING}")}
+
+
+def test_whatever_changes_a_program_changes_its_name(folder, monkeypatch):
+    loop = presets.find("cascaded/pi").loop
+    evaluated(loop)
+    assert len(names_of(folder)) == 1
+    evaluated(jaxtank.with_values(loop, {"controller.Kc": 2.0}))  # a number is no other program
+    assert len(names_of(folder)) == 1
+    evaluated(loop, dt=2.0)
+    evaluated(loop, names=("ise",))
+    # a switch of the plant, which is static
+    evaluated(
+        dataclasses.replace(
+            loop, plant=dataclasses.replace(loop.plant, overflow=not loop.plant.overflow)
+        )
+    )
+    count = len(names_of(folder))
+    assert count == 4
+    evaluate_compiled.programs.clear()
+    monkeypatch.setattr(signatures, "_process", lambda: ["another version"])
+    evaluated(loop)
+    assert len(names_of(folder)) == count + 1
+
+
+def test_a_class_or_a_measure_of_the_users_own_is_never_kept(folder):
+    loop = presets.find("cascaded/pi").loop
+
+    @jaxtank.component
+    class Own(type(loop.controller)):
+        pass
+
+    fields = {f.name: getattr(loop.controller, f.name) for f in dataclasses.fields(loop.controller)}
+    # of another length: what is not kept is in the cache of jax, from which nothing is kept
+    evaluated(dataclasses.replace(loop, controller=Own(**fields)), duration=100.0)
+    assert names_of(folder) == set()
+    spec = measures.MEASURES["iae"]._replace(doc="another")
+    measures.register("own_measure", spec)
+    try:
+        evaluated(loop, names=("own_measure",), duration=100.0)
+    finally:
+        del measures.MEASURES["own_measure"]
+    assert names_of(folder) == set()
+
+
+def test_inside_a_transformation_nothing_is_kept(folder):
+    loop = presets.find("cascaded/pi").loop
+
+    def cost(gain):
+        here = jaxtank.with_values(loop, {"controller.Kc": gain})
+        return evaluated(here, names=("rms_error_total",))["rms_error_total"]
+
+    step = 1e-6
+    slope = float(jax.grad(lambda k: cost(k[None]))(np.float64(1.0)))
+    difference = (cost(np.array([1.0 + step])) - cost(np.array([1.0 - step]))) / (2 * step)
+    assert slope == pytest.approx(float(difference), rel=1e-5)
+    assert len(names_of(folder)) == 1  # that of the two runs
+
+
+def test_names_of_static_values_are_exact():
+    of = signatures.words_of
+    assert of(1) != of(1.0) != of("1") and of(0.0) != of(-0.0) and of((1,)) != of([1])
+    assert of(np.arange(3)) != of(np.arange(4)) and of({"a": 1}) != of({"a": 2})
+    for unknown in (object(), lambda: None, os.environ):
+        with pytest.raises(signatures.Unknown):
+            of(unknown)
