@@ -63,6 +63,18 @@ class Controller(abc.ABC):
         """
         return ()
 
+    def shares(self, x: tuple[Any, ...], r: tuple[Any, ...]) -> tuple[Any, ...] | None:
+        """Return the share of the first of two blended controllers in each input [-].
+
+        For a picture of who is at work; None for a controller that is none of several.
+
+        Parameters
+        ----------
+        x : estimated levels, arrays of one shape [cm]
+        r : setpoints [cm]
+        """
+        return None
+
     def init(self, x0: tuple[Any, ...], u0: tuple[Any, ...]) -> Any:
         """Return the state before the first sample.
 

@@ -120,11 +120,14 @@ class FuzzyBlend(Controller):
             for i, u in enumerate(slide(*design, estimate.x, tick.r, u0, state, estimate.d))
         ]
         near = feedback(self.K, estimate.x, h0, u0)
-        size = [magnitude(h - r) for h, r in zip(estimate.x, tick.r)]
-        share = [
-            membership(size[j], self.b[i], self.w[i]) for i, j in enumerate(PAIRINGS[self.pairing])
-        ]
+        share = self.shares(tuple(estimate.x), tuple(tick.r))
         return tuple(n + m * (f - n) for m, f, n in zip(share, far, near)), state
+
+    def shares(self, x: tuple[Any, ...], r: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return the share of sliding mode in each input [-], mu_H; the rest is state feedback."""
+        size = [magnitude(h - target) for h, target in zip(x, r)]
+        pairs = enumerate(PAIRINGS[self.pairing])
+        return tuple(membership(size[j], self.b[i], self.w[i]) for i, j in pairs)
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state

@@ -70,7 +70,9 @@ def simulate_compiled(
     for name in COLUMNS:
         value: Any = getattr(saved, name)
         columns[name] = value if is_array(value) else jnp.stack(value, axis=-1)
-    return Trajectory(**columns, units=loop.units), is_broken(state)
+    shares = loop.controller.shares(*(tuple(columns[name].T) for name in ("x_hat", "r")))
+    share = None if shares is None else jnp.stack(shares, axis=-1)
+    return Trajectory(**columns, units=loop.units, share=share), is_broken(state)
 
 
 def _first(a: Any) -> Any:

@@ -27,6 +27,7 @@ FIELDS = (
     ("command", "command", "V"),
     ("spilled", "spilled", "cm^3"),
     ("d_hat", "d_hat", "cm/s"),
+    ("share", "share", "-"),
 )
 """Columns of a run: (name, field of `Trajectory`, unit)."""
 
@@ -34,7 +35,9 @@ COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied",
 """The fields of a `Trajectory` that are arrays."""
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=COLUMNS, meta_fields=("units",))
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=(*COLUMNS, "share"), meta_fields=("units",)
+)
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Trajectory:
     """A run for people: row k is the state at t_k, before the plant moves on.
@@ -57,6 +60,9 @@ class Trajectory:
     spilled : (rows, tanks) array
         Volume lost over each rim since the start [cm^3].
     units : (length, pump input)
+    share : (rows, pumps) array or None
+        Of a controller that blends two, the share of the first in each input [-]: of sliding mode
+        in that of `FuzzyBlend`.
 
     Examples
     --------
@@ -82,6 +88,7 @@ class Trajectory:
     u: Any
     spilled: Any
     units: tuple[str, str] = DEFAULT
+    share: Any = None
 
     def replace(self, **changes: Any) -> "Trajectory":
         """Return a copy with the named fields changed."""
@@ -93,8 +100,9 @@ class Trajectory:
         """
         units = {"t": "s", "e": local("cm", self.units), "applied": local("V", self.units)}
         units |= {field: local(unit, self.units) for _, field, unit in FIELDS}
-        found: dict[str, Any] = {"units": {name: units[name] for name in COLUMNS}}
-        return found | {name: clean(getattr(self, name)) for name in COLUMNS}
+        names = [*COLUMNS, *(["share"] if self.share is not None else [])]
+        found: dict[str, Any] = {"units": {name: units[name] for name in names}}
+        return found | {name: clean(getattr(self, name)) for name in names}
 
     def plot(self) -> dict[str, Any]:
         """Return matplotlib figures {name: figure}: levels and setpoints, errors, inputs.
@@ -185,6 +193,8 @@ def columns(
     """
     found: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
+        if getattr(run, field) is None:  # not of this controller
+            continue
         values = np.asarray(getattr(run, field))
         found |= {
             (f"{name}{i + 1}", local(unit, units)): values[:, i] for i in range(values.shape[1])

@@ -217,6 +217,31 @@ def disturbance(ax, run, tank, inflow=None, unit="cm/s"):
     return ax
 
 
+def share(ax, run, pump, of=("sliding mode", "state feedback")):
+    """Draw the share of two blended controllers, named in `of`, in one input; returns the axes.
+
+    Parameters
+    ----------
+    ax : matplotlib axes
+    run : Trajectory with `share`
+    pump : index of the pump
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from types import SimpleNamespace
+    >>> run = SimpleNamespace(t=np.arange(3.0), share=np.ones((3, 1)))
+    >>> len(share(Figure().gca(), run, 0).collections)
+    2
+    """
+    first = run.share[:, pump]
+    ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
+    ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
+    ax.set(title=f"input of pump {pump + 1}", ylabel="share [-]", ylim=(0.0, 1.0))
+    ax.margins(x=0.0)
+    return ax
+
+
 MANY = 16
 """Limits in a picture of margins at most: those with the smallest margins."""
 

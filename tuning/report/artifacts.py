@@ -11,6 +11,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
+from tuning.report import figures
 from tuning.report.figures import failed
 from tuning.report.tables import dumps
 
@@ -105,15 +106,17 @@ def save_run(case, run, payload, folder, gif=False, page=None):
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
-    names = ("responses.png", "run.gif", "report.html")
+    names = ("responses.png", "estimates.png", "shares.png", "run.gif", "report.html")
     stale = [Path(folder) / name for name in names] if old else []
-    written = write_result(
-        folder,
-        files,
-        lambda: {"responses": responses.responses(case.loop, {case.name: run}, case.title)},
-        page,
-        stale,
-    )
+
+    def pictures():
+        return {
+            "responses": responses.responses(case.loop, {case.name: run}, case.title),
+            **figures.estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
+            **figures.shares(run, f"{case.name}: shares of the blended controllers"),
+        }
+
+    written = write_result(folder, files, pictures, page, stale)
     if gif:
         from jaxtank.plots.animation import animate
 

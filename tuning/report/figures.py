@@ -126,6 +126,28 @@ def estimates(loop, clock, run, title=""):
     return {"estimates": figure}
 
 
+def shares(run, title=""):
+    """Return {"shares": share of two blended controllers in each input}; {} without any."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank.plots import diagnostics, responses
+
+    if run.share is None:
+        return {}
+    pumps = run.share.shape[1]
+    with responses.styled():
+        figure, axes = plt.subplots(
+            1, pumps, figsize=(max(6.4, 3.2 * pumps), 2.9), squeeze=False, layout="constrained"
+        )
+        for j, ax in enumerate(axes[0]):
+            diagnostics.share(ax, run, j)
+            ax.set_xlabel("time [s]")
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=2)
+        figure.suptitle(responses.plain(title), fontsize=10)
+    return {"shares": figure}
+
+
 def margins(rows):
     """Return {"margins": margin to every limit}; {} where there are none."""
     import matplotlib.pyplot as plt

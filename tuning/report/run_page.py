@@ -7,7 +7,17 @@ from tuning.problem.limits import resolve_limits
 from tuning.report import html, tables
 from tuning.report.panel import panel
 
-CAPTIONS = {"responses": "Levels with setpoints and rims, and the inputs of the pumps."}
+CAPTIONS = {
+    "responses": "Levels with setpoints and rims, and the inputs of the pumps.",
+    "estimates": (
+        "What the observer estimated: levels with their readings, and disturbances of their rates"
+        " with the inflow disturbance, where there is one; they hold all errors of the model."
+    ),
+    "shares": (
+        "The share of each of the two blended controllers in each input: the first acts far from"
+        " the setpoint, the second near it."
+    ),
+}
 """{picture: what it shows}."""
 
 WORST = 12

@@ -1,5 +1,6 @@
 """`jaxtank list`, `show`, `simulate`, `init` and `export`: the cases, and one case as it is."""
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -29,6 +30,13 @@ def add(commands, parents):
         help="one run: measures; with --out its trajectory, pictures and report.html",
     )
     one.set_defaults(run=simulate)
+    one.add_argument(
+        "others",
+        nargs="*",
+        metavar="CASE",
+        help="further cases, on one page and in one table with the first: under its disturbances,"
+        " faults and noise",
+    )
     one.add_argument(
         "--gif",
         action="store_true",
@@ -112,6 +120,8 @@ def _draw_rig(case, folder):
 
 def simulate(args):
     """Run a case once and print its measures; with --out write the run."""
+    if args.others:
+        return _together(args)
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
     seed, case = seed_of(args), open_case(args)
@@ -157,6 +167,27 @@ def simulate(args):
             print(f"\n{margin_tables.text(case.loop, plateaus)}")
         if case.loop.safety_filter is not None:
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
+    report_written(written, args)
+    return 0
+
+
+def _together(args):
+    """Run several cases under the same conditions; one table, and with --out one page."""
+    for flag, given in (("--gif", args.gif), ("--margins", args.margins)):
+        if given:
+            raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")
+    seed = seed_of(args)
+    names = [args.case, *args.others]
+    cases = [open_case(argparse.Namespace(**{**vars(args), "case": name})) for name in names]
+    from tuning.report import tables
+    from tuning.report.studies import together
+
+    runs = together.run_together(cases, seed)
+    written = together.save(runs, args.out, seed, args.line) if args.out else []
+    if args.json:
+        print(tables.dumps(together.json_of(runs, seed)))
+    else:
+        print("\n".join(map(str, together.lines_of(runs))))
     report_written(written, args)
     return 0
 

@@ -1,0 +1,61 @@
+"""What `simulate --out` writes beside levels and inputs: disturbances, shares of a blend."""
+
+import csv
+
+import numpy as np
+import pytest
+from helpers import command
+
+import jaxtank
+from jaxtank import presets
+
+
+def written(tmp_path, case, *words):
+    done = command("simulate", case, *words, "--out", str(tmp_path), "--quiet")
+    assert done.code == 0, done.err
+    with open(tmp_path / "trajectory.csv") as file:
+        head, *rows = csv.reader(file)
+    return dict(zip(head, np.array(rows, dtype=float).T)), {p.name for p in tmp_path.iterdir()}
+
+
+def test_the_share_of_sliding_mode_is_the_smoothstep_of_the_other_outputs_error(tmp_path):
+    """Eqs. (16)-(17) of mirakhorli with the pairing of the text: input i by output 3 - i."""
+    found, files = written(tmp_path, "mirakhorli/hybrid", "--set", "sensor.noise=0")
+    law = presets.find("mirakhorli/hybrid").loop.controller
+    for i, j in ((0, 1), (1, 0)):
+        size = np.abs(found[f"h{j + 1} [cm]"] - found[f"r{j + 1} [cm]"])
+        b, w = float(law.b[i]), min(float(law.w[i]), float(law.b[i]))
+        x = np.clip((size - b + w) / (2 * w), 0.0, 1.0)
+        share = found[f"share{i + 1} [-]"]
+        np.testing.assert_allclose(share, x**2 * (3 - 2 * x), atol=1e-7)
+        assert share.max() == 1.0 and share.min() == 0.0
+    assert list(found)[-2:] == ["share1 [-]", "share2 [-]"]
+    page = (tmp_path / "report.html").read_text()
+    assert "shares.png" in files and "estimates.png" not in files and "blended" in page
+
+
+def test_an_estimated_disturbance_is_drawn_and_kept_and_an_earlier_picture_goes(tmp_path):
+    (tmp_path / "trajectory.csv").write_text("of an earlier run")
+    (tmp_path / "shares.png").write_bytes(b"of an earlier run")
+    found, files = written(tmp_path, "gouta2022/chadpc")
+    assert list(found)[-2:] == ["d_hat1 [cm/s]", "d_hat2 [cm/s]"]
+    assert "estimates.png" in files and "shares.png" not in files
+    # while the kick lasts, the pump of its tank is off, and its dead zone no model error
+    case = presets.find("gouta2022/chadpc")
+    known = np.max(np.asarray(case.loop.disturbance.sample(case.clock)[0][0]))
+    assert found["d_hat1 [cm/s]"].max() == pytest.approx(
+        known / float(np.asarray(case.loop.plant.area)[0]), rel=0.02
+    )
+    assert "What the observer estimated" in (tmp_path / "report.html").read_text()
+
+
+def test_only_a_blend_has_shares():
+    clock = jaxtank.Clock(dt=4.0, duration=40.0)
+    run = jaxtank.simulate(presets.find("cascaded/pi").loop, clock)
+    assert run.share is None and "share" not in run.to_json()
+    from jaxtank.loop.trajectory import csv as text
+
+    assert "share" not in text(run) and "d_hat" not in text(run)
+    blend = presets.find("mirakhorli/hybrid")
+    run = jaxtank.simulate(blend.loop, jaxtank.Clock(dt=0.1, duration=1.0))
+    assert np.shape(run.to_json()["share"]) == (11, 2) and run.to_json()["units"]["share"] == "-"
