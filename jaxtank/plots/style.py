@@ -5,8 +5,19 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 
-# Okabe and Ito's colours, which colour-blind readers can distinguish
-BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = "#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73"
+# One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
+# distinguish (Okabe, Ito: Color Universal Design, 2008)
+PUBLISHED, TUNED, FILTERED = "#D55E00", "#0072B2", "#009E73"
+"""Colours of a run with the values of the case, with those of a search, and with those behind a
+safety filter or in any third run.
+"""
+
+REFERENCE, RIM = "#000000", "#CC79A7"
+"""Colours of setpoints, and of rims, limits and what lies beyond them."""
+
+BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM
+"""The same by their places in a comparison."""
+
 RUNS = (
     (BEFORE, "--"),
     (AFTER, "-"),

@@ -50,13 +50,20 @@ class Result(Shown):
         """Return matplotlib figures {name: Figure} of what there is to show."""
         return self._report().figures(self)
 
-    def explore(self) -> Any:
+    def explore(self, plants: int | None = None) -> Any:
         """Return the live page of the result's case, a `tuning.live.shown.LivePage`: of a tuned one
         with its values before and after. A notebook shows it, and `.save(path)` writes it.
 
+        With `plants`, in a notebook with ipywidgets, it is a live figure of so many plants that
+        begins with the values after (`case.explore`).
+
         Raises InputError for a case that cannot be run in a browser.
         """
-        return importlib.import_module("tuning.live.shown").of_result(self)
+        live = importlib.import_module("tuning.live.shown")
+        own = getattr(self, "tuned", None) or getattr(self, "case", None)
+        if plants is None or own is None:
+            return live.of_result(self)
+        return own.explore(plants=plants)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths.
