@@ -15,7 +15,7 @@ from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import html_table
+from jaxtank.core.text import html_table, with_picture
 from jaxtank.core.tree import describe, get_value, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
@@ -244,8 +244,13 @@ class Case:
         return "\n".join([heading, *(f"  {line}" for line in lines)])
 
     def _repr_html_(self) -> str:
+        def draw() -> bytes | None:
+            from jaxtank.plots.run import small
+
+            return small(self.plot())
+
         (_, caption), *rows = self._summary()
-        return html_table(rows, caption=caption)
+        return with_picture(html_table(rows, caption=caption), draw)
 
     def _summary(self) -> list[tuple[str, str]]:
         """(what, text) of each line for people."""

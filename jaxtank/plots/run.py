@@ -15,6 +15,9 @@ from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
 
+SMALL = 62
+"""Pixels per inch of the small picture that a notebook shows below a result."""
+
 
 def figures(run: Any) -> dict[str, Any]:
     """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
@@ -81,6 +84,16 @@ def png(figure: Any) -> bytes:
     figure.savefig(out, format="png", metadata={"Software": None})
     plt.close(figure)
     return out.getvalue()
+
+
+def small(drawn: Mapping[str, Any]) -> bytes | None:
+    """Return the first of {name: figure} as PNG bytes of about half its size; all are closed."""
+    out, first = io.BytesIO(), next(iter(drawn.values()), None)
+    if first is not None:
+        first.savefig(out, format="png", dpi=SMALL, metadata={"Software": None})
+    for figure in drawn.values():
+        plt.close(figure)
+    return None if first is None else out.getvalue()
 
 
 def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:

@@ -1,9 +1,15 @@
 """Colours, line styles and settings of all pictures. Imported by every module of this folder."""
 
 import contextlib
+import importlib
+import importlib.util
+import sys
 from typing import Any
 
 import matplotlib.pyplot as plt
+
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import PICTURES
 
 # One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
 # distinguish (Okabe, Ito: Color Universal Design, 2008)
@@ -73,6 +79,48 @@ def styled(more=None):
         yield
     finally:
         plt.rcParams.update(before)
+
+
+def notebook(dpi: int = 110, sharp: bool = False, pictures: bool = True) -> None:
+    """Set up a notebook, once in its first cell: float64, the style of the figures, their
+    resolution, and a small picture below each result that is shown.
+
+    Parameters
+    ----------
+    dpi : int
+        Size of figures on the screen, 40 to 400 [pixels per inch].
+    sharp : bool
+        Whether figures have twice as many pixels at the same size, for screens of high resolution.
+    pictures : bool
+        Whether a result that is shown has a small picture below its table.
+
+    Raises
+    ------
+    InputError
+        For another resolution.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> with plt.rc_context():
+    ...     jaxtank.notebook(pictures=False)
+    ...     plt.rcParams["figure.dpi"]
+    110.0
+    """
+    import jax
+
+    if isinstance(dpi, bool) or not isinstance(dpi, int) or not 40 <= dpi <= 400:
+        raise InputError(f"dpi = {dpi!r}: must be a whole number from 40 to 400 pixels per inch")
+    jax.config.update("jax_enable_x64", True)
+    STYLE["figure.dpi"] = dpi
+    plt.rcParams.update(STYLE)
+    PICTURES[0] = bool(pictures)
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    if hasattr(shell, "kernel") and importlib.util.find_spec("matplotlib_inline") is not None:
+        config: Any = importlib.import_module("matplotlib_inline.config")
+        inline: Any = config.InlineBackend.instance(parent=shell)
+        inline.shell = shell
+        inline.figure_formats = {"retina" if sharp else "png"}
 
 
 def plain(text):

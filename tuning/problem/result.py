@@ -10,15 +10,19 @@ import importlib
 from pathlib import Path
 from typing import Any, ClassVar
 
+from jaxtank.core.text import with_picture
+
 
 class Shown:
     """A result that a notebook displays as HTML: what `str` reports, all of it escaped."""
 
     def _repr_html_(self) -> str:
-        """Return the lines and tables of the result as a fragment of HTML."""
+        """Return the lines and tables of the result as a fragment of HTML, with a small picture
+        once `jaxtank.notebook()` has been called.
+        """
         from tuning.report.html import fragment
 
-        return fragment(self._lines())
+        return with_picture(fragment(self._lines()), lambda: _first_picture(self))
 
     def _lines(self) -> list[Any]:
         """Return what `str` reports: lines of text and tables."""
@@ -81,3 +85,11 @@ class Result(Shown):
             `folder` cannot be written to.
         """
         return self._report().save(self, folder, command)
+
+
+def _first_picture(result: Any) -> bytes | None:
+    """The first picture of a result as PNG bytes, None where it has none."""
+    from jaxtank.plots.run import small
+
+    plot: Any = getattr(result, "plot", None)
+    return None if plot is None else small(plot())
