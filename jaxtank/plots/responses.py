@@ -14,6 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.plots.effects import BARS, elementary, panels, shares, tornado
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.search import contours, convergence, curve
+from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
     AFTER,
     BEFORE,
@@ -75,7 +76,7 @@ def _example() -> Any:
     return Trajectory(**arrays)
 
 
-def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
+def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
     """Draw the level of one tank, with its setpoint, rim and limit.
 
     Parameters
@@ -86,6 +87,7 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
     output : index of its setpoint, None for a tank that is not controlled
     rim, limit : level [unit] or None
     unit : of levels
+    spills : {name: Spilled} of the runs (`jaxtank.plots.spills`), or None
 
     Returns
     -------
@@ -121,7 +123,8 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"tank {tank + 1}", ylabel=f"level [{unit}]")
+    ax.set(title=f"tank {tank + 1}{above_rim(ax, trajectories, tank, rim, spills)}")
+    ax.set_ylabel(f"level [{unit}]")
     return ax
 
 
@@ -230,6 +233,7 @@ def responses(loop, trajectories, title="", limits=None):
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
     rows, note = _rows(loop, drawn, (outputs, pumps, others), limits), note + more
+    note += spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
     width = max(4.6 * columns, 6.4)
     with styled():
@@ -295,9 +299,10 @@ def _rows(loop, drawn, which, limits):
     """Rows of functions that draw one panel each, of (outputs, pumps, other tanks)."""
     (outputs, pumps, others), (length, drive) = which, loop.units
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
+    lost = {name: spilled(loop.plant, run) for name, (run, *_) in drawn.items()}
 
     def level_of(i, k=None):
-        return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length)
+        return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length, lost)
 
     def error_of(i, k):
         return lambda ax: error(ax, drawn, k, i, length)

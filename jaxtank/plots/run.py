@@ -10,10 +10,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
+from jaxtank.core.units import local
 from jaxtank.plots import responses
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
+from jaxtank.plots.spills import amount, spilled
 
 SMALL = 62
 """Pixels per inch of the small picture that a notebook shows below a result."""
@@ -25,8 +27,10 @@ def figures(run: Any) -> dict[str, Any]:
     """
     length, drive = run.units
     colours = [colour for colour, _ in responses.RUNS]
+    lost = float(np.sum(np.asarray(run.spilled)[-1]))
+    floor = f", {amount(lost, local('cm^3', run.units))} over the rims" if lost > 0 else ""
     groups = [
-        ("levels", "h", run.x, length),
+        (f"levels{floor}", "h", run.x, length),
         ("setpoints", "r", run.r, length),
         ("tracking errors", "e", run.e, length),
         ("inputs", "u", run.u, drive),
@@ -69,9 +73,12 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
         extent = (4.8, min(7.0, 4.8 * high / wide + 0.35))
     with responses.styled():
         figure = plt.figure(figsize=extent)
-        ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
+        ax = figure.add_axes((0.01, 0.01, 0.98, 0.89))
         if run is not None and np.all(np.isfinite(run.x[-1])):
-            schematic(ax, plant, run.x[-1], run.r[-1])
+            lost = run.spilled[-1] if plant.overflow else None
+            schematic(ax, plant, run.x[-1], run.r[-1], lost)
+            found = spilled(plant, run)
+            title = f"{title}\n{found.words()}" if found.any else title
         else:
             schematic(ax, plant)
         ax.set_title(responses.plain(title))

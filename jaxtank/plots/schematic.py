@@ -7,8 +7,10 @@ import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
+from jaxtank.core.units import local
 from jaxtank.plots.layout import jets, overflows, pipes, place
 from jaxtank.plots.overview import LARGEST, overview
+from jaxtank.plots.spills import amount, rim_line, stack, stack_height
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -18,12 +20,13 @@ HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 """Outline of text that a level may pass behind."""
 
 
-def schematic(ax, plant, levels=None, setpoints=None):
+def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     """Draw a rig: each tank above those that it flows into, heights to scale.
 
     Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
-    are free jets, dotted lines overflow, double lines pipes below the surface. A rig of more than
-    24 tanks is drawn by `overview.overview`.
+    are free jets, dotted lines overflow, double lines pipes below the surface. Hatched is what is
+    above a rim: what the tank cannot hold, or has lost, in its own cross-section. A rig of more
+    than 24 tanks is drawn by `overview.overview`.
 
     Parameters
     ----------
@@ -31,6 +34,7 @@ def schematic(ax, plant, levels=None, setpoints=None):
     plant : TankNetwork
     levels : (tanks,) [cm], or None for empty tanks
     setpoints : (outputs,) [cm] to mark on the controlled tanks, or None
+    lost : (tanks,) volumes lost over the rims [cm^3], of a rig with overflow; or None
 
     Returns
     -------
@@ -81,6 +85,7 @@ def schematic(ax, plant, levels=None, setpoints=None):
                     zorder=1.6,
                 )
             )
+            _above(ax, plant, i, box, float(levels[i]), None if lost is None else float(lost[i]))
         x, y = box.x + box.width, box.y + box.height
         ax.plot(
             [box.x, box.x, x, x],
@@ -132,7 +137,7 @@ def mark_height(box, setpoint):
 
 
 def depth(box, level):
-    """Return the drawn depth of a level [cm], at most 5 % above the rim.
+    """Return the drawn depth of a level [cm], at most up to the rim; `spills` draws the rest.
 
     Examples
     --------
@@ -140,7 +145,22 @@ def depth(box, level):
     >>> depth(Box(0.0, 0.0, 1.0, 1.0, 0.1), 4.0)
     0.4
     """
-    return min(max(float(level), 0.0) * box.scale, 1.05 * box.height)
+    return min(max(float(level), 0.0) * box.scale, box.height)
+
+
+def _above(ax, plant, tank, box, level, lost):
+    """What is above the rim of a tank, hatched and counted; nothing where nothing is."""
+    area, rim = (float(np.asarray(v)[tank]) for v in (plant.area, plant.rim))
+    volume = max(0.0, area * (level - rim)) if lost is None else lost
+    if volume <= 1e-9 * area * rim:
+        return
+    height = stack_height(box, volume, area)
+    stack(ax, box, height)
+    rim_line(ax, box)
+    text = f"{amount(volume, local('cm^3', plant.units))} {'above' if lost is None else 'spilled'}"
+    where = (box.middle, box.y + box.height + min(0.5 * height, 0.2))
+    style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 6, "gid": "above"}
+    ax.text(*where, text, path_effects=HALO, **style)
 
 
 def _colour(pump):

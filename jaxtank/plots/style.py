@@ -36,8 +36,11 @@ RUNS = (
 other line styles.
 """
 
-PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
-"""One colour for each pump and its pipework."""
+PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")
+"""One colour for each pump and its pipework: none of a role above, and of different lightness."""
+
+SHARE = "#56B4E9"
+"""Colour of bars of shares and probabilities."""
 
 WATER, GLASS = "#9CCEEB", "0.35"
 """Colours of the liquid and of the walls of a tank in drawings of a rig."""

@@ -4,7 +4,18 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, REFERENCE, grid, hide, plain, styled
+from jaxtank.plots.style import (
+    AFTER,
+    BEFORE,
+    FORBIDDEN,
+    REFERENCE,
+    RIM,
+    SHARE,
+    grid,
+    hide,
+    plain,
+    styled,
+)
 
 
 def fan(loop, bands, title):
@@ -50,12 +61,12 @@ def _band(ax, loop, bands, i):
     ax.plot(t, middle, color=AFTER, linewidth=1.2, label="median")
     if i in loop.plant.outputs:
         setpoint = bands["r"][:, loop.plant.outputs.index(i)]
-        ax.plot(t, setpoint, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+        ax.plot(t, setpoint, color=REFERENCE, linewidth=0.8, linestyle="--", label="setpoint")
     if high.max() > 0.25 * rim:
-        ax.axhline(rim, color=BEFORE, linewidth=1.0, label="rim")
+        ax.axhline(rim, color=RIM, linewidth=1.2, label="rim")
     else:  # a rim far above all levels would only compress the picture
         label = f"rim {rim:g} {unit}, above the picture"
-        ax.plot([], [], color=BEFORE, linewidth=1.0, label=label)
+        ax.plot([], [], color=RIM, linewidth=1.2, label=label)
     ax.set(title=f"tank {i + 1}", ylabel=f"level [{unit}]")
     ax.legend(loc="best", fontsize="x-small")
 
@@ -152,13 +163,13 @@ def violations(rows, samples):
         figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
         y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
         ends = np.array([r["interval95"] for r in rows])
-        ax.barh(y, p, color="#56B4E9", height=0.6)
+        ax.barh(y, p, color=SHARE, height=0.6)
         ax.errorbar(
             p,
             y,
             xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]),
             fmt="none",
-            ecolor="black",
+            ecolor=REFERENCE,
             capsize=3,
         )
         ax.set_yticks(
