@@ -10,7 +10,7 @@ from matplotlib.patheffects import AbstractPathEffect, withStroke
 from jaxtank.core.units import local
 from jaxtank.plots.layout import jets, overflows, pipes, place
 from jaxtank.plots.overview import LARGEST, overview
-from jaxtank.plots.spills import amount, rim_line, stack, stack_height
+from jaxtank.plots.spills import Stack, amount, headroom
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -85,7 +85,6 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
                     zorder=1.6,
                 )
             )
-            _above(ax, plant, i, box, float(levels[i]), None if lost is None else float(lost[i]))
         x, y = box.x + box.width, box.y + box.height
         ax.plot(
             [box.x, box.x, x, x],
@@ -103,6 +102,8 @@ def schematic(ax, plant, levels=None, setpoints=None, lost=None):
         _pump(ax, x, y, j, str(j + 1) if crowded else f"pump {j + 1}")
     _shares(ax, plant, where)
     ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
+    if levels is not None:
+        _above(ax, plant, where, np.asarray(levels, dtype=float), lost)
     ax.axis("off")
     return ax
 
@@ -148,19 +149,21 @@ def depth(box, level):
     return min(max(float(level), 0.0) * box.scale, box.height)
 
 
-def _above(ax, plant, tank, box, level, lost):
-    """What is above the rim of a tank, hatched and counted; nothing where nothing is."""
-    area, rim = (float(np.asarray(v)[tank]) for v in (plant.area, plant.rim))
-    volume = max(0.0, area * (level - rim)) if lost is None else lost
-    if volume <= 1e-9 * area * rim:
-        return
-    height = stack_height(box, volume, area)
-    stack(ax, box, height)
-    rim_line(ax, box)
-    text = f"{amount(volume, local('cm^3', plant.units))} {'above' if lost is None else 'spilled'}"
-    where = (box.middle, box.y + box.height + min(0.5 * height, 0.2))
-    style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 6, "gid": "above"}
-    ax.text(*where, text, path_effects=HALO, **style)
+def _above(ax, plant, where, levels, lost):
+    """What is above the rims, hatched and counted: lost volumes, or what the tanks cannot hold."""
+    area, rim = (np.asarray(v, dtype=float) for v in (plant.area, plant.rim))
+    volumes, what = area * (levels - rim), "above"
+    if lost is not None:
+        volumes, what = np.asarray(lost, dtype=float), "spilled"
+    for i in np.flatnonzero(volumes > 1e-9 * area * rim):
+        box, volume = where.boxes[i], float(volumes[i])
+        found = Stack(ax, box, float(area[i]))
+        found.set(volume)
+        headroom(ax, [(found, volume)])
+        y = box.y + box.height + min(0.5 * found.height(volume), 0.2)
+        style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 6, "gid": "above"}
+        text = f"{amount(volume, local('cm^3', plant.units))} {what}"
+        ax.text(box.middle, y, text, path_effects=HALO, **style)
 
 
 def _colour(pump):

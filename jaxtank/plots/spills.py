@@ -18,7 +18,7 @@ from jaxtank.plots.style import RIM, plain
 LIQUID: dict[str, Any] = {"facecolor": to_rgba(RIM, 0.35), "edgecolor": RIM, "hatch": "////"}
 """Style of liquid above a rim."""
 
-HIGHEST = 0.62
+HIGHEST = 0.65
 """Drawn height above a rim, at most, in heights of the tallest tank: below the row above."""
 
 
@@ -102,35 +102,47 @@ def amount(volume: float, unit: str) -> str:
     return f"{figures if volume >= 1e-3 else f'{volume:.3g}'} {unit}"
 
 
-def stack(ax: Any, box: Any, height: float = 0.0) -> Rectangle:
-    """Draw liquid above the rim of a tank, hatched, and return the artist.
-
-    height : what `stack_height` returns.
-    """
-    patch = Rectangle(
-        (box.x, box.y + box.height), box.width, height, linewidth=0.0, zorder=3.5, **LIQUID
-    )
-    return ax.add_patch(patch)
-
-
-def stack_height(box: Any, volume: float, area: float) -> float:
-    """Return the drawn height of a volume above the rim of a tank: to the scale of its levels, at
-    most HIGHEST.
+class Stack:
+    """Liquid above the rim of a tank, hatched, with the rim as a line; a triangle on top where it
+    is higher than drawn.
 
     Examples
     --------
+    >>> from matplotlib.figure import Figure
     >>> from jaxtank.plots.layout import Box
-    >>> stack_height(Box(0.0, 0.0, 1.0, 1.0, 0.02), volume=100.0, area=10.0)
+    >>> stack = Stack(Figure().gca(), Box(0.0, 0.0, 1.0, 1.0, 0.02), area=10.0)
+    >>> stack.set(100.0)
+    >>> stack.patch.get_height()
     0.2
     """
-    return min(max(float(volume), 0.0) / float(area) * box.scale, HIGHEST)
+
+    def __init__(self, ax: Any, box: Any, area: float):
+        self.box, self.area, top = box, float(area), box.y + box.height
+        self.patch = Rectangle((box.x, top), box.width, 0.0, linewidth=0.0, zorder=3.5, **LIQUID)
+        ax.add_patch(self.patch)
+        ends = [box.x - 0.05, box.x + box.width + 0.05]
+        ax.plot(ends, [top, top], color=RIM, linewidth=1.6, zorder=3.6)
+        more = {"marker": "^", "color": RIM, "markersize": 5, "zorder": 3.7, "visible": False}
+        (self.more,) = ax.plot([box.middle], [top + HIGHEST + 0.05], **more)
+
+    def height(self, volume: float) -> float:
+        """Return the height of a volume, to the scale of the levels, before it is cut."""
+        return max(float(volume), 0.0) / self.area * self.box.scale
+
+    def set(self, volume: float) -> None:
+        """Show a volume [cm^3]."""
+        height = self.height(volume)
+        self.patch.set_height(min(height, HIGHEST))
+        self.more.set_visible(height > HIGHEST)
 
 
-def rim_line(ax: Any, box: Any) -> None:
-    """Draw the rim of a tank as a line that stands out at both sides."""
-    y, out = box.y + box.height, 0.05
-    ends = [box.x - out, box.x + box.width + out]
-    ax.plot(ends, [y, y], color=RIM, linewidth=1.6, zorder=3.6)
+def headroom(ax: Any, stacks: Any) -> None:
+    """Make room in a drawing for [(Stack, largest volume)]."""
+    tops = [
+        one.box.y + one.box.height + min(one.height(most), HIGHEST + 0.05) + 0.05
+        for one, most in stacks
+    ]
+    ax.set_ylim(top=max([ax.get_ylim()[1], *tops]))
 
 
 def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> str:

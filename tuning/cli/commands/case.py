@@ -32,7 +32,14 @@ def add(commands, parents):
     one.add_argument(
         "--gif",
         action="store_true",
-        help="with --out also run.gif, the tanks of the rig filling and emptying",
+        help="with --out also run.gif, the tanks of the rig filling and emptying, and film.png with"
+        " four of its pictures",
+    )
+    option(
+        one,
+        "--against",
+        "CASE",
+        "with --gif: a second case or rig file, as it is, beside the first in the film",
     )
     one.add_argument(
         "--margins",
@@ -114,7 +121,10 @@ def simulate(args):
     """Run a case once and print its measures; with --out write the run."""
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
+    if args.against is not None and not args.gif:
+        raise InputError("--against needs --gif, the film in which the second case stands")
     seed, case = seed_of(args), open_case(args)
+    other = None if args.against is None else _other(args.against)
     import jax
 
     from jaxtank.loop import run, step_size
@@ -146,7 +156,11 @@ def simulate(args):
         trajectory = artifacts.run_for_people(case, key)
         made = payload["provenance"]
         page = lambda drawn: run_page.page_of(case, values, drawn, args.line, made)
-        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page)
+        beside = None
+        if other is not None:
+            noise = jax.random.key(seed) if noisy(other) else None
+            beside = (other, artifacts.run_for_people(other, noise))
+        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page, beside)
     if args.json:
         print(tables.dumps(payload))
     else:
@@ -159,6 +173,16 @@ def simulate(args):
             print("\nThe safety filter is on: jaxtank show prints what is proved of each tank.")
     report_written(written, args)
     return 0
+
+
+def _other(name):
+    """The second case of a film; InputError where it is none, or cannot be drawn."""
+    from jaxtank import rig
+
+    try:
+        return rig.check(rig.open_case(name))
+    except InputError as error:
+        raise InputError(f"--against: {error}") from None
 
 
 def init(args):
