@@ -24,10 +24,15 @@ from jaxtank.plots.style import (
     REFERENCE,
     RUNS,
     STYLE,
+    beside,
+    for_print,
     grid,
+    height,
     hide,
     plain,
+    printing,
     styled,
+    width,
 )
 from jaxtank.plots.uncertainty import cloud, fan, violations
 
@@ -48,6 +53,7 @@ __all__ = [
     "elementary",
     "error",
     "fan",
+    "for_print",
     "level",
     "panels",
     "plain",
@@ -235,9 +241,10 @@ def responses(loop, trajectories, title="", limits=None):
     rows, note = _rows(loop, drawn, (outputs, pumps, others), limits), note + more
     note += spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
-    width = max(4.6 * columns, 6.4)
+    wide = width(max(4.6 * columns, 6.4))
     with styled():
-        figure, axes = grid(len(rows), columns, (width, 2.05 * len(rows) + 0.5), sharex=True)
+        high = height(2.05 * len(rows) + 0.5, len(rows))
+        figure, axes = grid(len(rows), columns, (wide, high), sharex=True)
         for row, line in zip(rows, axes):
             for draw, ax in zip(row, line):
                 draw(ax)
@@ -246,12 +253,13 @@ def responses(loop, trajectories, title="", limits=None):
             last = [ax for ax in column if ax.get_visible()][-1]
             last.set_xlabel("time [s]")
             last.tick_params(labelbottom=True)
-        _legend(figure, axes, width)
+        _legend(figure, axes, wide)
+        lines = ("" if printing() else title) + note  # a journal has captions
         figure.suptitle(
             "\n".join(
-                plain(textwrap.fill(line, int(12 * width))) for line in (title + note).splitlines()
+                plain(textwrap.fill(line, int(12 * wide))) for line in lines.strip().splitlines()
             ),
-            fontsize=10,
+            fontsize=None if printing() else 10,
         )
     return figure
 
@@ -316,7 +324,8 @@ def _rows(loop, drawn, which, limits):
         [level_of(i) for i in others],
         [voltage_of(j) for j in pumps],
     ]
-    return [row[i : i + COLUMNS] for row in kinds for i in range(0, len(row), COLUMNS)]
+    most = beside(COLUMNS)
+    return [row[i : i + most] for row in kinds for i in range(0, len(row), most)]
 
 
 def _legend(figure, axes, width):
@@ -326,6 +335,7 @@ def _legend(figure, axes, width):
         for handle, label in zip(*ax.get_legend_handles_labels()):
             handles.setdefault(label, handle)
     columns = len(handles) if len(handles) <= 6 else max(4, round(width / 2))
+    columns = min(columns, max(2, round(width)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 

@@ -5,18 +5,21 @@ May import the other modules of `plots` and what they import.
 
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
+from jaxtank.core.files import write_folder
 from jaxtank.core.units import local
 from jaxtank.plots import responses
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
+from jaxtank.plots.style import TALLEST, WIDTHS, for_print, styled
 
 GIF_BYTES = 600_000
 """Size of a GIF [bytes], above which it has fewer pictures per second."""
@@ -26,6 +29,9 @@ COLOURS = 64
 
 STILLS = 4
 """Moments of a still."""
+
+SOFTWARE = {"Software": None}
+"""Metadata of a PNG file: nothing that differs from machine to machine."""
 
 SMALL = 62
 """Pixels per inch of the small picture that a notebook shows below a result."""
@@ -98,16 +104,57 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
 def png(figure: Any) -> bytes:
     """Return a figure as PNG bytes, and close it."""
     out = io.BytesIO()
-    figure.savefig(out, format="png", metadata={"Software": None})
+    figure.savefig(out, format="png", metadata=SOFTWARE)
     plt.close(figure)
     return out.getvalue()
+
+
+def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
+    """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
+    or two columns of a journal; the figures are closed.
+
+    Figures that `style.for_print` has not made are scaled to that width.
+    """
+    found: dict[str, bytes] = {}
+    for name, figure in drawn.items():
+        wide, high = figure.get_size_inches()
+        scale = WIDTHS[columns] / wide
+        figure.set_size_inches(WIDTHS[columns], min(high * max(scale, 0.6), TALLEST))
+        for kind, metadata in (("svg", {"Date": None, "Creator": None}), ("png", SOFTWARE)):
+            out = io.BytesIO()
+            # the same bytes for the same figure
+            with for_print(columns), styled({"svg.hashsalt": name}):
+                figure.savefig(out, format=kind, metadata=metadata)
+            found[f"{name}.{kind}"] = out.getvalue()
+        plt.close(figure)
+    return found
+
+
+def save_for_print(drawn: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
+    """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
+    or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
+
+    Raises InputError for a number of columns that is none, and a folder that cannot be written to.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from jaxtank import presets
+    >>> with for_print(1):
+    ...     figures = presets.find("cascaded/pi").plot()
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_for_print(figures, folder)]
+    ['rig.svg', 'rig.png']
+    """
+    with for_print(columns):  # which refuses other numbers
+        return write_folder(folder, for_journal(drawn, columns))
 
 
 def small(drawn: Mapping[str, Any]) -> bytes | None:
     """Return the first of {name: figure} as PNG bytes of about half its size; all are closed."""
     out, first = io.BytesIO(), next(iter(drawn.values()), None)
     if first is not None:
-        first.savefig(out, format="png", dpi=SMALL, metadata={"Software": None})
+        first.savefig(out, format="png", dpi=SMALL, metadata=SOFTWARE)
     for figure in drawn.values():
         plt.close(figure)
     return None if first is None else out.getvalue()

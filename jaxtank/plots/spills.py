@@ -15,7 +15,7 @@ from jaxtank.core.text import one_line
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.plots.style import RIM, plain
 
-LIQUID: dict[str, Any] = {"facecolor": to_rgba(RIM, 0.35), "edgecolor": RIM, "hatch": "////"}
+LIQUID: dict[str, Any] = {"facecolor": to_rgba(RIM, 0.45), "edgecolor": RIM, "hatch": "////"}
 """Style of liquid above a rim."""
 
 HIGHEST = 0.65

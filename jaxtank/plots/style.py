@@ -60,6 +60,114 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 
+WIDTHS = {1: 3.5, 2: 7.16}
+"""{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
+(IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
+"""
+
+TALLEST = 9.0
+"""Height of a figure for a journal, at most [inch]."""
+
+PANEL = 2.2
+"""Width of a panel in a figure for a journal, at least [inch]."""
+
+PRINT: dict[Any, Any] = {
+    "font.family": "STIXGeneral",  # like Times, and comes with matplotlib
+    "mathtext.fontset": "stix",
+    "text.usetex": False,
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "figure.titlesize": 8,
+    "legend.fontsize": 7.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "savefig.dpi": 300,
+    "svg.fonttype": "path",  # the same wherever it is set
+    "pdf.fonttype": 42,
+}
+"""Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
+
+_COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
+
+
+@contextlib.contextmanager
+def for_print(columns=1):
+    """Make figures for a journal within a `with` block: their width, their letters, no title.
+
+    `jaxtank.plots.run.save_for_print` writes them as SVG and as PNG of 300 dpi.
+
+    Parameters
+    ----------
+    columns : 1 or 2
+        Of the journal, that a figure is wide.
+
+    Raises
+    ------
+    InputError
+        For another number.
+
+    Examples
+    --------
+    >>> with for_print(2), styled():
+    ...     width(9.6), plt.rcParams["savefig.dpi"]
+    (7.16, 300.0)
+    """
+    if columns not in WIDTHS or isinstance(columns, bool):
+        raise InputError(f"columns = {columns!r}: a figure is 1 or 2 columns of a journal wide")
+    _COLUMNS.append(columns)
+    try:
+        yield
+    finally:
+        _COLUMNS.pop()
+
+
+def printing():
+    """Return whether figures are made for a journal.
+
+    Examples
+    --------
+    >>> printing()
+    False
+    """
+    return bool(_COLUMNS)
+
+
+def width(usual):
+    """Return the width of a figure [inch]: that of a journal's columns, or `usual`.
+
+    Examples
+    --------
+    >>> width(9.6)
+    9.6
+    """
+    return WIDTHS[_COLUMNS[-1]] if _COLUMNS else usual
+
+
+def beside(most):
+    """Return how many panels stand beside each other: as many as a journal's columns take, or
+    `most`.
+
+    Examples
+    --------
+    >>> with for_print(1):
+    ...     beside(4)
+    1
+    """
+    return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
+
+
+def height(usual, rows, legend=0.5):
+    """Return the height of a figure of rows of panels [inch]: 1.3 each for a journal, or `usual`.
+
+    Examples
+    --------
+    >>> height(7.0, 3)
+    7.0
+    """
+    return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
+
 
 @contextlib.contextmanager
 def styled(more=None):
@@ -75,7 +183,7 @@ def styled(more=None):
     ...     plt.rcParams["font.size"]
     20.0
     """
-    settings = STYLE | (more or {})
+    settings = STYLE | (PRINT if _COLUMNS else {}) | (more or {})
     before: dict[Any, Any] = {name: plt.rcParams[name] for name in settings}
     plt.rcParams.update(settings)
     try:

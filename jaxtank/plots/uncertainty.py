@@ -11,10 +11,14 @@ from jaxtank.plots.style import (
     REFERENCE,
     RIM,
     SHARE,
+    beside,
     grid,
+    height,
     hide,
     plain,
+    printing,
     styled,
+    width,
 )
 
 
@@ -36,10 +40,11 @@ def fan(loop, bands, title):
     >>> [ax.get_title() for ax in figure.axes]
     ['tank 1', 'tank 2']
     """
-    tanks, columns = loop.plant.tanks, min(2, loop.plant.tanks)
-    rows = -(-tanks // 2)
+    tanks = loop.plant.tanks
+    columns = beside(min(2, tanks))
+    rows = -(-tanks // columns)
     with styled():
-        figure, axes = grid(rows, columns, (9.6, 2.7 * rows), sharex=True)
+        figure, axes = grid(rows, columns, (width(9.6), height(2.7 * rows, rows)), sharex=True)
         for i, ax in enumerate(axes.ravel()[:tanks]):
             _band(ax, loop, bands, i)
         # the lowest panel of each column, above one that stays empty too
@@ -47,7 +52,7 @@ def fan(loop, bands, title):
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
         hide(axes.ravel()[tanks:])
-        figure.suptitle(plain(title))
+        figure.suptitle("" if printing() else plain(title))
     return figure
 
 

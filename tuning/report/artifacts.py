@@ -93,11 +93,12 @@ def write_result(folder, files, draw, page=None, stale=()):
     return written + write_folder(folder, more | pngs(drawn))
 
 
-def save_run(case, run, payload, folder, gif=False, page=None, against=None):
+def save_run(case, run, payload, folder, gif=False, page=None, against=None, columns=None):
     """Write result.json, trajectory.csv, responses.png and, if asked, run.gif and its still
     film.png of one simulation to `folder`, from which those of an earlier one are removed; page:
     function of the pictures that returns report.html; against: (Case, Trajectory) of a rig that the
-    film shows beside it.
+    film shows beside it; columns: of a journal, for which the responses are also written as
+    print.svg and print.png of 300 dpi.
     """
     from jaxtank.plots import responses
 
@@ -105,7 +106,7 @@ def save_run(case, run, payload, folder, gif=False, page=None, against=None):
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
-    names = ("responses.png", "run.gif", "film.png", "report.html")
+    names = ("responses.png", "run.gif", "film.png", "report.html", "print.svg", "print.png")
     stale = [Path(folder) / name for name in names] if old else []
     written = write_result(
         folder,
@@ -114,6 +115,8 @@ def save_run(case, run, payload, folder, gif=False, page=None, against=None):
         page,
         stale,
     )
+    if columns is not None:
+        written += _for_journal(case, run, folder, columns)
     if gif:
         from jaxtank.plots.animation import film
 
@@ -126,3 +129,19 @@ def save_run(case, run, payload, folder, gif=False, page=None, against=None):
         else:
             written += write_folder(Path(folder), {"run.gif": moving, "film.png": still})
     return written
+
+
+def _for_journal(case, run, folder, columns):
+    """Write the responses of a run for a journal; returns the paths."""
+    from jaxtank.plots import responses
+    from jaxtank.plots.run import save_for_print
+
+    try:
+        with responses.for_print(columns):
+            figure = responses.responses(case.loop, {case.name: run})
+        return save_for_print({"print": figure}, folder, columns)
+    except InputError:
+        raise
+    except Exception as error:
+        failed("print.svg", error)
+        return []

@@ -42,6 +42,13 @@ def add(commands, parents):
         "with --gif: a second case or rig file, as it is, beside the first in the film",
     )
     one.add_argument(
+        "--columns",
+        type=int,
+        choices=(1, 2),
+        help="with --out also print.svg and print.png (300 dpi): the run in the width of one or two"
+        " columns of a journal",
+    )
+    one.add_argument(
         "--margins",
         action="store_true",
         help="also print the stability margins of the linearised loop at each plateau of the"
@@ -121,6 +128,8 @@ def simulate(args):
     """Run a case once and print its measures; with --out write the run."""
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
+    if args.columns is not None and not args.out:
+        raise InputError("--columns needs --out DIR, where print.svg and print.png are written")
     if args.against is not None and not args.gif:
         raise InputError("--against needs --gif, the film in which the second case stands")
     seed, case = seed_of(args), open_case(args)
@@ -160,7 +169,9 @@ def simulate(args):
         if other is not None:
             noise = jax.random.key(seed) if noisy(other) else None
             beside = (other, artifacts.run_for_people(other, noise))
-        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page, beside)
+        written = artifacts.save_run(
+            case, trajectory, payload, args.out, args.gif, page, beside, args.columns
+        )
     if args.json:
         print(tables.dumps(payload))
     else:
