@@ -35,6 +35,10 @@ LOOSE = 0.45
 """Share of a panel that must be filled; below it the panel is scaled again [-]."""
 
 
+UNLIMITED = 1e12
+"""Limits above this are those of a pump that has none, in any unit."""
+
+
 class MovingFan:
     """A figure of the quantiles of levels and inputs over many plants.
 
@@ -146,7 +150,8 @@ class _Panel:
     """One panel: its artists, and limits of its ordinate that hold them."""
 
     def __init__(self, ax: Any, t: Any, before: Any, setpoint: Any, bounds: Sequence[float]):
-        self.ax, self.t, self.bounds = ax, t, bounds
+        self.ax, self.t = ax, t
+        self.bounds = [v if abs(v) < UNLIMITED else np.inf for v in bounds]
         self.still = [v for v in (before, setpoint) if v is not None and np.isfinite(v).all()]
         self.shape = np.empty((2 * len(t), 2))
         self.shape[:, 0] = np.concatenate([t, t[::-1]])
@@ -161,7 +166,7 @@ class _Panel:
         fixed = [line(before, color=PUBLISHED, linestyle="--", linewidth=1.0)]
         if setpoint is not None:
             fixed.append(line(setpoint, color=REFERENCE, linestyle=":", linewidth=1.2))
-        fixed += [ax.axhline(v, color=RIM, linewidth=1.2) for v in bounds if np.isfinite(v)]
+        fixed += [ax.axhline(v, color=RIM, linewidth=1.2) for v in self.bounds if np.isfinite(v)]
         (self.median,) = ax.plot(t, before, color=TUNED, linewidth=1.4)
         where = {"transform": ax.transAxes, "ha": "right", "va": "bottom", "fontsize": 8}
         self.text = ax.text(1.0, 1.03, "", fontweight="bold", **where)
@@ -184,7 +189,7 @@ class _Panel:
         values = np.concatenate([v[np.isfinite(v)] for v in ends])
         low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
         near = [v for v in self.bounds if np.isfinite(v) and low <= v and high > NEAR * v > 0]
-        low, high = min(low, *self.bounds[1:], low), max([high, *near])
+        low, high = min([low, *self.bounds[1:]]), max([high, *near])
         bottom, top = self.limits
         if bottom <= low and high <= top and high - low > LOOSE * (top - bottom):
             return True

@@ -10,6 +10,7 @@ import jaxtank
 import tuning
 from jaxtank import presets
 from jaxtank.core.errors import InputError
+from jaxtank.plots.moving_fan import MovingFan
 from tuning.live import live_figure
 from tuning.live.fan import CUTS, Fan
 from tuning.live.live_figure import LiveFigure
@@ -113,6 +114,16 @@ def test_lines_are_moved_and_not_made_again(fan):
     assert np.asarray(figure.picture.panels[0][2].median.get_ydata()).tolist() == (
         figure.moved.x[2, :, 0].tolist()
     )
+
+
+def test_a_pump_without_limits_is_drawn_without_them(case):
+    """Its limits are numbers so large that a picture cannot hold them."""
+    wide = jaxtank.with_values(case.loop, {"actuator.low": [-1e300], "actuator.high": [1e300]})
+    t, ones = np.arange(3.0), np.ones((6, 3, 2))
+    fan = MovingFan(wide, t, np.ones((3, 1)), ones, ones[:, :, :1])
+    fan.draw(ones, 2.0 * ones[:, :, :1], [0.0, 0.0])
+    low, high = fan.panels[-1][2].ax.get_ylim()
+    assert 0.0 < low < high < 3.0
 
 
 def test_elsewhere_it_is_the_page():
