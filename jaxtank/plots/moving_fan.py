@@ -72,7 +72,7 @@ class MovingFan:
         pumps = range(min(plant.pumps, PUMPS_SHOWN))
         columns = max(2, min(4, len(tanks)))
         lines = -(-len(tanks) // columns) + -(-len(pumps) // columns)
-        with styled():
+        with styled(), np.errstate(all="ignore"):  # as in `draw`
             self.figure = Figure(figsize=(10.0, 2.1 * lines + 0.5), dpi=dpi, layout="constrained")
             self.canvas = FigureCanvasAgg(self.figure)
             axes = self.figure.subplots(lines, columns, sharex=True, squeeze=False)
@@ -105,11 +105,12 @@ class MovingFan:
         over : (tanks,) share of the plants that rise above the rim of each tank [-].
         """
         fits = True
-        for kind, i, panel in self.panels:
-            quantiles = (x if kind == "x" else u)[:, :, i]
-            text = f"{100 * over[i]:.3g} % over the rim" if kind == "x" and over[i] else ""
-            fits = panel.move(quantiles, text) and fits
-        with styled():
+        # a compiled run leaves floating-point flags, which numpy would report as an overflow
+        with styled(), np.errstate(all="ignore"):
+            for kind, i, panel in self.panels:
+                quantiles = (x if kind == "x" else u)[:, :, i]
+                text = f"{100 * over[i]:.3g} % over the rim" if kind == "x" and over[i] else ""
+                fits = panel.move(quantiles, text) and fits
             if self.background is None or not fits:
                 self.canvas.draw()
                 self.background = self.canvas.copy_from_bbox(self.figure.bbox)
@@ -129,7 +130,7 @@ class MovingFan:
 
     def save(self, out: Any, kind: str, dpi: int = 300) -> None:
         """Write the picture to a file or a stream as `kind`: "png", "svg" or "pdf"."""
-        with styled():
+        with styled(), np.errstate(all="ignore"):
             self.figure.savefig(out, format=kind, dpi=dpi)
 
     def _legend(self) -> None:

@@ -120,7 +120,9 @@ class LiveFigure:
     def _build(self) -> None:
         """Make the sliders and what they move."""
         iw: Any = importlib.import_module("ipywidgets")
-        self.image = iw.Image(value=self.png, format="png", layout=iw.Layout(max_width="100%"))
+        inches, _ = self.picture.figure.get_size_inches()
+        size = iw.Layout(width=f"{inches * self.picture.dpi:.0f}px", max_width="100%")
+        self.image = iw.Image(value=self.png, format="png", layout=size)
         self.text = iw.HTML(_list(self.words))
         self.sliders = {b.name: self._slider(iw, b) for b in self.fan.bounds}
         for slider in self.sliders.values():
@@ -128,22 +130,25 @@ class LiveFigure:
         back = iw.Button(description="values of the case", tooltip="set every slider back")
         back.on_click(lambda _: self.move())
         note = iw.HTML(f"<p>{html.escape(self._note())}</p>")
-        self.widgets = iw.VBox([*self.sliders.values(), back, self.text, self.image, note])
+        left = iw.VBox([*self.sliders.values(), back])
+        # the words beside the sliders where there is room
+        row = iw.Box([left, self.text], layout=iw.Layout(display="flex", flex_flow="row wrap"))
+        self.widgets = iw.VBox([row, self.image, note])
 
     def _slider(self, iw: Any, b: Bound) -> Any:
         unit = "" if b.unit in ("", "-") else f" [{b.unit}]"
-        style = {"description_width": "16em"}
+        style = {"description_width": "14em"}
         settings: dict[str, Any] = {
             "description": b.name + unit,
             "value": self.moved.values[b.name],
             "readout_format": ".4g",
             "style": style,
-            "layout": iw.Layout(width="min(44em, 98%)"),
+            "layout": iw.Layout(width="34em", max_width="98%"),
         }
-        if b.scale == "log":
-            low, high = math.log10(b.low), math.log10(b.high)
-            return iw.FloatLogSlider(min=low, max=high, step=(high - low) / STEPS, **settings)
-        return iw.FloatSlider(min=b.low, max=b.high, step=(b.high - b.low) / STEPS, **settings)
+        log = b.scale == "log"
+        low, at, high = (math.log10(v) if log else v for v in (b.low, settings["value"], b.high))
+        kind = iw.FloatLogSlider if log else iw.FloatSlider
+        return kind(min=low, max=high, step=_step(low, at, high), **settings)
 
     def _follow(self, _: Any) -> None:
         """Show the plants at the positions of the sliders."""
@@ -221,6 +226,14 @@ def in_notebook() -> bool:
     """
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return hasattr(shell, "kernel") and importlib.util.find_spec("ipywidgets") is not None
+
+
+def _step(low: float, at: float, high: float) -> float:
+    """The step of a slider, of about STEPS positions of which one is `at`: a browser moves a slider
+    that is between two positions.
+    """
+    step = (high - low) / STEPS
+    return (at - low) / max(1, round((at - low) / step)) if at - low > 0.5 * step else step
 
 
 def _list(words: list[str]) -> str:

@@ -137,6 +137,9 @@ def test_sliders_move_the_plants(case, monkeypatch):
     figure = case.explore(free={"controller.Kc": (0.1, 2.0)}, plants=4)
     slider = figure.sliders["controller.Kc[0]"]
     before = figure.image.value
+    # the value of the case is a position of the slider: a browser would move it there
+    places = (np.log10(slider.value) - slider.min) / slider.step
+    assert places == pytest.approx(round(places), abs=1e-9) and 100 < places < 300
     slider.value = 0.5
     assert figure.moved.values == {"controller.Kc[0]": pytest.approx(0.5)}
     assert figure.image.value == figure.png != before and "10 % more" in figure.text.value
