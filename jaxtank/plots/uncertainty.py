@@ -8,9 +8,11 @@ from jaxtank.plots.style import (
     AFTER,
     BEFORE,
     FORBIDDEN,
+    PUBLISHED,
     REFERENCE,
     RIM,
     SHARE,
+    TUNED,
     beside,
     grid,
     height,
@@ -20,6 +22,9 @@ from jaxtank.plots.style import (
     styled,
     width,
 )
+
+CUT = 0.05
+"""Share of the plants below a bar, and above it [-]."""
 
 
 def fan(loop, bands, title):
@@ -187,4 +192,46 @@ def violations(rows, samples):
         ax.invert_yaxis()
         ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
         ax.set_xlabel(f"probability of violating the limit [-], {samples} draws")
+    return figure
+
+
+def plants(sides, limits, unit):
+    """Return a figure of many plants: how their errors are distributed, and their highest levels.
+
+    Parameters
+    ----------
+    sides : {name: (errors (N,), highest levels (N, tanks))}
+        One, or before and after.
+    limits : (tanks,) on the levels, inf where there is none
+    unit : of lengths
+
+    Examples
+    --------
+    >>> figure = plants({"after": (np.ones(8), np.full((8, 2), 20.0))}, [30.0, 30.0], "cm")
+    >>> [ax.get_xlabel() for ax in figure.axes]
+    ['total rms error [cm]', 'tank']
+    """
+    colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
+    with styled():
+        figure, axes = grid(1, 2, (width(8.0), height(2.8, 2)))
+        left, right = axes[0]
+        every = np.concatenate([error for error, _ in sides.values()])
+        bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
+        for k, (colour, (name, (error, levels))) in enumerate(zip(colours, sides.items())):
+            left.hist(error, bins, color=colour, alpha=0.55, label=name)
+            left.axvline(error.mean(), color=colour, linewidth=1.2)
+            x = np.arange(levels.shape[1]) + 1 + (k - 0.5 * (len(sides) - 1)) * 0.25
+            low, high = np.quantile(levels, (CUT, 1.0 - CUT), axis=0)
+            right.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
+            right.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
+        for tank, limit in enumerate(limits):
+            if np.isfinite(limit):
+                right.hlines(limit, tank + 0.6, tank + 1.4, color=RIM, linewidth=1.6)
+        left.set(xlabel=f"total rms error [{unit}]", ylabel=f"plants of {len(error)}")
+        right.set(xlabel="tank", ylabel=f"highest level [{unit}]")
+        right.set_xticks(np.arange(len(limits)) + 1)
+        right.set_title("5 to 95 % of plants, highest of all, limit", loc="left")
+        left.set_title("line: mean", loc="left")
+        if len(sides) > 1:
+            left.legend()
     return figure
