@@ -213,7 +213,7 @@ def _scene(loop, trajectory, seconds, against, titles):
     places = [place(one.plant) for one, _ in pairs]
     shapes = [(where.top - where.bottom) / (where.right - where.left) for where in places]
     width = 4.6 if len(pairs) == 1 else 3.9
-    figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * max(shapes) + 0.75)), dpi=80)
+    figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * max(shapes) + 0.8)), dpi=80)
     names = [*titles, *[""] * len(pairs)][: len(pairs)]
     stages = [
         _Stage(figure, k, len(pairs), one, run, name)
@@ -222,8 +222,9 @@ def _scene(loop, trajectory, seconds, against, titles):
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
         stage.ax.set_ylim(top=stage.where.top + raised)
-    clock = figure.text(0.5, 0.988, "", ha="center", va="top", fontsize=10)
-    bar = Rectangle((0.0, 0.0), 0.0, 0.012, color=TUNED, linewidth=0)
+    inch = 1.0 / figure.get_size_inches()[1]
+    clock = figure.text(0.5, 1.0 - 0.05 * inch, "", ha="center", va="top", fontsize=10)
+    bar = Rectangle((0.0, 0.0), 0.0, 0.05 * inch, color=TUNED, linewidth=0)
     figure.add_artist(bar)
     end = max(float(run.t[-1]) for run in runs)
 
@@ -263,16 +264,17 @@ class _Stage:
             np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high)
         )
         self.found = spilled(loop.plant, run)
-        self.ax = ax = figure.add_axes(
-            (number / of + 0.005, 0.07, 1.0 / of - 0.01, 0.83 if title else 0.87)
-        )
+        inch = 1.0 / figure.get_size_inches()[1]  # as a share of the height
+        high = 1.0 - (0.78 if title else 0.56) * inch
+        self.ax = ax = figure.add_axes((number / of + 0.005, 0.31 * inch, 1.0 / of - 0.01, high))
         schematic(ax, loop.plant)
         for text in ax.texts:
             text.set_path_effects(HALO)
         middle = (number + 0.5) / of
         words = {"ha": "center", "fontsize": 9}
-        figure.text(middle, 0.93, plain(one_line(title, 60)), va="top", fontweight="bold", **words)
-        self.words = figure.text(middle, 0.022, "", va="bottom", **words)
+        name = plain(one_line(title, 60))
+        figure.text(middle, 1.0 - 0.25 * inch, name, va="top", fontweight="bold", **words)
+        self.words = figure.text(middle, 0.1 * inch, "", va="bottom", **words)
         self.water, self.marks, self.bars = _moving(ax, loop, self.where)
         self.stacks = {
             i: Stack(ax, box, self.area[i])
