@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from jaxtank.loop.run import simulate as simulate
     from jaxtank.loop.trajectory import Trajectory as Trajectory
     from jaxtank.loop.validation import check as check
+    from jaxtank.plots.style import notebook as notebook
     from jaxtank.xla.program_cache import cache as cache
 
 __version__ = "0.1.0"
@@ -83,6 +84,7 @@ _NAMES = {
     "stability_margins": "jaxtank.loop.margins",
     "check": "jaxtank.loop.validation",
     "cache": "jaxtank.xla.program_cache",
+    "notebook": "jaxtank.plots.style",
 }
 _FOLDERS = (
     "analysis",

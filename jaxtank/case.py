@@ -15,7 +15,7 @@ from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import html_table
+from jaxtank.core.text import html_table, with_picture
 from jaxtank.core.tree import describe, get_value, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
@@ -201,13 +201,23 @@ class Case:
 
         return rig(self.loop.plant, title=self.name)
 
-    def explore(self) -> Any:
+    def explore(
+        self, free: Mapping[str, Any] | None = None, plants: int | None = None, seed: int = 0
+    ) -> Any:
         """Return the live page, in which the loop runs while sliders move: a notebook shows it, and
         `.save(path)` writes it. Opens `tuning.live`.
 
-        Raises InputError for a case that cannot be run in a browser.
+        With `plants` or `free` it is a live figure in a notebook with ipywidgets: sliders of the
+        parameters `free` {dotted name: (low, high)} move a fan of `plants` plants (200) that are
+        drawn with `seed`, as `tuning.ensemble` draws them.
+
+        Raises InputError for a case that cannot be run in a browser, and for names and values that
+        cannot be used.
         """
-        return importlib.import_module("tuning.live.shown").of_case(self)
+        if free is None and plants is None:
+            return importlib.import_module("tuning.live.shown").of_case(self)
+        opened = importlib.import_module("tuning.live.live_figure")
+        return opened.of_case(self, free, plants, seed)
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return
@@ -234,8 +244,13 @@ class Case:
         return "\n".join([heading, *(f"  {line}" for line in lines)])
 
     def _repr_html_(self) -> str:
+        def draw() -> bytes | None:
+            from jaxtank.plots.run import small
+
+            return small(self.plot())
+
         (_, caption), *rows = self._summary()
-        return html_table(rows, caption=caption)
+        return with_picture(html_table(rows, caption=caption), draw)
 
     def _summary(self) -> list[tuple[str, str]]:
         """(what, text) of each line for people."""

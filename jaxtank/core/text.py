@@ -3,8 +3,9 @@
 Imports nothing of ours; may be imported by every folder.
 """
 
+import base64
 import html
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 MOST = 600
@@ -92,3 +93,38 @@ def html_table(rows: Iterable[Iterable[Any]], head: Iterable[Any] = (), caption:
     above = f"<caption>{html.escape(caption)}</caption>" if caption else ""
     headings = row(head, "th") if head else ""
     return f"<table>{above}\n{headings}{''.join(row(cells, 'td') for cells in rows)}</table>"
+
+
+PICTURES = [False]
+"""Whether results show a small picture in a notebook: `jaxtank.notebook()` switches it on."""
+
+
+def with_picture(table: str, draw: Callable[[], bytes | None]) -> str:
+    """Return the HTML of a result, with a small picture below it once `jaxtank.notebook()` has been
+    called.
+
+    Parameters
+    ----------
+    table : str
+        HTML.
+    draw : function that returns a PNG file as bytes, None where there is nothing to draw
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> with_picture("<p>", lambda: b"PNG")
+    '<p>'
+    """
+    if not PICTURES[0]:
+        return table
+    try:
+        png = draw()
+    except Exception as error:  # numbers are shown whatever their picture does
+        return table + f"<p>no picture: {html.escape(one_line(str(error)))}</p>"
+    if png is None:
+        return table
+    data = base64.b64encode(png).decode("ascii")
+    return f'{table}<img alt="" style="max-width:100%" src="data:image/png;base64,{data}">'

@@ -15,7 +15,7 @@ from jax.core import Tracer
 
 from jaxtank.core.files import write_folder
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import html_table
+from jaxtank.core.text import html_table, with_picture
 from jaxtank.core.units import DEFAULT, local
 
 FIELDS = (
@@ -140,9 +140,15 @@ class Trajectory:
         return str(self)
 
     def _repr_html_(self) -> str:
+        def draw() -> bytes | None:
+            from jaxtank.plots.run import small
+
+            return small(self.plot()) if lines else None
+
         caption, *lines = str(self).splitlines()
         rows = self._summary() if lines else []
-        return html_table(rows, ("", "least", "most", "at the end") if rows else (), caption)
+        head = ("", "least", "most", "at the end") if rows else ()
+        return with_picture(html_table(rows, head, caption), draw)
 
     def _summary(self) -> list[list[str]]:
         """Rows (what and its unit, least, most, last) of levels, errors and inputs."""

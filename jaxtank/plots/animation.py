@@ -1,23 +1,28 @@
-"""A run as an animation: levels of all tanks, setpoints, inputs of the pumps, and the time.
+"""A run, or two beside each other, as a film: levels, what is above a rim, setpoints, inputs, time.
 
-Imported by reports and notebooks.
+Time runs slowly where much changes. Imported by reports and notebooks.
 """
 
 import hashlib
 import re
-import tempfile
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.animation import FuncAnimation
 from matplotlib.patches import Rectangle
+from PIL import Image
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
+from jaxtank.core.text import one_line
 from jaxtank.plots.layout import place
+from jaxtank.plots.overview import LARGEST as MOST_TANKS
+from jaxtank.plots.run import gif, still
 from jaxtank.plots.schematic import HALO, depth, mark, mark_height, schematic
-from jaxtank.plots.style import PUMPS, WATER, styled
+from jaxtank.plots.spills import Stack, headroom, spilled
+from jaxtank.plots.style import PUMPS, TUNED, WATER, plain, styled
 
 RATE = 12
 """Pictures per second: enough for liquid, which moves slowly."""
@@ -25,11 +30,18 @@ RATE = 12
 LONGEST = 60.0
 """Of an animation [s]."""
 
+STEADY = 0.25
+"""Share of a film in which time passes evenly; in the rest it passes where levels, setpoints and
+inputs change [-].
+"""
 
-def animate(loop, trajectory, path, seconds=6):
-    """Write a run as a GIF and return its path; the file is complete or not there.
 
-    It needs Pillow, which matplotlib installs.
+def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
+    """Write a run as a GIF of at most 600 kB and return its path; the file is complete or not
+    there.
+
+    Time passes slowly where levels, setpoints and inputs change. It needs Pillow, which matplotlib
+    installs.
 
     Parameters
     ----------
@@ -37,14 +49,18 @@ def animate(loop, trajectory, path, seconds=6):
     trajectory : of `jaxtank.simulate(loop, ...)`
     path : ends in .gif
     seconds : duration of the animation, 1 to 60 [s]
+    against : (ClosedLoop, Trajectory) of a second rig, drawn beside the first, or None
+    titles : names above the rigs
 
     Raises
     ------
     InputError
-        For another duration or ending, and for a trajectory of another rig.
+        For another duration or ending, for a trajectory of another rig, and for a rig of more than
+        24 tanks.
 
     Examples
     --------
+    >>> import tempfile
     >>> import jaxtank
     >>> from jaxtank import presets
     >>> loop = presets.find("cascaded/pi").loop
@@ -56,16 +72,38 @@ def animate(loop, trajectory, path, seconds=6):
     path = Path(path)
     if path.suffix.lower() != ".gif":
         raise InputError(f"animation {str(path)!r}: is written as a GIF: its name must end in .gif")
-    with tempfile.TemporaryDirectory() as folder, styled():
-        animation = _animation(loop, trajectory, seconds)
-        animation.save(Path(folder) / "run.gif", writer=PillowWriter(fps=RATE), dpi=80)
-        plt.close(animation._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
-        write_atomic(path, (Path(folder) / "run.gif").read_bytes())
+    write_atomic(path, film(loop, trajectory, seconds, against, titles)[0])
     return path
 
 
-def to_html(loop, trajectory, seconds=6):
-    """Return a run as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook.
+def film(loop, trajectory, seconds=8, against=None, titles=()):
+    """Return (a GIF as bytes, a still as the bytes of a PNG file): the still shows four moments.
+
+    Parameters and errors as of `animate`.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> from jaxtank import presets
+    >>> loop = presets.find("cascaded/pi").loop
+    >>> run = jaxtank.simulate(loop, jaxtank.Clock(dt=4.0, duration=40.0))
+    >>> [data[:3] for data in film(loop, run, seconds=1)]
+    [b'GIF', b'\x89PN']
+    """
+    with styled():
+        scene = _scene(loop, trajectory, seconds, against, titles)
+        pictures = []
+        for t in scene.times:
+            scene.draw(t)
+            scene.figure.canvas.draw()
+            pixels = np.asarray(scene.figure.canvas.buffer_rgba())[:, :, :3]
+            pictures.append(Image.fromarray(np.ascontiguousarray(pixels)))
+        plt.close(scene.figure)
+    return gif(pictures, RATE), still(pictures)
+
+
+def to_html(loop, trajectory, seconds=8, against=None, titles=()):
+    """Return a film as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook.
 
     It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
     `animate`.
@@ -80,9 +118,16 @@ def to_html(loop, trajectory, seconds=6):
     False
     """
     with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
-        animation = _animation(loop, trajectory, seconds)
+        scene = _scene(loop, trajectory, seconds, against, titles)
+        animation = FuncAnimation(
+            scene.figure,
+            scene.draw,
+            frames=scene.times,
+            interval=1000 / RATE,
+            cache_frame_data=False,
+        )
         page = animation.to_jshtml(fps=RATE)
-        plt.close(animation._fig)  # pyright: ignore[reportAttributeAccessIssue]  absent from the stubs
+        plt.close(scene.figure)
     # matplotlib takes the pictures on its buttons from the network
     page = re.sub(r"<link\b[^>]*>\s*", "", page)
     for name, sign in SIGNS.items():
@@ -110,48 +155,149 @@ SIGNS = {
 """Labels of the buttons of `to_html`."""
 
 
-def _animation(loop, trajectory, seconds):
-    """A FuncAnimation of about seconds * RATE pictures, evenly spaced in time."""
+def moments(runs, count, ranges):
+    """Return `count` times [s] from the start to the end of the longest run: evenly spaced for a
+    quarter of them, for the others by how much changes.
+
+    Parameters
+    ----------
+    runs : sequence of Trajectory
+    count : number of times
+    ranges : for each run (rims (tanks,), ranges of the inputs (pumps,)), by which changes count
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> level = np.array([0.0, 0.0, 0.0, 4.0, 8.0])[:, None]
+    >>> run = SimpleNamespace(t=np.arange(5.0), x=level, r=0.0 * level, u=0.0 * level)
+    >>> moments([run], 5, [(np.array([8.0]), np.array([1.0]))]).round(1).tolist()
+    [0.0, 2.3, 2.9, 3.4, 4.0]
+    """
+    end = max(float(run.t[-1]) for run in runs)
+    grid = np.unique(np.concatenate([np.asarray(run.t, dtype=float) for run in runs]))
+    changed = np.zeros(len(grid))
+    for run, (rims, spans) in zip(runs, ranges):
+        t = np.asarray(run.t, dtype=float)
+        steps = np.zeros(len(t))
+        for values, span in ((run.x, np.max(rims)), (run.r, np.max(rims)), (run.u, spans)):
+            steps[1:] += np.sum(np.abs(np.diff(np.asarray(values), axis=0)) / span, axis=1)
+        # a pump that chatters must not take all of the time
+        typical = np.quantile(steps[steps > 0], 0.9) if np.any(steps > 0) else 1.0
+        changed += np.interp(grid, t, np.cumsum(np.minimum(steps, typical)))
+    even = grid / end if end > 0 else grid
+    share = changed / changed[-1] if changed[-1] > 0 else even
+    passed = STEADY * even + (1.0 - STEADY) * share
+    return np.interp(np.linspace(0.0, 1.0, count), passed, grid)
+
+
+class _Scene(NamedTuple):
+    """A figure, the times of its pictures, and what draws one of them."""
+
+    figure: Any
+    times: Any
+    draw: Any
+
+
+def _scene(loop, trajectory, seconds, against, titles):
+    """A _Scene of one rig, or of two beside each other."""
     if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
         raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
-    t, x, r, u = (np.asarray(v) for v in (trajectory.t, trajectory.x, trajectory.r, trajectory.u))
+    pairs = [(loop, trajectory), *([] if against is None else [against])]
+    for one, run in pairs:
+        _check(one, run)
+    runs = [run for _, run in pairs]
+    span = lambda actuator: np.asarray(actuator.high, float) - np.asarray(actuator.low, float)
+    ranges = [(np.asarray(one.plant.rim, dtype=float), span(one.actuator)) for one, _ in pairs]
+    count = min(max(len(run.t) for run in runs), round(seconds * RATE))
+    times = moments(runs, count, ranges)
+    places = [place(one.plant) for one, _ in pairs]
+    shapes = [(where.top - where.bottom) / (where.right - where.left) for where in places]
+    width = 4.6 if len(pairs) == 1 else 3.9
+    figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * max(shapes) + 0.8)), dpi=80)
+    names = [*titles, *[""] * len(pairs)][: len(pairs)]
+    stages = [
+        _Stage(figure, k, len(pairs), one, run, name)
+        for k, ((one, run), name) in enumerate(zip(pairs, names))
+    ]
+    raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
+    for stage in stages:  # to one scale
+        stage.ax.set_ylim(top=stage.where.top + raised)
+    inch = 1.0 / figure.get_size_inches()[1]
+    clock = figure.text(0.5, 1.0 - 0.05 * inch, "", ha="center", va="top", fontsize=10)
+    bar = Rectangle((0.0, 0.0), 0.0, 0.05 * inch, color=TUNED, linewidth=0)
+    figure.add_artist(bar)
+    end = max(float(run.t[-1]) for run in runs)
+
+    def draw(t):
+        clock.set_text(f"t = {t:.0f} s of {end:.0f} s")
+        bar.set_width(t / end if end > 0 else 1.0)
+        for stage in stages:
+            stage.draw(t)
+
+    return _Scene(figure, times, draw)
+
+
+def _check(loop, run):
+    """Raise InputError for a run of another rig, and for a rig with too many tanks."""
+    if not hasattr(loop.plant, "links") or loop.plant.tanks > MOST_TANKS:
+        raise InputError(f"a film shows networks of at most {MOST_TANKS} tanks")
+    x, u = np.asarray(run.x), np.asarray(run.u)
     if x.ndim != 2 or x.shape[1] != loop.plant.tanks or u.shape[1] != loop.plant.pumps:
         raise InputError(
             f"the trajectory is one of {x.shape[-1]} tanks and {u.shape[-1]} pumps, the rig has"
             f" {loop.plant.tanks} and {loop.plant.pumps}"
         )
-    rows = np.unique(
-        np.linspace(0, len(t) - 1, min(len(t), round(seconds * RATE))).round().astype(int)
-    )
-    where = place(loop.plant)
-    wide, high = where.right - where.left, where.top - where.bottom
-    figure = plt.figure(figsize=(4.6, min(6.0, 4.6 * high / wide + 0.4)))
-    ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
-    schematic(ax, loop.plant)
-    for text in ax.texts:
-        text.set_path_effects(HALO)
-    clock = figure.text(0.5, 0.985, "", ha="center", va="top", fontsize=10)
-    water, marks, bars = _moving(ax, loop, where)
-    low, top = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
-
-    def draw(k):
-        clock.set_text(f"t = {t[k]:.0f} s of {t[-1]:.0f} s")
-        for i, box in enumerate(where.boxes):
-            water[i].set_height(depth(box, x[k, i]))
-        for n, (line, triangle) in enumerate(marks):
-            y = mark_height(where.boxes[loop.plant.outputs[n]], float(r[k, n]))
-            line.set_ydata([y, y])
-            triangle.set_ydata([y])
-        for j, bar in enumerate(bars):
-            bar.set_height(BAR * float(np.clip((u[k, j] - low[j]) / (top[j] - low[j]), 0.0, 1.0)))
-
-    return FuncAnimation(
-        figure, draw, frames=rows.tolist(), interval=1000 / RATE, cache_frame_data=False
-    )
 
 
 BAR = 0.6
 """Height of a pump's bar from its lower to its upper limit."""
+
+
+class _Stage:
+    """One rig of a film: the artists that move, and what they follow."""
+
+    def __init__(self, figure, number, of, loop, run, title):
+        self.loop, self.where = loop, place(loop.plant)
+        self.t, self.x, self.r, self.u = (np.asarray(v) for v in (run.t, run.x, run.r, run.u))
+        self.area = np.asarray(loop.plant.area, dtype=float)
+        self.low, self.high = (
+            np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high)
+        )
+        self.found = spilled(loop.plant, run)
+        inch = 1.0 / figure.get_size_inches()[1]  # as a share of the height
+        high = 1.0 - (0.78 if title else 0.56) * inch
+        self.ax = ax = figure.add_axes((number / of + 0.005, 0.31 * inch, 1.0 / of - 0.01, high))
+        schematic(ax, loop.plant)
+        for text in ax.texts:
+            text.set_path_effects(HALO)
+        middle = (number + 0.5) / of
+        words = {"ha": "center", "fontsize": 9}
+        name = plain(one_line(title, 60))
+        figure.text(middle, 1.0 - 0.25 * inch, name, va="top", fontweight="bold", **words)
+        self.words = figure.text(middle, 0.1 * inch, "", va="bottom", **words)
+        self.water, self.marks, self.bars = _moving(ax, loop, self.where)
+        self.stacks = {
+            i: Stack(ax, box, self.area[i])
+            for i, box in enumerate(self.where.boxes)
+            if self.found.most[i] > 0
+        }
+        headroom(ax, [(one, self.found.most[i]) for i, one in self.stacks.items()])
+
+    def draw(self, t):
+        """Move everything to the time t [s], or to the end of a run that ends before."""
+        k = max(0, int(np.searchsorted(self.t, t * (1 + 1e-9) + 1e-9, side="right")) - 1)
+        for i, box in enumerate(self.where.boxes):
+            self.water[i].set_height(depth(box, self.x[k, i]))
+        for i, one in self.stacks.items():
+            one.set(self.found.volume[k, i])
+        for n, (line, triangle) in enumerate(self.marks):
+            y = mark_height(self.where.boxes[self.loop.plant.outputs[n]], float(self.r[k, n]))
+            line.set_ydata([y, y])
+            triangle.set_ydata([y])
+        for j, bar in enumerate(self.bars):
+            share = (self.u[k, j] - self.low[j]) / (self.high[j] - self.low[j])
+            bar.set_height(BAR * float(np.clip(share, 0.0, 1.0)))
+        self.words.set_text(self.found.words(k))
 
 
 def _moving(ax, loop, where):

@@ -14,6 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.plots.effects import BARS, elementary, panels, shares, tornado
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.search import contours, convergence, curve
+from jaxtank.plots.spills import above_rim, spill_note, spilled
 from jaxtank.plots.style import (
     AFTER,
     BEFORE,
@@ -23,10 +24,15 @@ from jaxtank.plots.style import (
     REFERENCE,
     RUNS,
     STYLE,
+    beside,
+    for_print,
     grid,
+    height,
     hide,
     plain,
+    printing,
     styled,
+    width,
 )
 from jaxtank.plots.uncertainty import cloud, fan, violations
 
@@ -47,6 +53,7 @@ __all__ = [
     "elementary",
     "error",
     "fan",
+    "for_print",
     "level",
     "panels",
     "plain",
@@ -75,7 +82,7 @@ def _example() -> Any:
     return Trajectory(**arrays)
 
 
-def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
+def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm", spills=None):
     """Draw the level of one tank, with its setpoint, rim and limit.
 
     Parameters
@@ -86,6 +93,7 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
     output : index of its setpoint, None for a tank that is not controlled
     rim, limit : level [unit] or None
     unit : of levels
+    spills : {name: Spilled} of the runs (`jaxtank.plots.spills`), or None
 
     Returns
     -------
@@ -121,7 +129,8 @@ def level(ax, trajectories, tank, output=None, rim=None, limit=None, unit="cm"):
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
             ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
-    ax.set(title=f"tank {tank + 1}", ylabel=f"level [{unit}]")
+    ax.set(title=f"tank {tank + 1}{above_rim(ax, trajectories, tank, rim, spills)}")
+    ax.set_ylabel(f"level [{unit}]")
     return ax
 
 
@@ -230,10 +239,12 @@ def responses(loop, trajectories, title="", limits=None):
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
     rows, note = _rows(loop, drawn, (outputs, pumps, others), limits), note + more
+    note += spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
-    width = max(4.6 * columns, 6.4)
+    wide = width(max(4.6 * columns, 6.4))
     with styled():
-        figure, axes = grid(len(rows), columns, (width, 2.05 * len(rows) + 0.5), sharex=True)
+        high = height(2.05 * len(rows) + 0.5, len(rows))
+        figure, axes = grid(len(rows), columns, (wide, high), sharex=True)
         for row, line in zip(rows, axes):
             for draw, ax in zip(row, line):
                 draw(ax)
@@ -242,12 +253,13 @@ def responses(loop, trajectories, title="", limits=None):
             last = [ax for ax in column if ax.get_visible()][-1]
             last.set_xlabel("time [s]")
             last.tick_params(labelbottom=True)
-        _legend(figure, axes, width)
+        _legend(figure, axes, wide)
+        lines = ("" if printing() else title) + note  # a journal has captions
         figure.suptitle(
             "\n".join(
-                plain(textwrap.fill(line, int(12 * width))) for line in (title + note).splitlines()
+                plain(textwrap.fill(line, int(12 * wide))) for line in lines.strip().splitlines()
             ),
-            fontsize=10,
+            fontsize=None if printing() else 10,
         )
     return figure
 
@@ -295,9 +307,10 @@ def _rows(loop, drawn, which, limits):
     """Rows of functions that draw one panel each, of (outputs, pumps, other tanks)."""
     (outputs, pumps, others), (length, drive) = which, loop.units
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
+    lost = {name: spilled(loop.plant, run) for name, (run, *_) in drawn.items()}
 
     def level_of(i, k=None):
-        return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length)
+        return lambda ax: level(ax, drawn, i, k, _at(rims, i), _at(limits, i), length, lost)
 
     def error_of(i, k):
         return lambda ax: error(ax, drawn, k, i, length)
@@ -311,7 +324,8 @@ def _rows(loop, drawn, which, limits):
         [level_of(i) for i in others],
         [voltage_of(j) for j in pumps],
     ]
-    return [row[i : i + COLUMNS] for row in kinds for i in range(0, len(row), COLUMNS)]
+    most = beside(COLUMNS)
+    return [row[i : i + most] for row in kinds for i in range(0, len(row), most)]
 
 
 def _legend(figure, axes, width):
@@ -321,6 +335,7 @@ def _legend(figure, axes, width):
         for handle, label in zip(*ax.get_legend_handles_labels()):
             handles.setdefault(label, handle)
     columns = len(handles) if len(handles) <= 6 else max(4, round(width / 2))
+    columns = min(columns, max(2, round(width)))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
 
 

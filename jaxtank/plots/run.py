@@ -5,15 +5,36 @@ May import the other modules of `plots` and what they import.
 
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
+from jaxtank.core.files import write_folder
+from jaxtank.core.units import local
 from jaxtank.plots import responses
 from jaxtank.plots.layout import place
 from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.schematic import schematic
+from jaxtank.plots.spills import amount, spilled
+from jaxtank.plots.style import TALLEST, WIDTHS, for_print, styled
+
+GIF_BYTES = 600_000
+"""Size of a GIF [bytes], above which it has fewer pictures per second."""
+
+COLOURS = 64
+"""Colours of a GIF."""
+
+STILLS = 4
+"""Moments of a still."""
+
+SOFTWARE = {"Software": None}
+"""Metadata of a PNG file: nothing that differs from machine to machine."""
+
+SMALL = 62
+"""Pixels per inch of the small picture that a notebook shows below a result."""
 
 
 def figures(run: Any) -> dict[str, Any]:
@@ -22,8 +43,10 @@ def figures(run: Any) -> dict[str, Any]:
     """
     length, drive = run.units
     colours = [colour for colour, _ in responses.RUNS]
+    lost = float(np.sum(np.asarray(run.spilled)[-1]))
+    floor = f", {amount(lost, local('cm^3', run.units))} over the rims" if lost > 0 else ""
     groups = [
-        ("levels", "h", run.x, length),
+        (f"levels{floor}", "h", run.x, length),
         ("setpoints", "r", run.r, length),
         ("tracking errors", "e", run.e, length),
         ("inputs", "u", run.u, drive),
@@ -66,9 +89,12 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
         extent = (4.8, min(7.0, 4.8 * high / wide + 0.35))
     with responses.styled():
         figure = plt.figure(figsize=extent)
-        ax = figure.add_axes((0.01, 0.01, 0.98, 0.92))
+        ax = figure.add_axes((0.01, 0.01, 0.98, 0.89))
         if run is not None and np.all(np.isfinite(run.x[-1])):
-            schematic(ax, plant, run.x[-1], run.r[-1])
+            lost = run.spilled[-1] if plant.overflow else None
+            schematic(ax, plant, run.x[-1], run.r[-1], lost)
+            found = spilled(plant, run)
+            title = f"{title}\n{found.words()}" if found.any else title
         else:
             schematic(ax, plant)
         ax.set_title(responses.plain(title))
@@ -78,11 +104,99 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
 def png(figure: Any) -> bytes:
     """Return a figure as PNG bytes, and close it."""
     out = io.BytesIO()
-    figure.savefig(out, format="png", metadata={"Software": None})
+    figure.savefig(out, format="png", metadata=SOFTWARE)
     plt.close(figure)
     return out.getvalue()
+
+
+def for_journal(drawn: Mapping[str, Any], columns: int = 1) -> dict[str, bytes]:
+    """Return {file name: bytes} of {name: figure} as SVG and as PNG of 300 dpi, in the width of one
+    or two columns of a journal; the figures are closed.
+
+    Figures that `style.for_print` has not made are scaled to that width.
+    """
+    found: dict[str, bytes] = {}
+    for name, figure in drawn.items():
+        wide, high = figure.get_size_inches()
+        scale = WIDTHS[columns] / wide
+        figure.set_size_inches(WIDTHS[columns], min(high * max(scale, 0.6), TALLEST))
+        for kind, metadata in (("svg", {"Date": None, "Creator": None}), ("png", SOFTWARE)):
+            out = io.BytesIO()
+            # the same bytes for the same figure
+            with for_print(columns), styled({"svg.hashsalt": name}):
+                figure.savefig(out, format=kind, metadata=metadata)
+            found[f"{name}.{kind}"] = out.getvalue()
+        plt.close(figure)
+    return found
+
+
+def save_for_print(drawn: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
+    """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
+    or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
+
+    Raises InputError for a number of columns that is none, and a folder that cannot be written to.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from jaxtank import presets
+    >>> with for_print(1):
+    ...     figures = presets.find("cascaded/pi").plot()
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_for_print(figures, folder)]
+    ['rig.svg', 'rig.png']
+    """
+    with for_print(columns):  # which refuses other numbers
+        return write_folder(folder, for_journal(drawn, columns))
+
+
+def small(drawn: Mapping[str, Any]) -> bytes | None:
+    """Return the first of {name: figure} as PNG bytes of about half its size; all are closed."""
+    out, first = io.BytesIO(), next(iter(drawn.values()), None)
+    if first is not None:
+        first.savefig(out, format="png", dpi=SMALL, metadata=SOFTWARE)
+    for figure in drawn.values():
+        plt.close(figure)
+    return None if first is None else out.getvalue()
 
 
 def pngs(drawn: Mapping[str, Any]) -> dict[str, bytes]:
     """Return {file name: PNG bytes} of {name: figure}; the figures are closed."""
     return {f"{name}.png": png(figure) for name, figure in drawn.items()}
+
+
+def gif(pictures: Any, rate: int) -> bytes:
+    """Return pictures of a film as a GIF of at most GIF_BYTES, `rate` of them per second. Of a
+    larger one some are left out, and the others shown for as long.
+    """
+    parts = Image.new("RGB", (pictures[0].width, 3 * pictures[0].height))
+    for k in range(3):  # one palette for all
+        parts.paste(pictures[k * (len(pictures) - 1) // 2], (0, k * pictures[0].height))
+    palette = parts.quantize(COLOURS, dither=Image.Dither.NONE)
+    colours = np.reshape(np.array(palette.getpalette() or ()), (-1, 3))
+    colours[colours.min(axis=1) >= 248] = 255  # paper stays white
+    palette.putpalette(colours.ravel().tolist())
+    drawn = [one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
+    for every in (1, 2, 3, 4, 6, 8):
+        out, kept = io.BytesIO(), drawn[::every]
+        pause = round(1000 * every / rate)
+        kept[0].save(
+            out, "GIF", save_all=True, append_images=kept[1:], duration=pause, loop=0, optimize=True
+        )
+        if out.tell() <= GIF_BYTES:
+            break
+    return out.getvalue()
+
+
+def still(pictures: Any) -> bytes:
+    """Return four moments of a film as a PNG file, in two rows where the film is wide."""
+    places = np.unique(np.linspace(0, len(pictures) - 1, STILLS + 1).round().astype(int))[1:]
+    chosen = [pictures[k] for k in places] or pictures[:1]
+    width, height = chosen[0].size
+    columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
+    rows = -(-len(chosen) // columns)
+    strip, out = Image.new("RGB", (columns * width, rows * height), "white"), io.BytesIO()
+    for k, one in enumerate(chosen):
+        strip.paste(one, (k % columns * width, k // columns * height))
+    strip.save(out, format="PNG", optimize=True)
+    return out.getvalue()

@@ -7,8 +7,10 @@ import numpy as np
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 
+from jaxtank.core.units import local
 from jaxtank.plots.layout import jets, overflows, pipes, place
 from jaxtank.plots.overview import LARGEST, overview
+from jaxtank.plots.spills import Stack, amount, headroom
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER
 
 JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
@@ -18,12 +20,13 @@ HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 """Outline of text that a level may pass behind."""
 
 
-def schematic(ax, plant, levels=None, setpoints=None):
+def schematic(ax, plant, levels=None, setpoints=None, lost=None):
     """Draw a rig: each tank above those that it flows into, heights to scale.
 
     Controlled tanks have a heavier outline. A closed orifice (area 0) is not drawn. Dashed lines
-    are free jets, dotted lines overflow, double lines pipes below the surface. A rig of more than
-    24 tanks is drawn by `overview.overview`.
+    are free jets, dotted lines overflow, double lines pipes below the surface. Hatched is what is
+    above a rim: what the tank cannot hold, or has lost, in its own cross-section. A rig of more
+    than 24 tanks is drawn by `overview.overview`.
 
     Parameters
     ----------
@@ -31,6 +34,7 @@ def schematic(ax, plant, levels=None, setpoints=None):
     plant : TankNetwork
     levels : (tanks,) [cm], or None for empty tanks
     setpoints : (outputs,) [cm] to mark on the controlled tanks, or None
+    lost : (tanks,) volumes lost over the rims [cm^3], of a rig with overflow; or None
 
     Returns
     -------
@@ -98,6 +102,8 @@ def schematic(ax, plant, levels=None, setpoints=None):
         _pump(ax, x, y, j, str(j + 1) if crowded else f"pump {j + 1}")
     _shares(ax, plant, where)
     ax.set(xlim=(where.left, where.right), ylim=(where.bottom, where.top), aspect="equal")
+    if levels is not None:
+        _above(ax, plant, where, np.asarray(levels, dtype=float), lost)
     ax.axis("off")
     return ax
 
@@ -132,7 +138,7 @@ def mark_height(box, setpoint):
 
 
 def depth(box, level):
-    """Return the drawn depth of a level [cm], at most 5 % above the rim.
+    """Return the drawn depth of a level [cm], at most up to the rim; `spills` draws the rest.
 
     Examples
     --------
@@ -140,7 +146,24 @@ def depth(box, level):
     >>> depth(Box(0.0, 0.0, 1.0, 1.0, 0.1), 4.0)
     0.4
     """
-    return min(max(float(level), 0.0) * box.scale, 1.05 * box.height)
+    return min(max(float(level), 0.0) * box.scale, box.height)
+
+
+def _above(ax, plant, where, levels, lost):
+    """What is above the rims, hatched and counted: lost volumes, or what the tanks cannot hold."""
+    area, rim = (np.asarray(v, dtype=float) for v in (plant.area, plant.rim))
+    volumes, what = area * (levels - rim), "above"
+    if lost is not None:
+        volumes, what = np.asarray(lost, dtype=float), "spilled"
+    for i in np.flatnonzero(volumes > 1e-9 * area * rim):
+        box, volume = where.boxes[i], float(volumes[i])
+        found = Stack(ax, box, float(area[i]))
+        found.set(volume)
+        headroom(ax, [(found, volume)])
+        y = box.y + box.height + min(0.5 * found.height(volume), 0.2)
+        style = {"ha": "center", "va": "center", "fontsize": 7, "zorder": 6, "gid": "above"}
+        text = f"{amount(volume, local('cm^3', plant.units))} {what}"
+        ax.text(box.middle, y, text, path_effects=HALO, **style)
 
 
 def _colour(pump):

@@ -1,12 +1,29 @@
 """Colours, line styles and settings of all pictures. Imported by every module of this folder."""
 
 import contextlib
+import importlib
+import importlib.util
+import sys
 from typing import Any
 
 import matplotlib.pyplot as plt
 
-# Okabe and Ito's colours, which colour-blind readers can distinguish
-BEFORE, AFTER, REFERENCE, FORBIDDEN, OTHER = "#D55E00", "#0072B2", "#000000", "#CC79A7", "#009E73"
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import PICTURES
+
+# One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
+# distinguish (Okabe, Ito: Color Universal Design, 2008)
+PUBLISHED, TUNED, FILTERED = "#D55E00", "#0072B2", "#009E73"
+"""Colours of a run with the values of the case, with those of a search, and with those behind a
+safety filter or in any third run.
+"""
+
+REFERENCE, RIM = "#000000", "#CC79A7"
+"""Colours of setpoints, and of rims, limits and what lies beyond them."""
+
+BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM
+"""The same by their places in a comparison."""
+
 RUNS = (
     (BEFORE, "--"),
     (AFTER, "-"),
@@ -19,8 +36,11 @@ RUNS = (
 other line styles.
 """
 
-PUMPS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
-"""One colour for each pump and its pipework."""
+PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")
+"""One colour for each pump and its pipework: none of a role above, and of different lightness."""
+
+SHARE = "#56B4E9"
+"""Colour of bars of shares and probabilities."""
 
 WATER, GLASS = "#9CCEEB", "0.35"
 """Colours of the liquid and of the walls of a tank in drawings of a rig."""
@@ -40,6 +60,114 @@ STYLE: dict[Any, Any] = {
     "svg.fonttype": "none",
 }
 
+WIDTHS = {1: 3.5, 2: 7.16}
+"""{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
+(IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
+"""
+
+TALLEST = 9.0
+"""Height of a figure for a journal, at most [inch]."""
+
+PANEL = 2.2
+"""Width of a panel in a figure for a journal, at least [inch]."""
+
+PRINT: dict[Any, Any] = {
+    "font.family": "STIXGeneral",  # like Times, and comes with matplotlib
+    "mathtext.fontset": "stix",
+    "text.usetex": False,
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "figure.titlesize": 8,
+    "legend.fontsize": 7.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "axes.linewidth": 0.6,
+    "hatch.linewidth": 0.6,
+    "savefig.dpi": 300,
+    "svg.fonttype": "path",  # the same wherever it is set
+    "pdf.fonttype": 42,
+}
+"""Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
+
+_COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
+
+
+@contextlib.contextmanager
+def for_print(columns=1):
+    """Make figures for a journal within a `with` block: their width, their letters, no title.
+
+    `jaxtank.plots.run.save_for_print` writes them as SVG and as PNG of 300 dpi.
+
+    Parameters
+    ----------
+    columns : 1 or 2
+        Of the journal, that a figure is wide.
+
+    Raises
+    ------
+    InputError
+        For another number.
+
+    Examples
+    --------
+    >>> with for_print(2), styled():
+    ...     width(9.6), plt.rcParams["savefig.dpi"]
+    (7.16, 300.0)
+    """
+    if columns not in WIDTHS or isinstance(columns, bool):
+        raise InputError(f"columns = {columns!r}: a figure is 1 or 2 columns of a journal wide")
+    _COLUMNS.append(columns)
+    try:
+        yield
+    finally:
+        _COLUMNS.pop()
+
+
+def printing():
+    """Return whether figures are made for a journal.
+
+    Examples
+    --------
+    >>> printing()
+    False
+    """
+    return bool(_COLUMNS)
+
+
+def width(usual):
+    """Return the width of a figure [inch]: that of a journal's columns, or `usual`.
+
+    Examples
+    --------
+    >>> width(9.6)
+    9.6
+    """
+    return WIDTHS[_COLUMNS[-1]] if _COLUMNS else usual
+
+
+def beside(most):
+    """Return how many panels stand beside each other: as many as a journal's columns take, or
+    `most`.
+
+    Examples
+    --------
+    >>> with for_print(1):
+    ...     beside(4)
+    1
+    """
+    return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
+
+
+def height(usual, rows, legend=0.5):
+    """Return the height of a figure of rows of panels [inch]: 1.3 each for a journal, or `usual`.
+
+    Examples
+    --------
+    >>> height(7.0, 3)
+    7.0
+    """
+    return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
+
 
 @contextlib.contextmanager
 def styled(more=None):
@@ -55,13 +183,55 @@ def styled(more=None):
     ...     plt.rcParams["font.size"]
     20.0
     """
-    settings = STYLE | (more or {})
+    settings = STYLE | (PRINT if _COLUMNS else {}) | (more or {})
     before: dict[Any, Any] = {name: plt.rcParams[name] for name in settings}
     plt.rcParams.update(settings)
     try:
         yield
     finally:
         plt.rcParams.update(before)
+
+
+def notebook(dpi: int = 110, sharp: bool = False, pictures: bool = True) -> None:
+    """Set up a notebook, once in its first cell: float64, the style of the figures, their
+    resolution, and a small picture below each result that is shown.
+
+    Parameters
+    ----------
+    dpi : int
+        Size of figures on the screen, 40 to 400 [pixels per inch].
+    sharp : bool
+        Whether figures have twice as many pixels at the same size, for screens of high resolution.
+    pictures : bool
+        Whether a result that is shown has a small picture below its table.
+
+    Raises
+    ------
+    InputError
+        For another resolution.
+
+    Examples
+    --------
+    >>> import jaxtank
+    >>> with plt.rc_context():
+    ...     jaxtank.notebook(pictures=False)
+    ...     plt.rcParams["figure.dpi"]
+    110.0
+    """
+    import jax
+
+    if isinstance(dpi, bool) or not isinstance(dpi, int) or not 40 <= dpi <= 400:
+        raise InputError(f"dpi = {dpi!r}: must be a whole number from 40 to 400 pixels per inch")
+    jax.config.update("jax_enable_x64", True)
+    STYLE["figure.dpi"] = dpi
+    plt.rcParams.update(STYLE)
+    PICTURES[0] = bool(pictures)
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    if hasattr(shell, "kernel") and importlib.util.find_spec("matplotlib_inline") is not None:
+        config: Any = importlib.import_module("matplotlib_inline.config")
+        inline: Any = config.InlineBackend.instance(parent=shell)
+        inline.shell = shell
+        inline.figure_formats = {"retina" if sharp else "png"}
 
 
 def plain(text):

@@ -4,7 +4,27 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, REFERENCE, grid, hide, plain, styled
+from jaxtank.plots.style import (
+    AFTER,
+    BEFORE,
+    FORBIDDEN,
+    PUBLISHED,
+    REFERENCE,
+    RIM,
+    SHARE,
+    TUNED,
+    beside,
+    grid,
+    height,
+    hide,
+    plain,
+    printing,
+    styled,
+    width,
+)
+
+CUT = 0.05
+"""Share of the plants below a bar, and above it [-]."""
 
 
 def fan(loop, bands, title):
@@ -25,10 +45,11 @@ def fan(loop, bands, title):
     >>> [ax.get_title() for ax in figure.axes]
     ['tank 1', 'tank 2']
     """
-    tanks, columns = loop.plant.tanks, min(2, loop.plant.tanks)
-    rows = -(-tanks // 2)
+    tanks = loop.plant.tanks
+    columns = beside(min(2, tanks))
+    rows = -(-tanks // columns)
     with styled():
-        figure, axes = grid(rows, columns, (9.6, 2.7 * rows), sharex=True)
+        figure, axes = grid(rows, columns, (width(9.6), height(2.7 * rows, rows)), sharex=True)
         for i, ax in enumerate(axes.ravel()[:tanks]):
             _band(ax, loop, bands, i)
         # the lowest panel of each column, above one that stays empty too
@@ -36,7 +57,7 @@ def fan(loop, bands, title):
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
         hide(axes.ravel()[tanks:])
-        figure.suptitle(plain(title))
+        figure.suptitle("" if printing() else plain(title))
     return figure
 
 
@@ -50,12 +71,12 @@ def _band(ax, loop, bands, i):
     ax.plot(t, middle, color=AFTER, linewidth=1.2, label="median")
     if i in loop.plant.outputs:
         setpoint = bands["r"][:, loop.plant.outputs.index(i)]
-        ax.plot(t, setpoint, color="black", linewidth=0.8, linestyle="--", label="setpoint")
+        ax.plot(t, setpoint, color=REFERENCE, linewidth=0.8, linestyle="--", label="setpoint")
     if high.max() > 0.25 * rim:
-        ax.axhline(rim, color=BEFORE, linewidth=1.0, label="rim")
+        ax.axhline(rim, color=RIM, linewidth=1.2, label="rim")
     else:  # a rim far above all levels would only compress the picture
         label = f"rim {rim:g} {unit}, above the picture"
-        ax.plot([], [], color=BEFORE, linewidth=1.0, label=label)
+        ax.plot([], [], color=RIM, linewidth=1.2, label=label)
     ax.set(title=f"tank {i + 1}", ylabel=f"level [{unit}]")
     ax.legend(loc="best", fontsize="x-small")
 
@@ -152,13 +173,13 @@ def violations(rows, samples):
         figure, ax = plt.subplots(figsize=(6.4, 0.9 + 0.35 * len(rows)), layout="constrained")
         y, p = np.arange(len(rows)), np.array([r["probability"] for r in rows])
         ends = np.array([r["interval95"] for r in rows])
-        ax.barh(y, p, color="#56B4E9", height=0.6)
+        ax.barh(y, p, color=SHARE, height=0.6)
         ax.errorbar(
             p,
             y,
             xerr=np.maximum(0.0, [p - ends[:, 0], ends[:, 1] - p]),
             fmt="none",
-            ecolor="black",
+            ecolor=REFERENCE,
             capsize=3,
         )
         ax.set_yticks(
@@ -171,4 +192,46 @@ def violations(rows, samples):
         ax.invert_yaxis()
         ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * ends[:, 1].max())))
         ax.set_xlabel(f"probability of violating the limit [-], {samples} draws")
+    return figure
+
+
+def plants(sides, limits, unit):
+    """Return a figure of many plants: how their errors are distributed, and their highest levels.
+
+    Parameters
+    ----------
+    sides : {name: (errors (N,), highest levels (N, tanks))}
+        One, or before and after.
+    limits : (tanks,) on the levels, inf where there is none
+    unit : of lengths
+
+    Examples
+    --------
+    >>> figure = plants({"after": (np.ones(8), np.full((8, 2), 20.0))}, [30.0, 30.0], "cm")
+    >>> [ax.get_xlabel() for ax in figure.axes]
+    ['total rms error [cm]', 'tank']
+    """
+    colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
+    with styled():
+        figure, axes = grid(1, 2, (width(8.0), height(2.8, 2)))
+        left, right = axes[0]
+        every = np.concatenate([error for error, _ in sides.values()])
+        bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
+        for k, (colour, (name, (error, levels))) in enumerate(zip(colours, sides.items())):
+            left.hist(error, bins, color=colour, alpha=0.55, label=name)
+            left.axvline(error.mean(), color=colour, linewidth=1.2)
+            x = np.arange(levels.shape[1]) + 1 + (k - 0.5 * (len(sides) - 1)) * 0.25
+            low, high = np.quantile(levels, (CUT, 1.0 - CUT), axis=0)
+            right.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
+            right.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
+        for tank, limit in enumerate(limits):
+            if np.isfinite(limit):
+                right.hlines(limit, tank + 0.6, tank + 1.4, color=RIM, linewidth=1.6)
+        left.set(xlabel=f"total rms error [{unit}]", ylabel=f"plants of {len(error)}")
+        right.set(xlabel="tank", ylabel=f"highest level [{unit}]")
+        right.set_xticks(np.arange(len(limits)) + 1)
+        right.set_title("5 to 95 % of plants, highest of all, limit", loc="left")
+        left.set_title("line: mean", loc="left")
+        if len(sides) > 1:
+            left.legend()
     return figure

@@ -84,6 +84,8 @@ MADE = {
     ("tuning.problem.result", "_report", "import_module"): "the report of its own class",
     ("tuning.problem.result", "explore", "import_module"): "the live page, by a constant name",
     ("jaxtank.case", "explore", "import_module"): "the live page, by a constant name",
+    ("tuning.live.live_figure", "_build", "import_module"): "ipywidgets, by a constant name",
+    ("jaxtank.plots.style", "notebook", "import_module"): "matplotlib_inline, by a constant name",
     ("tuning.cluster.task", "call", "import_module"): "names of its own table, in its own package",
     ("jaxtank.presets", "_load", "import_module"): "names of presets.PAPERS, checked before",
 }
@@ -92,8 +94,6 @@ READ = {
     " rig file names as the kind of a component; nothing from a path",
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
-    ("jaxtank.plots.animation", "animate", "read_bytes"): "the picture that it has just drawn",
-    ("tuning.report.artifacts", "save_run", "read_bytes"): "the picture that it has just drawn",
     ("tuning.bench.bench", "c_loop", "CDLL"): "the C loop that it has just compiled",
     ("tuning.report.html", "style", "read_text"): "page.css of the package",
     ("tuning.live.page", "_read", "read_text"): "a part of the page, of the package",

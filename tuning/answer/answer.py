@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxtank.core.jsonable import clean
-from tuning.answer.judged import Judged
+from tuning.answer.judged import Judged, drawn
 from tuning.answer.setting import Setting
 from tuning.problem.result import Shown
 
@@ -67,6 +67,11 @@ class Answer(Shown):
 
     def __str__(self) -> str:
         return "\n".join(map(str, self._lines()))
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {"plants": errors and highest levels before and after}."""
+        sides = {"before": self.before, "after": self.after}
+        return drawn({name: one for name, one in sides.items() if one is not None})
 
     def holds(self) -> dict[str, Any]:
         """Return the object `holds` of the JSON: share of plants, interval, certificates."""

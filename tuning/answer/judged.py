@@ -94,6 +94,12 @@ class Judged(Shown):
             numbers["diverged"] = f"{found['failed']} plants"
         return "\n".join(f"{name}: {text}" for name, text in numbers.items())
 
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {"plants": errors and highest levels}; {} where every run
+        diverged.
+        """
+        return drawn({"plants": self})
+
     def worst(self) -> list[dict[str, Any]]:
         """Return a dict for each limit: the Limit, its worst value, and on how many plants it is
         violated."""
@@ -112,6 +118,23 @@ class Judged(Shown):
                 }
             )
         return rows
+
+
+def drawn(sides: Mapping[str, Judged]) -> dict[str, Any]:
+    """Return {"plants": figure} of {name: Judged}, one or before and after; {} where every run of
+    one diverged.
+    """
+    if any(one.failed.all() for one in sides.values()):
+        return {}
+    from jaxtank.plots.uncertainty import plants
+
+    found = {name: (one.error[~one.failed], one.level[~one.failed]) for name, one in sides.items()}
+    last = list(sides.values())[-1]
+    limits = np.full(last.level.shape[1], np.inf)
+    for limit in last.limits:
+        if limit.measure == "max_level":
+            limits[limit.index] = limit.value
+    return {"plants": plants(found, limits, last.unit)}
 
 
 def validate(

@@ -10,15 +10,19 @@ import importlib
 from pathlib import Path
 from typing import Any, ClassVar
 
+from jaxtank.core.text import with_picture
+
 
 class Shown:
     """A result that a notebook displays as HTML: what `str` reports, all of it escaped."""
 
     def _repr_html_(self) -> str:
-        """Return the lines and tables of the result as a fragment of HTML."""
+        """Return the lines and tables of the result as a fragment of HTML, with a small picture
+        once `jaxtank.notebook()` has been called.
+        """
         from tuning.report.html import fragment
 
-        return fragment(self._lines())
+        return with_picture(fragment(self._lines()), lambda: _first_picture(self))
 
     def _lines(self) -> list[Any]:
         """Return what `str` reports: lines of text and tables."""
@@ -50,13 +54,20 @@ class Result(Shown):
         """Return matplotlib figures {name: Figure} of what there is to show."""
         return self._report().figures(self)
 
-    def explore(self) -> Any:
+    def explore(self, plants: int | None = None) -> Any:
         """Return the live page of the result's case, a `tuning.live.shown.LivePage`: of a tuned one
         with its values before and after. A notebook shows it, and `.save(path)` writes it.
 
+        With `plants`, in a notebook with ipywidgets, it is a live figure of so many plants that
+        begins with the values after (`case.explore`).
+
         Raises InputError for a case that cannot be run in a browser.
         """
-        return importlib.import_module("tuning.live.shown").of_result(self)
+        live = importlib.import_module("tuning.live.shown")
+        own = getattr(self, "tuned", None) or getattr(self, "case", None)
+        if plants is None or own is None:
+            return live.of_result(self)
+        return own.explore(plants=plants)
 
     def save(self, folder: str | Path, command: str | None = None) -> list[Path]:
         """Write result.json, tables, pictures and report.html to `folder`; return their paths.
@@ -74,3 +85,11 @@ class Result(Shown):
             `folder` cannot be written to.
         """
         return self._report().save(self, folder, command)
+
+
+def _first_picture(result: Any) -> bytes | None:
+    """The first picture of a result as PNG bytes, None where it has none."""
+    from jaxtank.plots.run import small
+
+    plot: Any = getattr(result, "plot", None)
+    return None if plot is None else small(plot())

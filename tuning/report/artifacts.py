@@ -1,6 +1,5 @@
 """Files of a result: trajectories, pictures, and a folder that takes all of them or none."""
 
-import tempfile
 from pathlib import Path
 
 import jax
@@ -95,10 +94,12 @@ def write_result(folder, files, draw, page=None, stale=()):
     return written + write_folder(folder, more | pngs(drawn))
 
 
-def save_run(case, run, payload, folder, gif=False, page=None):
-    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif of one simulation to
-    `folder`, from which the run.gif of an earlier one is removed; page: function of the pictures
-    that returns report.html.
+def save_run(case, run, payload, folder, gif=False, page=None, against=None, columns=None):
+    """Write result.json, trajectory.csv, responses.png and, if asked, run.gif and its still
+    film.png of one simulation to `folder`, from which those of an earlier one are removed; page:
+    function of the pictures that returns report.html; against: (Case, Trajectory) of a rig that the
+    film shows beside it; columns: of a journal, for which the responses are also written as
+    print.svg and print.png of 300 dpi.
     """
     from jaxtank.plots import responses
 
@@ -106,7 +107,8 @@ def save_run(case, run, payload, folder, gif=False, page=None):
     files = {"result.json": dumps(payload) + "\n", "trajectory.csv": csv(run, case.loop.units)}
     # of an earlier run, known by its trajectory: its tanks must not be taken for those of this one
     old = (Path(folder) / "trajectory.csv").exists()
-    names = ("responses.png", "estimates.png", "shares.png", "run.gif", "report.html")
+    names = ("responses.png", "estimates.png", "shares.png", "run.gif", "film.png")
+    names += ("report.html", "print.svg", "print.png")
     stale = [Path(folder) / name for name in names] if old else []
 
     def pictures():
@@ -117,14 +119,33 @@ def save_run(case, run, payload, folder, gif=False, page=None):
         }
 
     written = write_result(folder, files, pictures, page, stale)
+    if columns is not None:
+        written += _for_journal(case, run, folder, columns)
     if gif:
-        from jaxtank.plots.animation import animate
+        from jaxtank.plots.animation import film
 
+        beside = None if against is None else (against[0].loop, against[1])
+        names = (case.name,) if against is None else (case.name, against[0].name)
         try:
-            with tempfile.TemporaryDirectory() as aside:
-                film = animate(case.loop, run, Path(aside) / "run.gif").read_bytes()
+            moving, still = film(case.loop, run, against=beside, titles=names)
         except Exception as error:
             failed("run.gif", error)
         else:
-            written += write_folder(Path(folder), {"run.gif": film})
+            written += write_folder(Path(folder), {"run.gif": moving, "film.png": still})
     return written
+
+
+def _for_journal(case, run, folder, columns):
+    """Write the responses of a run for a journal; returns the paths."""
+    from jaxtank.plots import responses
+    from jaxtank.plots.run import save_for_print
+
+    try:
+        with responses.for_print(columns):
+            figure = responses.responses(case.loop, {case.name: run})
+        return save_for_print({"print": figure}, folder, columns)
+    except InputError:
+        raise
+    except Exception as error:
+        failed("print.svg", error)
+        return []

@@ -1,16 +1,22 @@
 """Moving pictures: how many, how large, and that they show the run that they are of."""
 
+import dataclasses
+import io
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
 import pytest
+from helpers import command
 from matplotlib.colors import to_rgb
 from PIL import Image
 
 import jaxtank
 from jaxtank.core.errors import InputError
+from jaxtank.plants import network
 from jaxtank.plots import animation, style
+from jaxtank.plots import run as run_plots
 
 
 @pytest.fixture(scope="module")
@@ -34,18 +40,69 @@ def blue(picture):
 def test_the_tanks_of_the_gif_hold_what_the_run_says(short, tmp_path):
     loop, run = short
     path = animation.animate(loop, run, tmp_path / "run.gif", seconds=1)
-    assert path.stat().st_size < 1_000_000 and [p.name for p in tmp_path.iterdir()] == ["run.gif"]
+    assert path.stat().st_size < 600_000 and [p.name for p in tmp_path.iterdir()] == ["run.gif"]
     seen = np.array([blue(f) for f in frames(path)])
     assert len(seen) == animation.RATE
-    # tanks of one size
-    stored = np.asarray(run.x)[np.linspace(0, len(run.t) - 1, len(seen)).round().astype(int)].sum(
-        axis=1
-    )
+    # tanks of one size; in between rows the one before is shown
+    times = animation.moments([run], len(seen), [(loop.plant.rim, np.array([12.0, 12.0]))])
+    rows = np.searchsorted(run.t, times + 1e-6, side="right") - 1
+    stored = np.asarray(run.x)[rows].sum(axis=1)
     # a straight line: what is not the tanks' water (none) plus pixels per cm; edges and words cost
     # some
     slope = np.polyfit(stored, seen, 1)
     assert stored[-1] > 2 * stored[0] and slope[0] > 0
     assert np.abs(np.polyval(slope, stored) - seen).max() < 0.05 * np.ptp(seen)
+
+
+def test_time_passes_slowly_where_something_changes():
+    """A level that rises from 40 to 60 s of 100 s: three quarters of the pictures, less what is
+    evenly spread, lie in that fifth of the time; the ends are met.
+    """
+    t = np.linspace(0.0, 100.0, 1001)
+    level = np.interp(t, [40.0, 60.0], [0.0, 10.0])[:, None]
+    run = SimpleNamespace(t=t, x=level, r=0.0 * level, u=0.0 * level)
+    times = animation.moments([run], 201, [(np.array([30.0]), np.array([1.0]))])
+    assert times[0] == 0.0 and times[-1] == 100.0 and np.all(np.diff(times) > 0)
+    inside = np.mean((times > 40.0) & (times < 60.0))
+    assert inside == pytest.approx(0.75 + 0.25 * 0.2, abs=0.01)
+
+
+def test_two_rigs_stand_beside_each_other_and_the_shorter_run_stays_at_its_end(short):
+    loop, run = short
+    other = jaxtank.presets.find("cascaded/pi").loop
+    brief = jaxtank.simulate(other, jaxtank.Clock(dt=4.0, duration=40.0, substeps=4))
+    one, _ = animation.film(loop, run, 1)
+    two, still = animation.film(loop, run, 1, (other, brief), ("four $tanks", "two <tanks>"))
+    sizes = [Image.open(io.BytesIO(data)).size for data in (one, two)]
+    assert sizes[1][0] > 1.5 * sizes[0][0] and len(two) < 600_000
+    # two of them in a row
+    assert Image.open(io.BytesIO(still)).size == (2 * sizes[1][0], 2 * sizes[1][1])
+
+
+def test_a_film_that_would_be_too_large_has_fewer_pictures(monkeypatch):
+    """Each is shown for longer, so that the film lasts as long."""
+    rng = np.random.default_rng(0)
+    pictures = [Image.fromarray(rng.integers(0, 255, (60, 60, 3), np.uint8)) for _ in range(24)]
+    whole = Image.open(io.BytesIO(run_plots.gif(pictures, 12)))
+    monkeypatch.setattr(run_plots, "GIF_BYTES", 55_000)
+    data = run_plots.gif(pictures, 12)
+    fewer = Image.open(io.BytesIO(data))
+    assert whole.n_frames == 24 and len(data) <= 55_000 and fewer.n_frames == 12
+    assert fewer.info["duration"] == pytest.approx(2 * whole.info["duration"], abs=20)
+
+
+def test_liquid_above_a_rim_is_in_the_film_and_a_rig_of_many_tanks_is_refused(short, tmp_path):
+    loop, run = short
+    high = run.replace(x=np.where(np.arange(4) == 3, 48.0, run.x))
+    path = animation.animate(loop, high, tmp_path / "run.gif", seconds=1)
+    first = next(frames(path))
+    pink = np.count_nonzero(np.abs(first - to_rgb(style.RIM)).max(axis=2) < 0.06)
+    dry = animation.animate(loop, run, tmp_path / "dry.gif", seconds=1)
+    none = np.count_nonzero(np.abs(next(frames(dry)) - to_rgb(style.RIM)).max(axis=2) < 0.06)
+    assert pink > 200 and none < 0.05 * pink
+    many = network(area=np.full(30, 15.0), drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=20.0)
+    with pytest.raises(InputError, match="at most 24 tanks"):
+        animation.animate(dataclasses.replace(loop, plant=many), run, tmp_path / "many.gif")
 
 
 class Tags(HTMLParser):
@@ -101,5 +158,23 @@ def test_simulate_writes_one_where_asked(tmp_path, capsys):
         "--gif",
     ]
     assert main.main(asked) == 2 and "--out DIR" in capsys.readouterr().err
-    assert main.main([*asked, "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert matplotlib.image.imread(tmp_path / "out" / "run.gif").size > 0
+    asked += ["--out", str(tmp_path / "out"), "--quiet"]
+    assert main.main(asked) == 0
+    alone = matplotlib.image.imread(tmp_path / "out" / "run.gif").shape
+    assert main.main([*asked, "--against", "cascaded/pi"]) == 0
+    assert matplotlib.image.imread(tmp_path / "out" / "run.gif").shape[1] > 1.5 * alone[1]
+    assert matplotlib.image.imread(tmp_path / "out" / "film.png").size > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--against", "cascaded/pi"], "--against needs --gif"),
+        (["--gif", "--out", "film", "--against", "cascaded/p"], "nearest: cascaded/pi"),
+    ],
+)
+def test_a_second_rig_that_cannot_be_shown_is_refused(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    found = command("simulate", "cascaded/pi", *words)
+    assert found.code == 2 and said in found.err and found.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

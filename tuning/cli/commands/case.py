@@ -40,7 +40,21 @@ def add(commands, parents):
     one.add_argument(
         "--gif",
         action="store_true",
-        help="with --out also run.gif, the tanks of the rig filling and emptying",
+        help="with --out also run.gif, the tanks of the rig filling and emptying, and film.png with"
+        " four of its pictures",
+    )
+    option(
+        one,
+        "--against",
+        "CASE",
+        "with --gif: a second case or rig file, as it is, beside the first in the film",
+    )
+    one.add_argument(
+        "--columns",
+        type=int,
+        choices=(1, 2),
+        help="with --out also print.svg and print.png (300 dpi): the run in the width of one or two"
+        " columns of a journal",
     )
     one.add_argument(
         "--margins",
@@ -124,7 +138,12 @@ def simulate(args):
         return _together(args)
     if args.gif and not args.out:
         raise InputError("--gif needs --out DIR, where run.gif is written")
+    if args.columns is not None and not args.out:
+        raise InputError("--columns needs --out DIR, where print.svg and print.png are written")
+    if args.against is not None and not args.gif:
+        raise InputError("--against needs --gif, the film in which the second case stands")
     seed, case = seed_of(args), open_case(args)
+    other = None if args.against is None else _other(args.against)
     import jax
 
     from jaxtank.loop import run, step_size
@@ -156,7 +175,13 @@ def simulate(args):
         trajectory = artifacts.run_for_people(case, key)
         made = payload["provenance"]
         page = lambda drawn: run_page.page_of(case, values, drawn, args.line, made)
-        written = artifacts.save_run(case, trajectory, payload, args.out, args.gif, page)
+        beside = None
+        if other is not None:
+            noise = jax.random.key(seed) if noisy(other) else None
+            beside = (other, artifacts.run_for_people(other, noise))
+        written = artifacts.save_run(
+            case, trajectory, payload, args.out, args.gif, page, beside, args.columns
+        )
     if args.json:
         print(tables.dumps(payload))
     else:
@@ -173,7 +198,8 @@ def simulate(args):
 
 def _together(args):
     """Run several cases under the same conditions; one table, and with --out one page."""
-    for flag, given in (("--gif", args.gif), ("--margins", args.margins)):
+    alone = {"--gif": args.gif, "--margins": args.margins, "--columns": args.columns}
+    for flag, given in alone.items():
         if given:
             raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")
     seed = seed_of(args)
@@ -190,6 +216,16 @@ def _together(args):
         print("\n".join(map(str, together.lines_of(runs))))
     report_written(written, args)
     return 0
+
+
+def _other(name):
+    """The second case of a film; InputError where it is none, or cannot be drawn."""
+    from jaxtank import rig
+
+    try:
+        return rig.check(rig.open_case(name))
+    except InputError as error:
+        raise InputError(f"--against: {error}") from None
 
 
 def init(args):

@@ -1,0 +1,189 @@
+"""What leaves a tank over its rim: volumes, words for them, and how they are drawn.
+
+A rig whose rims are physics (`plant.overflow`) counts what it loses; in any other one a level rises
+past its rim, and what stands above it is the volume that the tank cannot hold. Imported by
+`responses`, `schematic`, `run` and `animation`.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.patches import Rectangle
+
+from jaxtank.core.text import one_line
+from jaxtank.core.units import DEFAULT, local
+from jaxtank.plots.style import RIM, plain
+
+LIQUID: dict[str, Any] = {"facecolor": to_rgba(RIM, 0.45), "edgecolor": RIM, "hatch": "////"}
+"""Style of liquid above a rim."""
+
+HIGHEST = 0.65
+"""Drawn height above a rim, at most, in heights of the tallest tank: below the row above."""
+
+
+class Spilled(NamedTuple):
+    """Volumes above the rims in the course of a run; made by `spilled`.
+
+    simulated : True if rims are physics: volumes are then lost since the start, else they stand
+        above the rims at this moment.
+    volume : (rows, tanks) [cm^3]
+    most : (tanks,) the largest of each column [cm^3]
+    unit : of volumes
+
+    Examples
+    --------
+    >>> Spilled(True, np.zeros((1, 2)), np.zeros(2), "cm^3").any
+    False
+    """
+
+    simulated: bool
+    volume: Any
+    most: Any
+    unit: str
+
+    @property
+    def any(self) -> bool:
+        """Whether something is above a rim, by more than rounding."""
+        return bool(np.any(self.most > 0.0))
+
+    def words(self, row: int = -1) -> str:
+        """What a picture reports of it, up to a row; whether overflow is simulated in any case."""
+        model = "overflow simulated" if self.simulated else "no overflow in the model"
+        if not self.any:
+            return f"{model}, no level above its rim"
+        if self.simulated:
+            return f"{model}: {amount(self.volume[row].sum(), self.unit)} on the floor"
+        most = self.volume[: None if row == -1 else row + 1].max(axis=0)
+        return f"{model}: up to {amount(most.sum(), self.unit)} above the rims"
+
+
+def spilled(plant: Any, run: Any) -> Spilled:
+    """Return the volumes above the rims of a Trajectory of `plant`.
+
+    What is captured by another tank is not lost, and not in it.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> from jaxtank.plants import network
+    >>> rig = network(area=10.0, drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=30.0)
+    >>> run = SimpleNamespace(x=np.array([[20.0], [48.0], [25.0]]))
+    >>> spilled(rig, run).words()
+    'no overflow in the model: up to 180 cm^3 above the rims'
+    """
+    x = np.asarray(run.x, dtype=float)
+    if getattr(plant, "overflow", False):
+        volume = np.asarray(run.spilled, dtype=float)
+        volume = np.where(volume > 1e-9 * volume.max(initial=0.0), volume, 0.0)
+    elif not hasattr(plant, "area"):  # a plant of the user's own
+        volume = np.zeros_like(x)
+    else:
+        rim, area = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
+        past = x - rim
+        volume = area * np.where(past > 1e-9 * np.abs(rim), past, 0.0)
+    simulated = bool(getattr(plant, "overflow", False))
+    unit = local("cm^3", getattr(plant, "units", DEFAULT))
+    return Spilled(simulated, volume, volume.max(axis=0), unit)
+
+
+def amount(volume: float, unit: str) -> str:
+    """Return a volume as three figures with its unit.
+
+    Examples
+    --------
+    >>> amount(773.6, "cm^3"), amount(12345.6, "cm^3"), amount(0.0, "cm^3")
+    ('774 cm^3', '12300 cm^3', '0 cm^3')
+    """
+    if volume <= 0.0:
+        return f"0 {unit}"
+    digits = max(0, 2 - int(np.floor(np.log10(volume))))
+    figures = f"{round(volume, 2 - int(np.floor(np.log10(volume)))):.{digits}f}"
+    return f"{figures if volume >= 1e-3 else f'{volume:.3g}'} {unit}"
+
+
+class Stack:
+    """Liquid above the rim of a tank, hatched, with the rim as a line; a triangle on top where it
+    is higher than drawn.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from jaxtank.plots.layout import Box
+    >>> stack = Stack(Figure().gca(), Box(0.0, 0.0, 1.0, 1.0, 0.02), area=10.0)
+    >>> stack.set(100.0)
+    >>> stack.patch.get_height()
+    0.2
+    """
+
+    def __init__(self, ax: Any, box: Any, area: float):
+        self.box, self.area, top = box, float(area), box.y + box.height
+        self.patch = Rectangle((box.x, top), box.width, 0.0, linewidth=0.0, zorder=3.5, **LIQUID)
+        ax.add_patch(self.patch)
+        ends = [box.x - 0.05, box.x + box.width + 0.05]
+        ax.plot(ends, [top, top], color=RIM, linewidth=1.6, zorder=3.6)
+        more = {"marker": "^", "color": RIM, "markersize": 5, "zorder": 3.7, "visible": False}
+        (self.more,) = ax.plot([box.middle], [top + HIGHEST + 0.05], **more)
+
+    def height(self, volume: float) -> float:
+        """Return the height of a volume, to the scale of the levels, before it is cut."""
+        return max(float(volume), 0.0) / self.area * self.box.scale
+
+    def set(self, volume: float) -> None:
+        """Show a volume [cm^3]."""
+        height = self.height(volume)
+        self.patch.set_height(min(height, HIGHEST))
+        self.more.set_visible(height > HIGHEST)
+
+
+def headroom(ax: Any, stacks: Any) -> None:
+    """Make room in a drawing for [(Stack, largest volume)]."""
+    tops = [
+        one.box.y + one.box.height + min(one.height(most), HIGHEST + 0.05) + 0.05
+        for one, most in stacks
+    ]
+    ax.set_ylim(top=max([ax.get_ylim()[1], *tops]))
+
+
+def above_rim(ax: Any, trajectories: Any, tank: int, rim: Any, spills: Any) -> str:
+    """Hatch what is above the rim of a tank in a picture of its level over time; return
+    ": 774 cm^3 above the rim" for the title, "" where nothing is.
+
+    trajectories : {name: (Trajectory, colour, line style)}; spills : {name: Spilled}, or None.
+    """
+    wet = {n: found for n, found in (spills or {}).items() if found.most[tank] > 0}
+    for name, found in wet.items():
+        _hatch(ax, trajectories[name][0], tank, rim, found)
+    if not wet:
+        return ""
+    what = "over the rim" if next(iter(wet.values())).simulated else "above the rim"
+    named = len(trajectories) > 1
+    amounts = [
+        amount(found.most[tank], found.unit) + (f" ({plain(one_line(name, 24))})" if named else "")
+        for name, found in list(wet.items())[:2]
+    ]
+    return f": {', '.join(amounts)}{' and more' if len(wet) > 2 else ''} {what}"
+
+
+def spill_note(plant: Any, trajectories: Any) -> str:
+    """Return lines of a title, each after a line break, of the runs with a level above its rim:
+    how much, and whether overflow is simulated.
+    """
+    found = {name: spilled(plant, run) for name, run in trajectories.items()}
+    wet = [(name, one.words()) for name, one in found.items() if one.any]
+    lines = [words if len(found) == 1 else f"{name}: {words}" for name, words in wet]
+    return "".join(f"\n{line}" for line in lines[:3])
+
+
+def _hatch(ax: Any, run: Any, tank: int, rim: float, found: Spilled) -> None:
+    """Hatch between rim and level, or all that is above the rim while a rig loses liquid."""
+    t, style = np.asarray(run.t), {**LIQUID, "linewidth": 0.0}
+    if found.simulated:
+        rises = np.diff(found.volume[:, tank], append=found.volume[-1, tank]) > 0
+        where = rises | np.concatenate([[False], rises[:-1]])
+        top = max(ax.get_ylim()[1], 1.12 * rim)
+        ax.fill_between(t, rim, top, where=where, **style)
+        ax.set_ylim(top=top)
+    else:
+        level = np.asarray(run.x)[:, tank]
+        ax.fill_between(t, rim, level, where=level > rim, interpolate=True, **style)
