@@ -48,6 +48,7 @@ RANKS = [
     "tuning.answer",
     "tuning.live",
     "tuning.report",
+    "tuning.figures",
     "tuning.bench",
     "tuning.cli",
 ]

@@ -234,7 +234,7 @@ def responses(loop, trajectories, title="", limits=None):
         raise InputError("trajectories = {}: there is no run to draw")
     drawn = {
         name: (run, *style)
-        for (name, run), style in zip(trajectories.items(), _styles(trajectories))
+        for (name, run), style in zip(trajectories.items(), styles_of(trajectories))
     }
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
@@ -264,7 +264,7 @@ def responses(loop, trajectories, title="", limits=None):
     return figure
 
 
-def _styles(trajectories):
+def styles_of(trajectories):
     """(colour, line style) of each run."""
     if len(trajectories) == 1:
         return [(AFTER, "-")]

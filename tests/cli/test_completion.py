@@ -16,7 +16,7 @@ from tuning.cli.parser import parser
 COMMANDS = {
     *("list", "show", "simulate", "tune", "uncertainty", "merge", "sensitivity", "identify"),
     *("attack", "explore"),
-    *("init", "export", "compare", "completion", "bench", "cache"),
+    *("init", "export", "compare", "figure", "completion", "bench", "cache"),
 }
 SHELLS = {shell: shutil.which(shell) for shell in completion.SHELLS}
 
@@ -117,6 +117,7 @@ def test_commands_options_cases_parameters_and_measures(script, shell, tmp_path)
     }
     assert set(asked("jaxtank sensitivity cascaded/pi --method ")) == {"local", "morris", "sobol"}
     assert asked("jaxtank compare gouta2015") == ["gouta2015"]
+    assert asked("jaxtank figure khalid/") == [f"khalid/{n}" for n in range(2, 8)]
     assert set(asked("jaxtank completion ")) == set(completion.SHELLS)
 
 

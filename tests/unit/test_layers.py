@@ -19,7 +19,12 @@ LAZY = {
     ("jaxtank.case", "jaxtank.rig.write"),
     ("jaxtank.loop.trajectory", "jaxtank.plots.run"),
 }
-DRAWING = {"jaxtank.plots", "tuning.report", "tuning.cli"}  # folders that may import matplotlib
+DRAWING = {
+    "jaxtank.plots",
+    "tuning.report",
+    "tuning.figures",
+    "tuning.cli",
+}  # folders that may import matplotlib
 
 
 def sources(*roots):

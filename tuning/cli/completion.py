@@ -32,6 +32,7 @@ KINDS = {
     "HTML": "files",
     "CASE": "cases",
     "PAPER": "papers",
+    "PAPER/N": "figures",
     "SHELL": "shells",
 }
 # options whose values are a few words
@@ -129,8 +130,8 @@ def _kind(command, action):
 
 
 def words():
-    """Return the words of each kind: cases, papers, parameters, limits, measures, shells."""
-    found = {"cases": [], "parameters": [], "measures": []}
+    """Return the words of each kind: cases, papers, figures, parameters, limits and others."""
+    found = {"cases": [], "parameters": [], "measures": [], "figures": []}
     for line in NAMES.read_text(encoding="utf-8").splitlines():
         kind, _, word = line.partition(" ")
         found[kind].append(word)
@@ -148,6 +149,7 @@ def gather():
     from jaxtank.core.clock import CLOCK
     from jaxtank.core.tree import walk
     from jaxtank.measures import MEASURES, functions
+    from tuning.figures.catalogue import FIGURES
 
     names = {f"clock.{k}" for k in CLOCK}
     for case in presets.names():
@@ -159,7 +161,8 @@ def gather():
             }
     lines = [f"cases {c}" for c in presets.names()] + [f"parameters {n}" for n in sorted(names)]
     known = [m for m in MEASURES if m not in functions(MEASURES)]  # without a user's own functions
-    return "\n".join([*lines, *(f"measures {m}" for m in known)]) + "\n"
+    lines += [f"measures {m}" for m in known]
+    return "\n".join([*lines, *(f"figures {n}" for n, f in FIGURES.items() if f.runs)]) + "\n"
 
 
 def refresh():
@@ -208,7 +211,7 @@ def _bash_value(kind):
         return f'_jaxtank_words "$_jaxtank_{kind}"; compopt -o nospace 2>/dev/null'
     if kind == "cases":
         return '_jaxtank_words "$_jaxtank_cases"; _jaxtank_files'
-    if kind in ("papers", "measures", "shells"):
+    if kind in ("papers", "figures", "measures", "shells"):
         return f'_jaxtank_words "$_jaxtank_{kind}"'
     if kind in ("folders", "files"):
         flag = "-d" if kind == "folders" else "-f"
@@ -222,7 +225,7 @@ def _zsh_value(kind):
         return f"compadd -S '' -- $_jaxtank_{kind}"
     if kind == "cases":
         return "compadd -- $_jaxtank_cases; _files -g '*.toml'"
-    if kind in ("papers", "measures", "shells"):
+    if kind in ("papers", "figures", "measures", "shells"):
         return f"compadd -- $_jaxtank_{kind}"
     if kind in ("folders", "files"):
         return "_files -/" if kind == "folders" else "_files"

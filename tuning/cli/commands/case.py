@@ -49,13 +49,8 @@ def add(commands, parents):
         "CASE",
         "with --gif: a second case or rig file, as it is, beside the first in the film",
     )
-    one.add_argument(
-        "--columns",
-        type=int,
-        choices=(1, 2),
-        help="with --out also print.svg and print.png (300 dpi): the run in the width of one or two"
-        " columns of a journal",
-    )
+    text = "with --out also print.svg and print.png (300 dpi): the run in the width of one or two"
+    option(one, "--columns", "N", f"{text} columns of a journal: 1 or 2")
     one.add_argument(
         "--margins",
         action="store_true",
@@ -136,12 +131,7 @@ def simulate(args):
     """Run a case once and print its measures; with --out write the run."""
     if args.others:
         return _together(args)
-    if args.gif and not args.out:
-        raise InputError("--gif needs --out DIR, where run.gif is written")
-    if args.columns is not None and not args.out:
-        raise InputError("--columns needs --out DIR, where print.svg and print.png are written")
-    if args.against is not None and not args.gif:
-        raise InputError("--against needs --gif, the film in which the second case stands")
+    columns = _checked_columns(args)
     seed, case = seed_of(args), open_case(args)
     other = None if args.against is None else _other(args.against)
     import jax
@@ -180,7 +170,7 @@ def simulate(args):
             noise = jax.random.key(seed) if noisy(other) else None
             beside = (other, artifacts.run_for_people(other, noise))
         written = artifacts.save_run(
-            case, trajectory, payload, args.out, args.gif, page, beside, args.columns
+            case, trajectory, payload, args.out, args.gif, page, beside, columns
         )
     if args.json:
         print(tables.dumps(payload))
@@ -196,9 +186,23 @@ def simulate(args):
     return 0
 
 
+def _checked_columns(args):
+    """The number of --columns, None without; InputError for options that do not fit together."""
+    if args.gif and not args.out:
+        raise InputError("--gif needs --out DIR, where run.gif is written")
+    if args.columns not in (None, "1", "2"):
+        raise InputError(f"--columns {args.columns}: must be 1 or 2")
+    if args.columns is not None and not args.out:
+        raise InputError("--columns needs --out DIR, where print.svg and print.png are written")
+    if args.against is not None and not args.gif:
+        raise InputError("--against needs --gif, the film in which the second case stands")
+    return None if args.columns is None else int(args.columns)
+
+
 def _together(args):
     """Run several cases under the same conditions; one table, and with --out one page."""
     alone = {"--gif": args.gif, "--margins": args.margins, "--columns": args.columns}
+    alone["--against"] = args.against
     for flag, given in alone.items():
         if given:
             raise InputError(f"{flag}: of one case alone, and {1 + len(args.others)} are given")

@@ -1,9 +1,14 @@
-"""`jaxtank compare`, `completion`, `bench` and `cache`: the papers, the shell, the speed of this
-machine, the programs that are kept."""
+"""`jaxtank compare`, `figure`, `completion`, `bench` and `cache`: the papers and their figures, the
+shell, the speed of this machine, the programs that are kept."""
 
 import os
 import sys
+import textwrap
+from pathlib import Path
 
+from jaxtank.core.errors import InputError
+from jaxtank.core.files import check_folder, write_folder
+from jaxtank.core.text import printable
 from tuning.cli.arguments import option
 from tuning.cli.options import report_written
 from tuning.cli.values import whole
@@ -20,6 +25,19 @@ def add(commands, parents):
     one.add_argument("paper", metavar="PAPER", help='a paper (see jaxtank list), or "all"')
     option(one, "--out", "DIR", "folder for report.html, result.json and the rigs as pictures")
     one.add_argument("--markdown", action="store_true", help="as a Markdown table")
+    one = commands.add_parser(
+        "figure",
+        parents=[parents.common],
+        help="a figure of a paper redrawn by our runs, as gouta2015/6; without one the list of all",
+    )
+    one.set_defaults(run=figure)
+    one.add_argument("figure", nargs="?", metavar="PAPER/N", help="the figure (default: list all)")
+    one.add_argument(
+        "--out",
+        dest="picture",
+        metavar="FILE",
+        help="the picture: .svg, .png or .pdf (default: print its caption)",
+    )
     one = commands.add_parser(
         "completion",
         help="a script that completes commands, options, cases and parameters: bash, zsh or fish",
@@ -43,6 +61,43 @@ def add(commands, parents):
     one.set_defaults(run=bench)
     one.add_argument("cases", nargs="*", metavar="CASE", help='cases to time instead, or "all"')
     option(one, "--rounds", "N", "interleaved rounds to take the median of (default 7)", "7")
+
+
+def figure(args):
+    """List the figures of the papers, print the caption of one, or draw it to --out."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from tuning.figures.catalogue import FIGURES, find
+    from tuning.report import tables
+
+    if args.figure is None:
+        if args.picture:
+            raise InputError("--out needs a figure, as gouta2015/6: jaxtank figure lists them")
+        rows = [[f.name, "" if f.runs else "no result", f.shows] for f in FIGURES.values()]
+        shown = {f.name: {"shows": f.shows, "result": bool(f.runs)} for f in FIGURES.values()}
+        print(tables.dumps(shown) if args.json else tables.table(rows, ["figure", "", "it shows"]))
+        return 0
+    one = find(args.figure)
+    from tuning.figures import drawing
+
+    if args.picture:
+        drawing.check_name(args.picture)
+        check_folder(Path(args.picture).parent)
+    drawn, written = drawing.run(one), []
+    if args.picture:
+        data = drawing.rendered(drawing.draw(one, drawn), args.picture)
+        written = write_folder(Path(args.picture).parent, {Path(args.picture).name: data})
+    if args.json:
+        cases = [{"label": r.label, "case": r.case, "values": dict(r.values)} for r in one.runs]
+        texts = {"shows": one.shows, "states": one.states, "here": list(drawn.ours)}
+        payload = {"figure": one.name, **texts, "remark": one.remark, "cases": cases}
+        print(tables.dumps(tables.clean(payload)))
+    elif not args.quiet or not args.picture:
+        print("\n".join(textwrap.fill(p, 80) for p in drawing.caption(one, drawn.ours)))
+    if written and not args.quiet:
+        print(f"written to {printable(args.picture)}", file=sys.stderr)
+    return 0
 
 
 def compare(args):

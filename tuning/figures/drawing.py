@@ -1,0 +1,240 @@
+"""A figure of a paper drawn by our runs, with a caption. Imports plots and reports."""
+
+import io
+import textwrap
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxtank import presets, rig
+from jaxtank.case import Case
+from jaxtank.controllers.fuzzy import membership
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import local
+from jaxtank.loop.trajectory import Trajectory
+from tuning.figures.figure import Figure
+from tuning.problem.scenarios import noisy
+from tuning.report.artifacts import run_for_people
+from tuning.report.tables import number
+
+FORMATS = ("svg", "png", "pdf")
+"""What a figure can be written as."""
+
+WIDTH, LINE = (92, 122), 0.17
+"""Characters in a line of the caption below one and two columns, height of a line [inch]."""
+
+SHARE = 0.5
+"""Share from which the first of two blended controllers counts as the one at work [-]."""
+
+
+class Drawn(NamedTuple):
+    """The runs of a figure: {label: (case, trajectory)}, and sentences on what they show."""
+
+    runs: dict[str, tuple[Case, Trajectory]]
+    ours: tuple[str, ...]
+
+
+def run(figure: Figure) -> Drawn:
+    """Return the runs of a figure; noise is that of seed 0.
+
+    Examples
+    --------
+    >>> import jax
+    >>> from tuning.figures.catalogue import find
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> run(find("mirakhorli/10")).ours[0].startswith("hybrid: ")
+    True
+    """
+    runs = {}
+    for one in figure.runs:
+        case = rig.set_values(presets.find(one.case), dict(one.values))
+        key = jax.random.key(0) if noisy(case) else None
+        runs[one.label] = case, run_for_people(case, key)
+    kinds = figure.kind.split()
+    facts = {n: _facts(kinds, case, found, figure) for n, (case, found) in runs.items()}
+    ours = [f"{label}: {'; '.join(shown)}" for label, shown in facts.items() if shown]
+    return Drawn(runs, tuple(ours))
+
+
+def _facts(kinds, case, found, figure):
+    """What a run shows of what is drawn, in numbers."""
+    length, drive = case.loop.units
+    facts = []
+    if "levels" in kinds or "errors" in kinds:
+        errors = np.sqrt(np.mean(np.asarray(found.e) ** 2, axis=0))
+        drawn = figure.tanks or range(case.loop.plant.tanks)
+        shown = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in drawn]
+        facts.append(f"RMS error {_several(errors[shown])} {length}")
+        if "levels" in kinds:
+            facts.append(f"error at the end {_several(np.asarray(found.e)[-1][shown])} {length}")
+    if "levels" in kinds:
+        tanks = list(figure.tanks) or list(range(case.loop.plant.tanks))
+        facts.append(f"highest level {_several(np.max(found.x, axis=0)[tanks])} {length}")
+    if "inputs" in kinds:
+        low, high = np.min(found.u, axis=0), np.max(found.u, axis=0)
+        spans = [f"{number(a, 3)} to {number(b, 3)}" for a, b in zip(low, high)]
+        facts.append(f"inputs from {' and '.join(spans)} {drive}")
+    if "estimates" in kinds:
+        rate = local("cm/s", case.loop.units)
+        facts.append(f"median {_several(np.median(found.d_hat, axis=0), 4)} {rate}")
+        facts.append(f"at most {_several(np.max(found.d_hat, axis=0))} {rate}")
+    if "shares" in kinds:
+        time = 100.0 * np.mean(np.asarray(found.share) > SHARE, axis=0)
+        facts.append(f"sliding mode has the larger share in {_several(time)} % of the time")
+    return facts
+
+
+def _several(values, digits=3):
+    return " and ".join(number(round(float(v), 6), digits) for v in np.ravel(values))
+
+
+def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
+    """Return the paragraphs below a figure: what the paper shows and says, what ours shows.
+
+    Examples
+    --------
+    >>> caption(Figure("p", 1, "Levels", "Fast."), ("A: 1 cm",))
+    ['p, figure 1. Levels.', 'The paper: Fast.', 'Here: A: 1 cm.']
+    """
+    found = [f"{figure.paper}, figure {figure.number}. {figure.shows}."]
+    found += [f"The paper: {figure.states}"] if figure.states else []
+    found += [f"Here: {'; '.join(ours)}."] if ours else []
+    return [*found, *([figure.remark] if figure.remark else [])]
+
+
+def draw(figure: Figure, drawn: Drawn) -> Any:
+    """Return the matplotlib figure, with its caption below.
+
+    Examples
+    --------
+    >>> import jax
+    >>> from tuning.figures.catalogue import find
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> one = find("mirakhorli/3")
+    >>> [ax.get_title() for ax in draw(one, run(one)).axes][0]
+    'memberships of input 1'
+    """
+    import matplotlib.pyplot as plt
+
+    from jaxtank.plots import responses
+
+    panels = [panel for kind in figure.kind.split() for panel in _panels(kind, figure, drawn)]
+    columns = min(2, len(panels))
+    rows = -(-len(panels) // columns)
+    width = WIDTH[columns - 1]
+    lines = [line for text in caption(figure, drawn.ours) for line in textwrap.wrap(text, width)]
+    high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
+    with responses.styled():
+        whole = plt.figure(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
+        parts: Any = whole.subfigures(2, 1, height_ratios=[high, low])
+        upper, lower = parts
+        whole.set_layout_engine("constrained")
+        axes = upper.subplots(rows, columns, squeeze=False, sharex="memberships" not in figure.kind)
+        for panel, ax in zip(panels, axes.flat):
+            panel(ax)
+            if figure.window:
+                ax.set_xlim(*figure.window)
+        for ax in axes.flat[len(panels) :]:
+            ax.set_visible(False)
+        if "memberships" not in figure.kind:
+            for column in axes.T:
+                last = [ax for ax in column if ax.get_visible()][-1]
+                last.tick_params(labelbottom=True)
+                last.set_xlabel("time [s]")
+        handles = {}
+        for ax in axes.flat[: len(panels)]:
+            handles |= dict(zip(*ax.get_legend_handles_labels()[::-1]))
+        upper.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4)
+        lower.text(0.02, 1.0, "\n".join(lines), va="top", ha="left", fontsize=8, linespacing=1.35)
+    return whole
+
+
+def _panels(kind, figure, drawn):
+    """Functions that draw one panel each on an axis."""
+    from jaxtank.plots import diagnostics, responses
+
+    case, first = next(iter(drawn.runs.values()))
+    plant, (length, drive) = case.loop.plant, case.loop.units
+    outputs = {tank: j for j, tank in enumerate(plant.outputs)}
+    styles = responses.styles_of([found for _, found in drawn.runs.values()])
+    lines = {n: (found, *s) for (n, (_, found)), s in zip(drawn.runs.items(), styles)}
+    rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
+    rims = [float(v) if np.isfinite(v) else None for v in rims]
+    if kind == "levels":
+        return [
+            lambda ax, i=i: responses.level(ax, lines, i, outputs.get(i), rims[i], unit=length)
+            for i in figure.tanks or range(plant.tanks)
+        ]
+    if kind == "errors":
+        pairs = outputs.items()
+        return [lambda ax, i=i, j=j: responses.error(ax, lines, j, i, length) for i, j in pairs]
+    if kind == "inputs":
+        low, high = (np.asarray(getattr(case.loop.actuator, n), float) for n in ("low", "high"))
+        return [
+            lambda ax, j=j: responses.voltage(ax, lines, j, low[j], high[j], drive)
+            for j in range(plant.pumps)
+        ]
+    if kind == "estimates":
+        rate = local("cm/s", case.loop.units)
+        return [
+            lambda ax, i=i: diagnostics.disturbance(ax, first, i, None, rate)
+            for i in range(plant.tanks)
+        ]
+    if kind == "shares":
+        return [lambda ax, j=j: diagnostics.share(ax, first, j) for j in range(plant.pumps)]
+    if kind == "setpoints":
+        return [lambda ax: _setpoints(ax, case, first)]
+    return [lambda ax, i=i: _memberships(ax, case.loop.controller, i, length) for i in range(2)]
+
+
+def _setpoints(ax, case, found):
+    for j, tank in enumerate(case.loop.plant.outputs):
+        ax.plot(found.t, found.r[:, j], linewidth=1.4, label=f"setpoint of tank {tank + 1}")
+    ax.set(ylabel=f"level [{case.loop.units[0]}]", title="setpoints")
+
+
+def _memberships(ax, law, i, unit):
+    b, w = float(law.b[i]), float(law.w[i])
+    size = np.linspace(0.0, 2.0 * (b + w), 200)
+    high = np.asarray(membership(size, b, w))
+    ax.plot(size, 1.0 - high, linewidth=1.4, label="low: state feedback")
+    ax.plot(size, high, linewidth=1.4, linestyle="--", label="high: sliding mode")
+    ax.set(xlabel=f"size of the error [{unit}]", ylabel="membership [-]")
+    ax.set_title(f"memberships of input {i + 1}")
+
+
+def rendered(figure: Any, name: str) -> bytes:
+    """Return a matplotlib figure as the bytes of a file, by the end of its name; closes it.
+
+    Raises
+    ------
+    InputError
+        For an end that is none of FORMATS.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure as Blank
+    >>> rendered(Blank(), "a.png")[1:4]
+    b'PNG'
+    """
+    import matplotlib.pyplot as plt
+
+    check_name(name)
+    kind, out = name.rpartition(".")[2].lower(), io.BytesIO()
+    dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with plt.rc_context({"svg.hashsalt": "jaxtank"}):
+        figure.savefig(out, format=kind, dpi=200, metadata=dated)
+    plt.close(figure)
+    return out.getvalue()
+
+
+def check_name(name: str) -> None:
+    """Raise InputError for a file name with an end that is none of FORMATS.
+
+    Examples
+    --------
+    >>> check_name("a.svg")
+    """
+    if name.rpartition(".")[2].lower() not in FORMATS or "." not in name:
+        raise InputError(f"--out {name}: must end in {', '.join('.' + f for f in FORMATS)}")
