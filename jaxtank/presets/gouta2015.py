@@ -111,12 +111,35 @@ PUBLISHED = {
     "clock.dt": Published(0.01, "s", "sec. 5"),
     "actuator.high": Published(12.0, "V", "eq. (9)"),
     "plant.rim": Published(30.0, "cm", "sec. 5"),
+    "actuator.low": Published(0.0, "V", "eq. (9)"),
+    "clock.duration": Published(1200.0, "s", "sec. 5"),
+    "plant.pump_gain": Published(7.687, "cm^3/(s V)", "Table 1 (printed without 1/s)"),
+    "plant.gravity": Published(981.0, "cm/s^2", "Table 1"),
+    "sensor.gain": Published((9.4458, 8.7106, 8.5106, 9.3458), "cm/V", "sec. 5.2"),
+    "diameters of outlets 1 and 2": Published((0.48, 0.48), "cm", "Table 1"),
+    "diameters of orifices 31, 32, 41, 42": Published((0.38, 0.31, 0.31, 0.38), "cm", "Table 1"),
+    "changes of the setpoints": Published(
+        (270.0, 470.0, 760.0, 900.0),
+        "s",
+        "sec. 5",
+        1e-3,
+        fitted="the ramps were made to begin at these times: Fig. 5 is not in the text",
+    ),
     "tracking error": Published(
         "'negligible' (NGPC), 'more important' (backstepping)",
         "",
         "sec. 5.1, 5.3, Table 2",
         reason="no numbers are printed",
     ),
+    "which tracks better": Published(
+        "backstepping, of which saturation changes little",
+        "",
+        "sec. 5.1",
+        reason="sec. 5.3 and Table 2 say the opposite; without the rates of the setpoint, as eq."
+        " (48) is printed, backstepping lags behind ramps",
+    ),
+    "which moves the pumps less": Published("backstepping", "", "sec. 5.1, Fig. 9"),
+    "inputs within the limits of the pumps": Published("of both controllers", "", "sec. 5.1"),
     "levels below the rims": Published(
         "levels 'do not exceed 30 cm'",
         "",
@@ -190,6 +213,18 @@ def _steady(area):
     return equilibrium(state_coupled_four_tank(area), START)
 
 
+def _diameters(areas):
+    """Diameters of bores [cm] of areas [cm^2]."""
+    return [float(d) for d in np.sqrt(4.0 * np.asarray(areas) / np.pi)]
+
+
+def _changes(trajectory):
+    """Times [s] at which a setpoint begins to move, after the start-up."""
+    moves = np.any(np.diff(trajectory.r, axis=0) != 0.0, axis=1)
+    begins = np.flatnonzero(moves[1:] & ~moves[:-1]) + 1
+    return tuple(float(t) for t in trajectory.t[begins] if t > 100.0)
+
+
 def measured(run):
     """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
 
@@ -200,7 +235,26 @@ def measured(run):
     (near, a), (far, b), (slow, _) = map(total, ("ngpc", "backstepping", "ngpc-table1"))
     stuck, d = total("ngpc", {"actuator.dead_zone": 3.0})
     highest = max(a.x.max(), b.x.max())
+    plant = run("ngpc")[0].loop.plant
+    travel = [float(np.abs(np.diff(one.u, axis=0)).sum()) for one in (a, b)]
+    low, high = (f([f(one.command) for one in (a, b)]) for f in (np.min, np.max))
+    inside = low > 0.0 and high < float(np.max(run("ngpc")[0].loop.actuator.high))
     return {
+        "diameters of outlets 1 and 2": tuple(_diameters(plant.drain)[:2]),
+        "diameters of orifices 31, 32, 41, 42": tuple(_diameters(plant.orifice)),
+        "changes of the setpoints": _changes(a),
+        "which tracks better": Claim(
+            verdict(far < near),
+            f"total RMS error {near:.4f} cm (NGPC), {far:.3f} cm (backstepping)",
+        ),
+        "which moves the pumps less": Claim(
+            verdict(travel[1] < travel[0]),
+            f"total variation of both inputs {travel[0]:.0f} V (NGPC), {travel[1]:.0f} V"
+            " (backstepping)",
+        ),
+        "inputs within the limits of the pumps": Claim(
+            verdict(inside), f"commands from {low:.2f} to {high:.2f} V"
+        ),
         "tracking error": Claim(
             verdict(near < 0.1 < far),
             f"total RMS error {near:.4f} cm (NGPC), {far:.3f} cm (backstepping)",

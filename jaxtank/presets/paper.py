@@ -21,6 +21,8 @@ class Published(NamedTuple):
     tolerance : share of the printed number by which the measured one may differ and still count as
         reproduced; None for a number that is only quoted (a gain, a limit) and for a claim
     reason : why the measured number differs, or why it cannot be measured
+    fitted : the assumption of ours that was chosen to come near this number, which is then no
+        evidence for the paper; "" for none
 
     Examples
     --------
@@ -33,6 +35,7 @@ class Published(NamedTuple):
     where: str
     tolerance: float | None = None
     reason: str = ""
+    fitted: str = ""
 
 
 class Claim(NamedTuple):

@@ -115,7 +115,7 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
     >>> [ax.get_title() for ax in draw(one, run(one)).axes][0]
     'memberships of input 1'
     """
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure as Blank
 
     from jaxtank.plots import responses
 
@@ -126,7 +126,7 @@ def draw(figure: Figure, drawn: Drawn) -> Any:
     lines = [line for text in caption(figure, drawn.ours) for line in textwrap.wrap(text, width)]
     high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
     with responses.styled():
-        whole = plt.figure(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
+        whole = Blank(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
         parts: Any = whole.subfigures(2, 1, height_ratios=[high, low])
         upper, lower = parts
         whole.set_layout_engine("constrained")
@@ -205,7 +205,7 @@ def _memberships(ax, law, i, unit):
 
 
 def rendered(figure: Any, name: str) -> bytes:
-    """Return a matplotlib figure as the bytes of a file, by the end of its name; closes it.
+    """Return a matplotlib figure as the bytes of a file, by the end of its name.
 
     Raises
     ------
@@ -218,14 +218,13 @@ def rendered(figure: Any, name: str) -> bytes:
     >>> rendered(Blank(), "a.png")[1:4]
     b'PNG'
     """
-    import matplotlib.pyplot as plt
+    import matplotlib
 
     check_name(name)
     kind, out = name.rpartition(".")[2].lower(), io.BytesIO()
     dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with plt.rc_context({"svg.hashsalt": "jaxtank"}):
+    with matplotlib.rc_context({"svg.hashsalt": "jaxtank"}):
         figure.savefig(out, format=kind, dpi=200, metadata=dated)
-    plt.close(figure)
     return out.getvalue()
 
 

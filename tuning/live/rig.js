@@ -10,6 +10,9 @@ function draw(tag, attributes, text) {
   return node;
 }
 
+// a name as long as a tank is wide
+const shortened = (name) => (name.length > 12 ? `${name.slice(0, 11)}…` : name);
+
 // rig: data of tuning/live/drawing.py; returns {update({h, r, u, spills})}
 function makeRig(svg, rig, info) {
   const { left, right, bottom, top } = rig;
@@ -42,7 +45,7 @@ function makeRig(svg, rig, info) {
     line(wall, tank.controlled ? "wall controlled" : "wall");
     const middle = { x: X(x + width / 2), "text-anchor": "middle" };
     const small = width < 0.7 ? " small" : "";
-    add("text", { ...middle, y: Y(y + height / 2) - 4, class: `halo${small}` }, info.tanks[i].name);
+    add("text", { ...middle, y: Y(y + height / 2) - 4, class: `halo${small}` }, shortened(info.tanks[i].name));
     tank.text = add("text", { ...middle, y: Y(y + height / 2) + 11, class: `halo value${small}` });
     if (tank.controlled) tank.mark = line([[0, 0], [0, 0]], "setpoint");
   });

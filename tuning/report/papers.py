@@ -3,7 +3,6 @@
 Imported by the command line and the benchmarks.
 """
 
-import numbers
 import textwrap
 from collections import Counter
 from pathlib import Path
@@ -24,7 +23,16 @@ from tuning.report import artifacts, figures, tables
 from tuning.report.html import document, drawings
 from tuning.report.panel import panel
 
-QUOTED, REPRODUCED, DIFFERS, UNMEASURED = "quoted", "reproduced", "differs", "not measured"
+REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
+IMPOSSIBLE, INPUT = "not reproducible", "input"
+VERDICTS = {
+    REPRODUCED: "within the tolerance of its row, or a claim that holds",
+    FITTED: "near the printed number, for which an assumption of ours was chosen: no evidence",
+    DIFFERS: "measured, and different or true in part only: the row says why",
+    IMPOSSIBLE: "cannot be measured: the row says what is missing",
+    INPUT: "a number that our case has from the paper",
+}
+"""{verdict of a row: what it means}."""
 
 
 def runner(paper):
@@ -48,21 +56,32 @@ def runner(paper):
 
 
 def verdict(published, measured):
-    """Return (verdict, measured value or text) of one published quantity.
+    """Return (verdict, measured value or text, reason) of one published quantity.
 
-    measured: number, tuple, Claim or None.
+    measured: number, tuple, Claim or None. The verdict is one of VERDICTS.
     """
+    reason = published.reason
     if isinstance(measured, Claim):
-        return measured.verdict, measured.text
+        near = measured.verdict != "not reproduced"
+        if near and published.fitted:
+            return FITTED, measured.text, f"{published.fitted}; {reason}".rstrip("; ")
+        if measured.verdict == REPRODUCED:
+            return REPRODUCED, measured.text, ""  # the text has the numbers
+        return DIFFERS, measured.text, f"in part: {reason}" if near else reason
     if measured is None:
-        return UNMEASURED, None
+        return IMPOSSIBLE, None, reason
     if published.tolerance is None:
-        return QUOTED, measured
+        same = isinstance(published.value, str) or _same(published.value, measured)
+        return (INPUT, measured, VERDICTS[INPUT]) if same else (DIFFERS, measured, reason)
     printed, found = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
     near = printed.shape == found.shape and np.all(
         np.abs(found - printed) <= published.tolerance * np.abs(printed)
     )
-    return (REPRODUCED if near else DIFFERS), measured
+    if not near:
+        return DIFFERS, measured, reason
+    within = f"within {100 * published.tolerance:g} %"
+    chosen = published.fitted
+    return (FITTED, measured, chosen) if chosen else (REPRODUCED, measured, within)
 
 
 def measure(paper):
@@ -84,16 +103,7 @@ def measure(paper):
     rows = []
     for name, printed in preset.published.items():
         value = found.get(name)
-        word, value = verdict(printed, _set_in(preset, name) if value is None else value)
-        reason = printed.reason
-        if (
-            word == QUOTED
-            and isinstance(printed.value, numbers.Number | tuple)
-            and not _same(printed.value, value)
-        ):
-            word = DIFFERS
-        if word in (QUOTED, REPRODUCED):
-            reason = ""
+        word, value, reason = verdict(printed, _set_in(preset, name) if value is None else value)
         rows.append(
             {
                 "quantity": name,
@@ -177,10 +187,10 @@ def text(page):
 def save(pages, folder, command=None):
     """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
     check_folder(folder)
-    captions = {}
+    captions = {"published": OVERVIEW}
 
     def draw():
-        drawn = {}
+        drawn = overview(pages)
         for paper, found in pages.items():
             seen = []
             for name, case in presets.load(paper).cases.items():
@@ -208,11 +218,11 @@ def save(pages, folder, command=None):
         return document(
             f"{', '.join(pages)}: published and measured",
             "Published numbers, those of the same rigs and controllers here, and why they differ.",
-            f"{count[REPRODUCED]} of {count.total() - count[QUOTED] - count[UNMEASURED]} measured"
-            " quantities and claims reproduced",
+            f"{count[REPRODUCED]} of {count.total() - count[INPUT] - count[IMPOSSIBLE]} measured"
+            f" quantities and claims reproduced, {count[FITTED]} fitted",
             True,
-            [(word, str(n)) for word, n in count.most_common()],
-            [],
+            [(word, str(count[word])) for word in VERDICTS if count[word]],
+            [f"{word}: {VERDICTS[word]}" for word in VERDICTS if count[word]],
             drawings(drawn, captions),
             parts,
             command,
@@ -221,11 +231,61 @@ def save(pages, folder, command=None):
         )
 
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
-    stale = artifacts.earlier(folder, old)
+    stale = artifacts.earlier(folder, [*old, "published"])
     table = pages if len(pages) > 1 else next(iter(pages.values()))
     return artifacts.write_result(
         folder, {"result.json": tables.dumps(table) + "\n"}, draw, page_of, stale
     )
+
+
+OVERVIEW = (
+    "Measured over published, for every number that was measured: at the line the two agree."
+    " Numbers of both signs, and those that are 0, are in the table alone."
+)
+
+
+def overview(pages):
+    """Return {"published": figure of measured over published numbers}, {} without any."""
+    import matplotlib.pyplot as plt
+
+    from jaxtank.plots import responses
+
+    rows = [(paper, row, _ratios(row)) for paper, page in pages.items() for row in page["rows"]]
+    rows = [one for one in rows if one[2].size]
+    if not rows:
+        return {}
+    styles = {
+        REPRODUCED: (responses.AFTER, "o"),
+        FITTED: ("#E69F00", "s"),
+        DIFFERS: (responses.BEFORE, "X"),
+    }
+    with responses.styled():
+        figure, ax = plt.subplots(figsize=(7.2, 0.8 + 0.2 * len(rows)), layout="constrained")
+        for k, (_, row, ratios) in enumerate(rows):
+            colour, marker = styles[row["verdict"]]
+            ax.plot(ratios, [k] * len(ratios), marker, color=colour, markersize=5, alpha=0.8)
+        ax.axvline(1.0, color=responses.REFERENCE, linewidth=1.0)
+        ax.set_xscale("log")
+        ax.set(xlabel="measured / published [-]", ylim=(len(rows) - 0.4, -0.6))
+        names = [f"{paper}: {responses.plain(row['quantity'])}" for paper, row, _ in rows]
+        ax.set_yticks(range(len(rows)), names, fontsize=7)
+        for word, (colour, marker) in styles.items():
+            ax.plot([], [], marker, color=colour, label=word)
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return {"published": figure}
+
+
+def _ratios(row):
+    """Measured over published numbers of a row, one for each entry; none for claims."""
+    given = (row["published"], row["measured"])
+    if row["verdict"] in (INPUT, IMPOSSIBLE) or any(v is None or isinstance(v, str) for v in given):
+        return np.zeros(0)
+    printed, found = (np.ravel(np.asarray(v, dtype=float)) for v in given)
+    if printed.size not in (1, found.size):
+        return np.zeros(0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.unique(found / printed)
+    return ratios[np.isfinite(ratios) & (ratios > 0.0)]
 
 
 def _in_full(found):
@@ -243,10 +303,7 @@ def _in_full(found):
         for r in found["rows"]
     ]
     return [
-        tables.table(
-            rows,
-            ["quantity", "unit", "published", "measured", "verdict", "where", "why it differs"],
-        )
+        tables.table(rows, ["quantity", "unit", "published", "measured", "verdict", "where", "why"])
     ]
 
 
@@ -258,7 +315,7 @@ def markdown(pages):
     lines = ["| paper | quantity | published | measured | verdict |", "|---|---|---|---|---|"]
     for paper, page in pages.items():
         for r in page["rows"]:
-            if r["verdict"] in (QUOTED, UNMEASURED):
+            if r["verdict"] in (INPUT, IMPOSSIBLE):
                 continue
             unit = f" {r['unit']}" if r["unit"] else ""
             mine = _cell(r["measured"]) + ("" if isinstance(r["measured"], str) else unit)

@@ -131,7 +131,7 @@ def results(case, tmp_path_factory):
         "uncertainty": (cloud.save, ["fan", "violations", "rig"]),
         "sensitivity": (sensitive.save, ["tornado"]),
         "identify": (found.save, ["fit", "residuals", "rig"]),
-        "compare": (lambda *a: papers.save(pages, *a), ["rig-calofir"]),
+        "compare": (lambda *a: papers.save(pages, *a), ["published", "rig-calofir"]),
     }
 
 
@@ -330,6 +330,7 @@ def test_compare_and_show_write_to_the_folder_asked_for(tmp_path, monkeypatch, c
     )
     assert main.main(["compare", "calofir", "--out", str(tmp_path / "one"), "--quiet"]) == 0
     assert {p.name for p in (tmp_path / "one").iterdir()} == {
+        "published.png",
         "report.html",
         "result.json",
         "rig-calofir.png",
@@ -486,7 +487,7 @@ def test_no_column_of_a_page_of_claims_is_cut(tmp_path, width):
         "unit": "cm^3/(s V)",
         "where": "sec. 5.1, 5.3, Table 2",
     }
-    row |= {"published": words, "measured": words, "verdict": "not reproduced", "reason": words}
+    row |= {"published": words, "measured": words, "verdict": "differs", "reason": words}
     listed = row | {
         "published": tuple(0.123456 + k for k in range(16)),
         "measured": tuple(0.654321 + k for k in range(16)),
