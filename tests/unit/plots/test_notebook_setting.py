@@ -55,12 +55,13 @@ def test_a_case_a_run_and_a_study_have_one_small_picture_each(restored):
     )
     assert [pictures_of(v._repr_html_()) for v in (case, run, study)] == [[], [], []]
     jaxtank.notebook()
+    before = plt.get_fignums()  # of other tests
     for shown in (case, run, study):
         page = shown._repr_html_()
         (picture,) = pictures_of(page)
         assert "<table" in page and 200 < picture.width < 700 and len(page) < 150_000
         assert np.ptp(np.asarray(picture.convert("L"))) > 100  # not blank
-    assert plt.get_fignums() == []
+    assert plt.get_fignums() == before
 
 
 def test_numbers_are_shown_where_a_picture_fails(restored, monkeypatch):
