@@ -51,12 +51,13 @@ function linkOf(state, leaves) {
   }
   if (state.filter !== null) parts.push(`filter=${state.filter ? 1 : 0}`);
   if (state.seed) parts.push(`seed=${state.seed}`);
+  if (state.faults.length) parts.push(`faults=${state.faults.join(",")}`);
   return `#${parts.join("&")}`;
 }
 
-// {values, filter, seed, notes} of a fragment; what is unknown or no number is left out and noted
+// {values, filter, seed, faults: indices, notes} of a fragment; what is unknown or no number is left out and noted
 function readLink(text, leaves, hasFilter) {
-  const found = { values: {}, filter: null, seed: 0, notes: [] };
+  const found = { values: {}, filter: null, seed: 0, faults: [], notes: [] };
   const parts = text.replace(/^#/, "").split("&");
   if (!parts[0]) return found;
   if (parts[0] !== LINK) {
@@ -77,6 +78,8 @@ function readLink(text, leaves, hasFilter) {
       found.filter = word === "1";
     } else if (name === "seed" && Number.isInteger(value) && value >= 0 && value < 2 ** 31) {
       found.seed = value;
+    } else if (name === "faults" && /^\d{1,4}(,\d{1,4})*$/.test(word)) {
+      found.faults = word.split(",").map(Number);
     } else if (known.has(name) && Number.isFinite(value)) {
       const s = scaleOf(known.get(name));
       found.values[name] = clamp(value, s.low, s.high);
@@ -234,7 +237,9 @@ function marginsOf(limits, measures) {
     if (limit.lower !== null && limit.lower !== undefined) margins.push(value - limit.lower);
     found.push({ limit, value, margin: Math.min(...margins) });
   }
-  return found.sort((a, b) => a.margin - b.margin);
+  // the tightest first, as a share of its limit: units differ
+  const share = ({ limit, margin }) => margin / (limit.scale || Math.abs(limit.upper ?? limit.lower) || 1);
+  return found.sort((a, b) => share(a) - share(b));
 }
 
 // a quantile of numbers, between the nearest two

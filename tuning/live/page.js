@@ -134,10 +134,13 @@ function settle() {
   if (runner.busy) return;
   const rows = ((view.to - view.from) / info.dt) / data.drawn;
   if (rows < 400 && data.drawn > 1 && current && current.t.length < info.samples && !slow) touch(1);
-  if (!framed) history.replaceState(null, "", linkOf({ ...state, values: effective() }, leaves));
+  if (!framed) history.replaceState(null, "", linkOf(linked(), leaves));
   describe();
-  if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants();
+  if ($("plants").getAttribute("aria-pressed") === "true" && !bands && !worker) manyPlants(false);
 }
+
+// the state as a link has it: faults by their numbers
+const linked = () => ({ ...state, faults: data.breaks.flatMap((one, i) => (state.broken.has(one.name) ? [i] : [])) });
 
 function describe() {
   if (!current) return;
@@ -161,7 +164,8 @@ function noteFilter() {
 
 // own: by the search that runs; whatever else changes the loop ends it
 function changed(own = false) {
-  if (!own) tuneNow.stop?.("Tuning stopped: the loop was changed");
+  if (!own && tuneNow.stop) tuneNow.stop("Tuning stopped: the loop was changed");
+  else if (!own && worker) stop(); // plants about other values
   noteFilter();
   bands = null;
   touch();
@@ -304,9 +308,11 @@ function slider(leaf) {
     "aria-label": `${leaf.name}${words}` });
   const label = make("label", { for: id, title: leaf.doc }, leaf.name, make("span", { class: "unit" }, words));
   const row = make("div", { class: "row" }, label, number, range);
+  let ticked = () => {};
   if (state.free.has(leaf.name)) {
     const free = make("input", { type: "checkbox", "aria-label": `tune ${leaf.name}` });
     free.checked = true;
+    ticked = () => (free.checked = state.free.has(leaf.name));
     free.addEventListener("change", () => state.free[free.checked ? "add" : "delete"](leaf.name));
     row.classList.add("tunable");
     row.append(make("label", { class: "free", title: "changed by Tune" }, free, "tune"));
@@ -325,6 +331,7 @@ function slider(leaf) {
     range.setAttribute("aria-valuetext", `${shown(value)} ${leaf.unit}`);
     if (document.activeElement !== number) number.value = Number(value.toPrecision(6));
     row.classList.toggle("moved", leaf.name in state.values);
+    ticked();
   };
   range.addEventListener("pointerdown", () => (dragged = true));
   range.addEventListener("pointerup", () => (dragged = false));
@@ -340,6 +347,7 @@ function slider(leaf) {
     number.setAttribute("aria-invalid", String(!good));
     if (good) set(value);
   });
+  number.addEventListener("blur", () => update());
   number.addEventListener("change", () => {
     const value = number.value.trim() === "" ? NaN : Number(number.value);
     if (!Number.isFinite(value)) number.value = valueOf(leaf.name);
@@ -440,7 +448,7 @@ function makeLegend() {
     return make("span", { class: `key pin${i}` }, one.name, remove);
   });
   $("legend").replaceChildren(key("run", "this run"), ...own, key("setpoint", "setpoint"),
-    ...(bands ? [key("band", "90 % of 64 plants")] : []));
+    ...(bands ? [key("band", `90 % of 64 plants${bands.words}`)] : []));
 }
 
 function newWorker() {
@@ -518,7 +526,8 @@ function tuneNow() {
   return promise;
 }
 
-function manyPlants() {
+// spoken: whether the message says how many; not where they follow a slider or a search
+function manyPlants(spoken = true) {
   tuneNow.stop?.();
   const spread = {}, values = {};
   const now = effective();
@@ -533,12 +542,13 @@ function manyPlants() {
     measures: [...new Set(info.limits.map((limit) => limit.measure))],
     every: Math.max(1, Math.ceil(info.samples / 400)),
   }, {
-    progress: ({ done, of }) => say(`Simulating ${of} plants: ${done} done`),
+    progress: ({ done, of }) => spoken && say(`Simulating ${of} plants: ${done} done`),
     plants(found) {
       bands = found;
       const kept = info.limits.length ? `${found.kept} of ${found.count} plants keep every limit` :
         `${found.count} plants simulated`;
-      say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`);
+      bands.words = info.limits.length ? `, ${found.kept} keep every limit` : "";
+      if (spoken) say(`${kept}${found.broken ? `; ${found.broken} diverged` : ""}. The band holds 90 % of them at each time.`);
       makeLegend();
       show();
     },
@@ -568,7 +578,10 @@ function download(name, text) {
   setTimeout(() => URL.revokeObjectURL(url), 1000);
 }
 
-const csv = () => csvOf(run(effective(), data.every), info.units);
+const csv = () => {
+  const found = run(effective(), data.every);
+  return found && csvOf(found, info.units);
+};
 
 // the command that repeats the run: all that differs from the preset or the file
 function command() {
@@ -586,13 +599,18 @@ function command() {
 
 const toml = () => tomlOf(data.toml, leaves, effective(), state.filter);
 
-function reset() {
-  tuneNow.stop?.();
-  stop();
+function initial() {
   state.values = {};
   state.broken.clear();
   state.seed = 0;
   state.filter = info.filter.present ? data.filter : null;
+}
+
+function reset() {
+  tuneNow.stop?.();
+  stop();
+  initial();
+  state.free = new Set(entriesOf(info.free));
   pins.length = 0;
   bands = null;
   $("plants").setAttribute("aria-pressed", "false");
@@ -693,9 +711,12 @@ function listen() {
   });
   $("copy-command").addEventListener("click", () => copy(command(), "Command"));
   $("copy-toml").addEventListener("click", () => copy(toml(), "Rig file"));
-  $("csv").addEventListener("click", () => download(`${info.case.replace(/[^\w-]+/g, "-")}.csv`, csv()));
+  $("csv").addEventListener("click", () => {
+    const text = csv();
+    if (text) download(`${info.case.replace(/[^\w-]+/g, "-")}.csv`, text);
+  });
   $("link").addEventListener("click", () => {
-    const link = linkOf({ ...state, values: effective() }, leaves);
+    const link = linkOf(linked(), leaves);
     copy(location.href.split("#")[0] + link, "Link");
   });
   $("time").addEventListener("input", () => moveCursor((Number($("time").value) / 1000) * info.duration));
@@ -722,11 +743,12 @@ function preset(one) {
 function open() {
   const found = readLink(location.hash, leaves, info.filter.present);
   const asked = location.hash.length > 1;
+  initial();
   if (asked) {
     state.values = found.values;
-    state.broken.clear(); // the link has the values with what is broken
     state.seed = found.seed;
-    if (info.filter.present) state.filter = found.filter ?? data.filter;
+    for (const i of found.faults) if (i < data.breaks.length) state.broken.add(data.breaks[i].name);
+    if (found.filter !== null) state.filter = found.filter;
     if (found.notes.length) say(found.notes.slice(0, 3).join(" "));
   } else {
     for (const one of data.presets) {

@@ -21,6 +21,7 @@ from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, parameters
 from jaxtank.export.whole.loop import check_pointwise
+from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.trajectory import stride
 from tuning.answer.setting import plants_of
 from tuning.live.drawing import drawing
@@ -78,7 +79,14 @@ def page(case, presets=(), source=None):
     check_pointwise(case)
     off, on, filtered = both(case)
     data = data_of(case, presets, source)
-    text = assemble(_engine(off, on), case.name, data)
+    try:
+        text = assemble(_engine(off, on), case.name, data)
+    except InputError as error:
+        if not takes_arrays(case.loop):
+            raise
+        tanks = case.loop.plant.tanks
+        words = f"{case.name}: no live page of its {tanks} tanks, which run as arrays ({error})"
+        raise InputError(words) from None
     if len(text) > LARGEST and not filtered:  # then without a safety filter to switch on
         text = assemble(_engine(off, None), case.name, data)
     return text

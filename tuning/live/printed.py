@@ -197,7 +197,8 @@ class Printed:
         if own:
             lines.append(f"const[{','.join(own)}]=S;")
         body = text.write(self._timed(), streams)
-        body += [f"{array}[k]=+{text.of(e)};" for array, e in zip(own, streams)]
+        values = (text.of(e) for e in streams)
+        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(own, values)]
         lines += ["for(;k<K;++k){", *body, "}"] if own else []
         return function("signals", "q,k,K,S", lines)
 

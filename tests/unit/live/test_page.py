@@ -1,6 +1,7 @@
 """The live page in Chromium, against the library and its own promises."""
 
 import csv
+import dataclasses
 import io
 import json
 import shlex
@@ -13,6 +14,8 @@ from helpers import command
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
+from jaxtank.signals.base import Constant
 from tuning.live import shown
 from tuning.live.gallery import gallery
 from tuning.live.page import page
@@ -420,3 +423,60 @@ def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
     wanted, expected = table((tmp_path / "out" / "trajectory.csv").read_text())
     assert head == wanted
     np.testing.assert_allclose(numbers, expected, rtol=2e-9, atol=2e-9)
+
+
+def test_faults_of_a_link_are_switches_and_an_empty_address_is_the_case(browser, tmp_path):
+    """A fault beyond the end of its slider comes back, and can be switched off."""
+    path = tmp_path / "page.html"
+    path.write_text(page(presets.find("dts200/pi")), encoding="utf-8")
+    with opened(browser, path) as live:
+        count = live("document.querySelectorAll('#breaks button').length")
+        assert count > 2
+        live.page.click("#breaks summary")
+        for i in range(count):
+            live.page.click(f"#breaks button >> nth={i}")
+        live.page.wait_for_timeout(500)
+        state, link = live("jaxtank.state()"), live("location.hash")
+        assert "faults=0,1,2" in link and len(state["values"]) >= 3
+    with opened(browser, path, link) as live:
+        assert live("jaxtank.state()") == state and "range" not in live.text("#message")
+        pressed = "[...document.querySelectorAll('#breaks [aria-pressed=true]')].length"
+        assert live(pressed) == count
+        live("() => { location.hash = ''; }")
+        live.wait(f"{pressed} === 0")
+        assert live("jaxtank.state().values") == {}
+
+
+def test_reset_ticks_what_is_tuned_and_plants_leave_the_message_of_a_search(browser, written):
+    with opened(browser, written) as live:
+        tick = "document.querySelector('#groups .free input')"
+        live(f"() => {tick}.click()")
+        assert live(f"{tick}.checked") is False
+        live.page.click("#reset")
+        assert live(f"{tick}.checked") is True
+        live.page.click("#plants")
+        live.wait("document.querySelector('#legend').textContent.includes('keep every limit')")
+        live("jaxtank.tune()")
+        assert live.text("#message").startswith("Tuned in")
+        live.wait("document.querySelector('#legend').textContent.includes('keep every limit')")
+        assert live.text("#message").startswith("Tuned in")
+
+
+def test_a_constant_reference_runs_and_limits_are_ranked_by_their_shares(browser, tmp_path):
+    """An error of twice its limit goes before a level that is 4 V, but 80 %, above its own."""
+    case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 400.0})
+    level = np.asarray(case.loop.reference.initial)
+    loop = dataclasses.replace(case.loop, reference=Constant(level=level))
+    loop = with_values(loop, {"x0": 0.97 * np.asarray(loop.x0)})
+    wanted = jaxtank.evaluate(loop, case.clock, ["max_error", "max_level"])
+    error, tanks = (np.asarray(wanted[name]) for name in ("max_error", "max_level"))
+    limits = {"max_error": [error[0] / 2], "max_level": [tanks[0] / 1.8, 2 * tanks[1]]}
+    assert tanks[0] - limits["max_level"][0] > error[0] / 2 > 0.0
+    path = tmp_path / "page.html"
+    path.write_text(page(case.replace(loop=loop, limits=limits)), encoding="utf-8")
+    with opened(browser, path) as live:
+        found = live("jaxtank.run({})")["measures"]
+        np.testing.assert_allclose(found["max_error"], error, rtol=1e-9)
+        assert live.text("#verdict").startswith("Limit exceeded by")
+        assert "max_error" in live.text("#verdict")
+        assert live.text("#margins tbody th").startswith("max_error")
