@@ -76,7 +76,7 @@ def spilled(plant: Any, run: Any) -> Spilled:
     if getattr(plant, "overflow", False):
         volume = np.asarray(run.spilled, dtype=float)
         volume = np.where(volume > 1e-9 * volume.max(initial=0.0), volume, 0.0)
-    elif not hasattr(plant, "area"):  # a plant of the user's own
+    elif callable(getattr(plant, "area", callable)):  # a plant of the user's own, as a cone
         volume = np.zeros_like(x)
     else:
         rim, area = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))

@@ -93,7 +93,7 @@ def estimates(loop, clock, run, title=""):
         return {}
     length = loop.units[0]
     known = None
-    if loop.disturbance is not None:
+    if loop.disturbance is not None and not callable(loop.plant.area):
         index = np.clip(np.rint(np.asarray(run.t) / clock.dt).astype(int), 0, clock.samples - 1)
         known = np.stack(
             [np.asarray(d)[index] for d in loop.disturbance.sample(clock)[0]], axis=1

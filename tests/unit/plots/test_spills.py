@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -122,3 +123,9 @@ def test_no_two_roles_share_a_colour_and_the_live_page_has_the_same():
     sheet = (ROOT / "tuning" / "live" / "page.css").read_text().split("@media")[0]
     for role, colour in roles.items():
         assert re.search(rf"--{role}: {colour.lower()};", sheet), role
+
+
+def test_a_plant_whose_area_is_a_function_of_the_level_has_no_counted_volume():
+    cone = SimpleNamespace(area=lambda h: 2.0 * h, rim=np.array([1.0]))
+    found = spills.spilled(cone, SimpleNamespace(x=np.array([[0.5], [2.0]])))
+    assert not found.any and found.volume.shape == (2, 1)
