@@ -48,7 +48,7 @@ function makeChart(host, spec, view, on) {
       },
       axes: [
         { ...axis, size: 24, space: 48, gap: 3, values: (u, at) => at.map((t, i) => shown(t, 6) + (i === at.length - 1 ? " s" : "")) },
-        { ...axis, size: 46, space: 26, gap: 4, values: (u, at) => at.map((v) => shown(v, 5)) },
+        { ...axis, size: (u, at) => Math.max(46, ...(at ?? []).map((text) => 7 * text.length + 12)), space: 26, gap: 4, values: (u, at) => at.map((v) => shown(v, 5)) },
       ],
       series,
       bands: [{ series: [2, 1], fill: () => colour("--band") }],
