@@ -1,114 +1,209 @@
-"""Execute the notebooks of this folder, top to bottom.
+"""Build the notebooks of this folder from their sources (NN_name.py, jupytext's percent format).
 
-python notebooks/run.py            in full, and keep the outputs in the files
-python notebooks/run.py --fast     with the parameters of FAST (coarse steps, few starts), without
-                                   changing the files
+python notebooks/run.py            runs each, writes NN_name.ipynb, its thumbnail and the gallery
+python notebooks/run.py --check    runs each, and fails where a stored notebook or the gallery
+                                   differs from the run: text, numbers, figures' titles and legends
 python notebooks/run.py 05 08      those alone, by the beginnings of their names
+
+In the text of a source, {{expression}} or {{expression:format}} stands for a value of the notebook
+at that place; {{run_time}} for the seconds that it took, {{links}} for links to hosts that open it.
 """
 
+import base64
+import io
+import json
+import math
 import re
 import subprocess
 import sys
 import time
+import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jupytext
 import nbformat
 from nbclient import NotebookClient
+from stale import differences, text_differs
 
-# Parameters of a quick run, by the beginning of a notebook's name: they replace those of its cell
-# tagged "parameters".
-FAST = {
-    "01": {
-        "dt": "0.1",
-        "starts, screening": "2, 8",
-        "rigs": "16",
-        "slow_cases": '("backstepping-slow",)',
-    },
-    "02": {"dt": "0.1"},
-    "03": {
-        "starts, screening": "1, 8",
-        "size": "15",
-        "heights": "[30.0, 33.0, 36.0]",
-        "bound_heights": "[33.0]",
-        "bound_iterations": "20",
-        "rigs, judged": "16, 32",
-    },
-    "04": {"dt": "0.05", "rates": "np.array([0.3, 3.0, 10.0])", "starts, screening": "1, 8"},
-    "05": {"grid_points": "6", "kinds": '("hybrid",)', "screening": "2", "iterations": "2"},
-    "06": {
-        "horizons": "np.geomspace(1.5, 60.0, 9)",
-        "tps": "np.geomspace(0.1, 5.0, 7)",
-        "poles": "np.linspace(0.0, 0.95, 5)",
-        "orders": "(1, 4)",
-    },
-    "07": {"rigs": "64", "sobol_samples": "16"},
-    "08": {"starts, plants, new": "1, 8, 64", "judged": "32"},
-    "09": {"starts": "2", "samples, new, iterations": "4, 16, 4"},
-    "10": {"dt": "0.1", "starts, screening, validation": "1, 8, 8", "rigs": "32"},
+FOLDER = Path(__file__).resolve().parent
+FIELD = re.compile(r"\{\{(.+?)\}\}")
+LONGEST = 60  # [s] a notebook may take on two quiet cores
+HOSTS = {
+    "Colab": "https://colab.research.google.com/github/{}/blob/HEAD/notebooks/{}",
+    "Binder": "https://mybinder.org/v2/gh/{}/HEAD?labpath=notebooks/{}",
 }
 
 
-def inject(notebook, values):
-    """Replace the assignments of `values` {names: source of the value} in the cell tagged
-    "parameters".
+def sources():
+    """Return the sources, in order."""
+    return sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+
+
+def links(name):
+    """Return Markdown links to hosts that open a notebook, "" without a public repository.
+
+    The repository is `Repository` under [project.urls] of pyproject.toml, on GitHub.
     """
-    (cell,) = (c for c in notebook.cells if "parameters" in c.metadata.get("tags", ()))
-    for names, value in values.items():
-        cell.source, count = re.subn(
-            f"^{re.escape(names)} = .*$",
-            lambda _, line=f"{names} = {value}": line,
-            cell.source,
-            flags=re.M,
+    project = tomllib.loads((FOLDER.parent / "pyproject.toml").read_text())["project"]
+    public = re.search(
+        r"github\.com/([\w.-]+/[\w.-]+)", project.get("urls", {}).get("Repository", "")
+    )
+    if not public:
+        return ""
+    opened = (f"[{host}]({url.format(public[1], name)})" for host, url in HOSTS.items())
+    return "Open in " + " or ".join(opened)
+
+
+def aside(client, code):
+    """Execute code in the kernel that is no cell of the notebook; return what it prints."""
+    first = client.nb.cells[0]
+    cell = nbformat.v4.new_code_cell(code)
+    client.execute_cell(cell, 0, store_history=False)
+    client.nb.cells[0] = first  # nbclient had put the cell there
+    return "".join(output["text"] for output in cell.outputs if output.get("name") == "stdout")
+
+
+def fill(client, text, known):
+    """Return a text in which each {{expression}} is replaced by its value in the kernel."""
+
+    def value(field):
+        if field[1] in known:
+            return known[field[1]]
+        return aside(client, f'print(f"""{{{field[1]}}}""", end="")')
+
+    return FIELD.sub(value, text)
+
+
+def tidy(notebook):
+    """Remove from a notebook what differs from run to run without a meaning."""
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+        for output in cell.get("outputs", []):
+            if output.output_type == "stream":  # a warning names a file of this run alone
+                output.text = re.sub(r"\S*ipykernel_\d+/\d+\.py", "notebook", output.text)
+            if "image/png" in output.get("data", {}):  # the still of a widget, whose kernel is gone
+                output.data.pop("application/vnd.jupyter.widget-view+json", None)
+    notebook.metadata = nbformat.from_dict(
+        {
+            "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+            "language_info": {"name": "python"},
+        }
+    )
+    for index, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{index + 1}"
+
+
+def execute(source):
+    """Return the notebook of a source with its outputs, and the seconds that it took."""
+    notebook = jupytext.read(source, fmt="py:percent")
+    client = NotebookClient(
+        notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}
+    )
+    began = time.perf_counter()
+    with client.setup_kernel():
+        aside(client, (FOLDER / "drawn.py").read_text())
+        count = 0
+        for index, cell in enumerate(notebook.cells):
+            if cell.cell_type == "code":
+                count += 1
+                client.execute_cell(cell, index, execution_count=count)
+            else:
+                known = {"run_time": "{{run_time}}", "links": links(f"{source.stem}.ipynb")}
+                cell.source = fill(client, cell.source, known).strip()
+    took = time.perf_counter() - began
+    for cell in notebook.cells:
+        if cell.cell_type == "markdown":
+            cell.source = cell.source.replace("{{run_time}}", str(10 * math.ceil(took / 10)))
+    tidy(notebook)
+    return notebook, took
+
+
+def picture(notebook):
+    """Return the PNG of a notebook's thumbnail: of its cell tagged "thumbnail", or its last one."""
+    found = None
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            png = output.get("data", {}).get("image/png")
+            if png and (found is None or "thumbnail" not in found[0]):
+                found = cell.metadata.get("tags", ()), base64.b64decode(png)
+    return found and found[1]
+
+
+def thumbnail(png, width=360):
+    """Return a PNG of at most `width` pixels across."""
+    from PIL import Image
+
+    image = Image.open(io.BytesIO(png)).convert("RGB")
+    image.thumbnail((width, width), Image.Resampling.LANCZOS)
+    small = io.BytesIO()
+    image.quantize(128).save(small, "png", optimize=True)
+    return small.getvalue()
+
+
+def gallery():
+    """Return the table of the notebooks for README.md: picture, title, question, run time."""
+    rows = ["| | notebook | run time |", "|---|---|---|"]
+    for source in sources():
+        path = source.with_suffix(".ipynb")
+        if not path.exists():
+            continue
+        first = nbformat.read(path, as_version=4).cells[0].source
+        title = re.search(r"^# (.+)$", first, re.M)[1]
+        question = re.search(r"^\*\*Question[:.]?\*\*[:.]?\s*((?:.+\n?)+)", first, re.M)[1]
+        seconds = re.search(r"Run time: about (\d+ s)", first)[1]
+        picture = f"[![{title}](images/{source.stem}.png)]({path.name})"
+        rows.append(
+            f"| {picture} | [{title}]({path.name}). {' '.join(question.split())} | {seconds} |"
         )
-        if count != 1:
-            raise KeyError(f"the parameters are assigned {count} times, not once: {names}")
+    return "\n".join(rows)
+
+
+def keep(source, notebook):
+    """Write a notebook and its thumbnail."""
+    nbformat.write(notebook, source.with_suffix(".ipynb"))
+    if png := picture(notebook):
+        (FOLDER / "images" / f"{source.stem}.png").write_bytes(thumbnail(png))
+
+
+def one(source, check):
+    """Build or check one notebook; return whether it is well."""
+    notebook, took = execute(source)
+    path, faults = source.with_suffix(".ipynb"), []
+    if check:
+        stored = json.loads(path.read_text()) if path.exists() else {"cells": []}
+        faults = differences(stored, notebook)
+    else:
+        keep(source, notebook)
+    cells = sum(cell.cell_type == "code" for cell in notebook.cells)
+    print(f"{path.name}: {cells} cells ran in {took:.0f} s", *faults, sep="\n  ", flush=True)
+    return not faults
 
 
 def main():
-    fast = "--fast" in sys.argv[1:]
-    wanted = tuple(a for a in sys.argv[1:] if a != "--fast")
-    paths = [
-        p
-        for p in sorted(Path(__file__).parent.glob("*.ipynb"))
-        if not wanted or p.name.startswith(wanted)
-    ]
-    if not paths:
+    words = sys.argv[1:]
+    check = "--check" in words
+    wanted = tuple(word for word in words if word != "--check")
+    chosen = [path for path in sources() if not wanted or path.name.startswith(wanted)]
+    if not chosen:
         sys.exit(f"no notebook here begins with {' or '.join(wanted)}")
-    if fast and len(paths) > 1:  # two at once, each in a process of its own
-        alone = lambda path: (
-            subprocess.run([sys.executable, __file__, "--fast", path.name]).returncode
-        )
-        with ThreadPoolExecutor(2) as pool:
-            sys.exit(max(pool.map(alone, paths)))
-    for path in paths:
-        began = time.perf_counter()
-        notebook = nbformat.read(path, as_version=4)
-        if fast:
-            inject(notebook, FAST[path.name[:2]])
-        NotebookClient(
-            notebook,
-            timeout=1800,
-            kernel_name="python3",
-            resources={"metadata": {"path": str(path.parent)}},
-        ).execute()
-        print(
-            f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells ran in"
-            f" {time.perf_counter() - began:.0f} s"
-        )
-        if not fast:
-            for cell in notebook.cells:
-                cell.metadata.pop("execution", None)
-                for output in cell.get("outputs", []):
-                    if output.output_type == "stream":  # a warning names a file of this run alone
-                        output.text = re.sub(r"\S*ipykernel_\d+/\d+\.py", "notebook", output.text)
-            notebook.metadata["kernelspec"] = {
-                "display_name": "Python 3",
-                "language": "python",
-                "name": "python3",
-            }
-            notebook.metadata.get("language_info", {}).pop("version", None)
-            nbformat.write(notebook, path)
+    if len(chosen) == 1:
+        well = one(chosen[0], check)
+    else:  # two at once, each in a process of its own
+        command = [sys.executable, __file__, *(["--check"] if check else [])]
+        alone = lambda path: not subprocess.run([*command, path.name]).returncode
+        with ThreadPoolExecutor(2 if check else 1) as pool:
+            well = all(list(pool.map(alone, chosen)))
+    page = FOLDER / "README.md"
+    start, end = "<!-- gallery -->\n", "\n<!-- end of gallery -->"
+    head, rest = page.read_text().split(start)
+    stored, tail = rest.split(end)
+    if not check:
+        page.write_text(head + start + gallery() + end + tail)
+    elif len(chosen) == len(sources()) and (how := text_differs(stored, gallery())):
+        print(f"README.md: {how}")
+        well = False
+    sys.exit(0 if well else "stored notebooks differ from a run: python notebooks/run.py")
 
 
 if __name__ == "__main__":

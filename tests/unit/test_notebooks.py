@@ -1,58 +1,170 @@
-"""The notebooks read as a user would write them; a quick run replaces parameters of their tagged
-cell alone.
+"""The notebooks keep their form, agree with their sources, and the comparison of a stored notebook
+with a run finds what has changed. The runs themselves: python notebooks/run.py --check.
 """
 
 import ast
+import copy
 import json
 import re
+import sys
 
 import pytest
 from helpers import ROOT
 
 FOLDER = ROOT / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-pytestmark = pytest.mark.skipif(not NOTEBOOKS, reason="the notebooks are not beside the tests")
+SOURCES = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
+pytestmark = pytest.mark.skipif(not SOURCES, reason="the notebooks are not beside the tests")
+every = pytest.mark.parametrize("source", SOURCES, ids=lambda path: path.stem)
+FIELD = re.compile(r"\{\{(.+?)\}\}")
 
 
-def quick_parameters():
-    """FAST of notebooks/run.py, read without its imports."""
-    tree = ast.parse((FOLDER / "run.py").read_text())
-    (node,) = (n for n in tree.body if isinstance(n, ast.Assign) and n.targets[0].id == "FAST")
-    return ast.literal_eval(node.value)
+@pytest.fixture(scope="module")
+def stale():
+    sys.path.insert(0, str(FOLDER))
+    try:
+        import stale
+    finally:
+        sys.path.remove(str(FOLDER))
+    return stale
 
 
-def code(path):
-    return [c for c in json.loads(path.read_text())["cells"] if c["cell_type"] == "code"]
+def stored(source):
+    """Cells of the notebook of a source: [(kind, text, outputs)]."""
+    cells = json.loads(source.with_suffix(".ipynb").read_text())["cells"]
+    return [(c["cell_type"], "".join(c["source"]), c.get("outputs", [])) for c in cells]
 
 
-def test_every_notebook_has_parameters_of_a_quick_run():
-    assert [p.name[:2] for p in NOTEBOOKS] == sorted(quick_parameters())
+def code(source):
+    return [text for kind, text, _ in stored(source) if kind == "code"]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_each_quick_parameter_is_assigned_once_in_the_tagged_cell(path):
-    (cell,) = (c for c in code(path) if "parameters" in c["metadata"].get("tags", ()))
-    source = "".join(cell["source"])
-    for names, value in quick_parameters()[path.name[:2]].items():
-        (assigned,) = re.findall(f"^{re.escape(names)} = (.*)$", source, re.M)
-        assert len(ast.parse(names).body) == 1 and ast.parse(value) and assigned != value
+@every
+def test_each_notebook_has_the_cells_of_its_source(source):
+    jupytext = pytest.importorskip("jupytext")
+    wanted = jupytext.read(source, fmt="py:percent").cells
+    found = stored(source)
+    assert [c.cell_type for c in wanted] == [kind for kind, *_ in found]
+    for cell, (kind, text, _) in zip(wanted, found, strict=True):
+        if kind == "code":
+            assert cell.source == text
+        else:  # fields are filled with values of the run, and nothing else has changed
+            plain = FIELD.split(cell.source.strip())[::2]
+            pattern = "(.*?)".join(re.escape(part) for part in plain)
+            assert re.fullmatch(pattern, text, re.DOTALL | re.M) or "{{links}}" in cell.source
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_no_later_cell_assigns_a_parameter(path):
-    _, *later = code(path)
-    trees = [ast.parse(re.sub("^[%!].*$", "", "".join(c["source"]), flags=re.M)) for c in later]
-    stored = {
-        n.id
-        for tree in trees
-        for n in ast.walk(tree)
-        if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+@every
+def test_first_cell_has_title_question_source_and_run_time(source):
+    (kind, first, _), *_ = stored(source)
+    assert kind == "markdown" and re.match(r"# \S", first)
+    assert re.search(r"^\*\*Question[:.]?\*\*[:.]? \S", first, re.M)
+    assert re.search(r"\]\(https://doi\.org/10\.\d{4,}/\S+\)", first)
+    seconds = int(re.search(r"Run time: about (\d+) s", first)[1])
+    assert 0 < seconds <= 60
+    assert "{{run_time}}" in source.read_text() and "{{links}}" in source.read_text()
+
+
+@every
+def test_last_cell_concludes_with_three_exercises_and_folded_answers(source):
+    kind, last, _ = stored(source)[-1]
+    assert kind == "markdown" and len(FIELD.findall(source.read_text())) > 4
+    assert last.count("<details><summary>") == last.count("</details>") == 3
+
+
+@every
+def test_cells_are_short_and_plain(source):
+    cells = code(source)
+    assert "jaxtank.notebook()" in cells[0]
+    for text in cells:
+        lines = [line for line in text.splitlines() if line.strip()]
+        assert len(lines) <= 12 and max(map(len, lines)) <= 100, text
+        tree = ast.parse(re.sub("^[%!].*$", "", text, flags=re.M))
+        loops = [n for n in ast.walk(tree) if isinstance(n, ast.For | ast.While)]
+        calls = [n for loop in loops for n in ast.walk(loop) if isinstance(n, ast.Call)]
+        assert not [c for c in calls if getattr(c.func, "id", "") == "print"], text
+    whole = "\n".join(cells)
+    for word in ("environ", "FAST", "set_dpi", "figure.dpi", "enable_x64", "warnings.", "%%"):
+        assert word not in whole
+
+
+@every
+def test_guesses_come_before_figures_and_formulas_are_latex(source):
+    text = "\n".join(text for kind, text, _ in stored(source) if kind == "markdown")
+    assert text.lower().count("guess") >= 2 and "$" in text
+
+
+@every
+def test_outputs_are_stored_and_small(source):
+    assert source.with_suffix(".ipynb").stat().st_size <= 600_000
+    assert (FOLDER / "images" / f"{source.stem}.png").stat().st_size <= 60_000
+    outputs = [o for _, _, outputs in stored(source) for o in outputs]
+    assert any("image/png" in o.get("data", {}) for o in outputs)
+    assert not [o for o in outputs if o["output_type"] == "error" or o.get("name") == "stderr"]
+
+
+def test_the_gallery_has_every_notebook():
+    page = (FOLDER / "README.md").read_text()
+    gallery = page.partition("<!-- gallery -->")[2].partition("<!-- end of gallery -->")[0]
+    assert re.findall(r"\[!\[.*?\]\(images/(.*?)\.png\)\]", gallery) == [s.stem for s in SOURCES]
+    assert [s.name[:2] for s in SOURCES] == [f"{i + 1:02}" for i in range(len(SOURCES))]
+
+
+def notebook(legend="tuned", value="error 0.297 cm\n", prose="It falls to 0.297 cm.", tags=()):
+    figure = {"image/png": "iVBOR", "text/plain": "<Figure size 640x480 with 1 Axes>"}
+    drawn = ["axes  | time [s] | level [cm]", "line 0 to 12.3", f"legend {legend}"]
+    outputs = [
+        {"output_type": "stream", "name": "stdout", "text": value},
+        {
+            "output_type": "display_data",
+            "data": figure,
+            "metadata": {"image/png": {"drawn": drawn}},
+        },
+        {
+            "output_type": "execute_result",
+            "data": {"text/html": f"<table><td>{value}</td></table><style>p 9</style>"},
+            "metadata": {},
+        },
+    ]
+    tagged = {"tags": list(tags)}
+    return {
+        "cells": [
+            {"cell_type": "code", "source": "a()", "outputs": outputs, "metadata": tagged},
+            {"cell_type": "markdown", "source": prose, "metadata": tagged},
+        ]
     }
-    names = {n.strip() for key in quick_parameters()[path.name[:2]] for n in key.split(",")}
-    assert names & stored == set()
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
-def test_no_notebook_asks_how_it_is_run(path):
-    source = "".join("".join(c["source"]) for c in code(path))
-    assert "FAST" not in source and "environ" not in source
+@pytest.mark.parametrize(
+    "change, where",
+    [
+        ({"legend": "published"}, "figure"),
+        ({"value": "error 0.303 cm\n"}, "stdout"),
+        ({"value": "errors 0.297 cm\n"}, "stdout"),
+        ({"value": "error 0.297 cm 3\n"}, "stdout"),
+        ({"prose": "It falls to 0.31 cm."}, "text"),
+        ({"prose": "It rises to 0.297 cm."}, "text"),
+    ],
+)
+def test_a_changed_legend_number_or_word_is_found(stale, change, where):
+    found = stale.differences(notebook(), notebook(**change))
+    assert found and any(where in line for line in found)
+
+
+def test_rounding_times_and_addresses_are_no_differences(stale):
+    assert stale.differences(notebook(), notebook()) == []
+    assert stale.differences(notebook(), notebook(value="error  0.298 cm\n")) == []
+    slow = notebook(value="2.1 ms", tags=["times"]), notebook(value="9.4 ms", tags=["times"])
+    assert stale.differences(*slow) == []
+    a, b = (notebook(prose=f"Run time: about {n} s. <a at 0x7f{n}abcdef>") for n in (20, 50))
+    assert stale.differences(a, b) == []
+
+
+def test_changed_code_kinds_and_counts_of_cells_are_found(stale):
+    other = copy.deepcopy(notebook())
+    other["cells"][0]["source"] = "b()"
+    assert stale.differences(notebook(), other) == ["cell 1: the code differs"]
+    other = copy.deepcopy(notebook())
+    other["cells"][0]["outputs"].pop()
+    assert "outputs" in stale.differences(notebook(), other)[0]
+    other["cells"].pop()
+    assert stale.differences(notebook(), other) == ["stored 2 cells, now 1"]
