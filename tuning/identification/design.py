@@ -18,6 +18,7 @@ from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
 from tuning.identification.confidence import VAGUE
 from tuning.identification.parametrisation import coordinates, nominal, specification
+from tuning.identification.result import Experiments
 from tuning.problem.bounds import bounds
 
 REGISTER = 7
@@ -136,7 +137,7 @@ def compare_experiments(
     size: ArrayLike | None = None,
     bit: float | None = None,
     inputs: Mapping[str, Any] | None = None,
-) -> dict[str, dict[str, Any]]:
+) -> Experiments:
     """Predict the standard deviations of the free parameters that each candidate experiment leaves.
 
         covariance = (J' J / noise^2)^-1,   J the sensitivities of the readings (Fisher information)
@@ -167,8 +168,8 @@ def compare_experiments(
 
     Returns
     -------
-    dict
-        {description: {"sd" {name: value or None}, "condition", "open": names that are not
+    Experiments
+        A dict {description: {"sd" {name: value or None}, "condition", "open": names that are not
         identifiable}}, the condition number of J'J for parameters relative to their values.
 
     Raises
@@ -210,7 +211,7 @@ def compare_experiments(
                 " shorter duration"
             )
         found[name] = _precision(moved, p, values, jacobian)
-    return found
+    return Experiments(case, found)
 
 
 def _precision(moved, p, values, jacobian):

@@ -10,11 +10,49 @@ from typing import Any
 import numpy as np
 
 from jaxtank.case import Case
+from jaxtank.core.text import html_table
+from jaxtank.core.tree import get_value
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
 from tuning.problem.result import Result
 from tuning.problem.status import Status
+
+
+class Experiments(dict[str, dict[str, Any]]):
+    """Result of `tuning.compare_experiments`: {description: {"sd", "condition", "open"}}, which a
+    notebook shows as a table.
+
+    Attributes
+    ----------
+    case : Case
+        The rig, with the values at which the sensitivities were taken.
+    """
+
+    case: Case
+
+    def __init__(self, case: Case, found: dict[str, dict[str, Any]]):
+        super().__init__(found)
+        self.case = case
+
+    def _repr_html_(self) -> str:
+        """A row for each experiment: standard deviations in per cent of the values."""
+        names = list(next(iter(self.values()))["sd"]) if self else []
+        size = {n: abs(float(np.asarray(get_value(self.case.loop, n)))) for n in names}
+
+        def cell(name: str, sd: float | None) -> str:
+            if sd is None:
+                return "not identifiable"
+            if not size[name]:
+                return f"{sd:.2g}"
+            percent = 100 * sd / size[name]
+            return f"{percent:.2g} %" if percent < 100 else f"{percent:.0f} %"
+
+        rows = [
+            [words, *(cell(*pair) for pair in one["sd"].items())] for words, one in self.items()
+        ]
+        caption = f"{self.case.name}: standard deviations that each experiment would leave"
+        return html_table(rows, ["experiment", *names], caption)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

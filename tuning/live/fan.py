@@ -163,7 +163,8 @@ class Fan:
             rows, keys
         )
         key = None if keys is None else keys[0]
-        order, at = tuple(values), tuple(values.values())
+        order = tuple(b.name for b in self.bounds)  # that of `values` is by name inside jit
+        at = tuple(values[name] for name in order)
         nominal, slopes, _, _ = sensitivities_compiled(loop, clock, names, order, at, key)
         return saved, measures, broken, nominal, slopes
 

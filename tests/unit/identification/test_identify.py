@@ -150,6 +150,22 @@ def test_standard_deviations_of_the_notes(case, levels):
         assert found[letter]["open"] == []
 
 
+def test_a_notebook_shows_experiments_as_a_table():
+    """In per cent of the values; a share of an overflow is open where no tank overflows."""
+    case = presets.find("cascaded/open-loop")
+    free = {"plant.orifice[0]": (0.01, 0.2), "plant.caught[0]": (0.0, 1.0, "linear")}
+    t = np.arange(0.0, 80.0, 4.0)
+    runs = {"a <step>": (t, np.full((20, 1), 3.0), np.zeros(2))}
+    found = compare_experiments(case, free, noise=0.05, duration=80, dt=4, inputs=runs)
+    sd, value = found["a <step>"]["sd"], float(case.loop.plant.orifice[0])
+    shown = found._repr_html_()
+    assert "<th>plant.orifice[0]</th>" in shown and "a &lt;step&gt;" in shown
+    assert (
+        f"<td>{100 * sd['plant.orifice[0]'] / value:.2g} %</td><td>not identifiable</td>" in shown
+    )
+    assert isinstance(found, dict) and list(found) == ["a <step>"]
+
+
 def test_the_candidates_are_those_of_the_notes(case):
     made = candidates(case.loop, duration=300, dt=1.0, voltage=VOLTAGE, size=0.5)
     wanted = experiments(case)

@@ -85,6 +85,23 @@ def test_the_effect_in_words_is_the_difference_of_two_runs(fan):
     np.testing.assert_allclose(moved.slopes["rms_error_total"][..., 0], slope, rtol=1e-6)
 
 
+def test_each_parameter_keeps_its_own_effect_whatever_their_order():
+    """The slopes by central differences, of parameters that are not in the order of their names."""
+    case = presets.find("cascaded/pi")
+    case = case.replace(clock=dataclasses.replace(case.clock, duration=400.0))
+    at = {"plant.drain[1]": 0.05, "controller.Kc[0]": 0.7}
+    fan = Fan(case, {name: (0.5 * value, 2.0 * value) for name, value in at.items()}, plants=1)
+    moved = fan.move(at)
+    for k, name in enumerate(b.name for b in fan.bounds):
+        step, ends = 1e-5 * at[name], []
+        for sign in (-1.0, 1.0):
+            loop = fan.case_at(at | {name: at[name] + sign * step}).loop
+            ends.append(jaxtank.evaluate(loop, case.clock, "rms_error_total")["rms_error_total"])
+        np.testing.assert_allclose(
+            moved.slopes["rms_error_total"][..., k], (ends[1] - ends[0]) / (2.0 * step), rtol=1e-5
+        )
+
+
 def test_the_share_over_a_rim_counts_plants(fan):
     moved = fan.move(MOVED)
     spilled = np.asarray(moved.measures["overflow_volume"]) > 0
