@@ -69,8 +69,8 @@ PUBLISHED = {
         "levels below 30 cm with both controllers",
         "",
         _WHERE,
-        reason="with ramps of 30 s tank 4 of the nominal plant needs more than 30 cm (gouta2015"
-        " notes S3)",
+        reason="with ramps of 30 s tank 4 of the nominal plant needs more than 30 cm"
+        " (gouta2015 notes S3)",
     ),
 }
 
