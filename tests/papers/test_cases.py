@@ -140,7 +140,7 @@ def test_a_case_is_simulated_by_the_command(name, tmp_path, capsys):
 # rows of each paper: one that goes missing is a number that nobody looks at any more
 ROWS = {
     **{"calofir": 19, "cascaded": 3, "dts200": 8, "gouta2015": 46, "gouta2022": 46},
-    **{"johansson": 23, "khalid": 24, "mirakhorli": 29},
+    **{"johansson": 23, "khalid": 24, "mirakhorli": 39},
 }
 
 
