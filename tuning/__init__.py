@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from tuning.feasible.study import can_follow as can_follow
     from tuning.feasible.study import feasibility as feasibility
     from tuning.feasible.study import least_offset as least_offset
+    from tuning.figures.comparison import Comparison as Comparison
+    from tuning.figures.comparison import compare as compare
+    from tuning.figures.comparison import redraw as redraw
     from tuning.identification.batch import identify_many as identify_many
     from tuning.identification.csv_log import read_log as read_log
     from tuning.identification.design import compare_experiments as compare_experiments
@@ -95,6 +98,9 @@ _NAMES = {
     "bound": "tuning.optimal_input.perfect_information",
     "compare_experiments": "tuning.identification.design",
     "ensemble": "tuning.uncertainty.study",
+    "Comparison": "tuning.figures.comparison",
+    "compare": "tuning.figures.comparison",
+    "redraw": "tuning.figures.comparison",
     "Identifications": "tuning.identification.result",
     "identify": "tuning.identification.fit",
     "identify_many": "tuning.identification.batch",

@@ -1,0 +1,188 @@
+"""`tuning.compare`: published beside measured numbers of papers, as a result that a notebook shows,
+and `tuning.redraw`: a figure of a paper by our runs. Imported as names of `tuning`.
+"""
+
+import html
+import warnings
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from jaxtank import presets
+from jaxtank.core.errors import unknown
+from jaxtank.core.text import html_table
+from tuning.figures import catalogue, drawing
+from tuning.problem.result import Shown
+from tuning.report import papers, tables
+
+COLOURS = {
+    papers.REPRODUCED: "#0072B2",
+    papers.FITTED: "#9A6A00",
+    papers.DIFFERS: "#B8431A",
+    papers.IMPOSSIBLE: "#6B6B6B",
+    papers.INPUT: "#6B6B6B",
+}
+"""Colour of each verdict in a notebook."""
+
+
+class Comparison(Shown):
+    """Published and measured numbers of some papers; made by `tuning.compare`.
+
+    A notebook shows how many rows of each paper have which verdict, and all rows folded below.
+
+    Attributes
+    ----------
+    pages : dict
+        {paper: {"citation", "notes", "rows"}}, as `jaxtank compare PAPER --json` has them.
+    notes : tuple of str
+        Warnings of the runs.
+    """
+
+    def __init__(self, pages: dict[str, dict[str, Any]], notes: tuple[str, ...] = ()):
+        self.pages, self.notes = pages, notes
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """Every row, with its paper: quantity, unit, where, published, measured, verdict, why."""
+        return [{"paper": name} | row for name, page in self.pages.items() for row in page["rows"]]
+
+    def count(self, verdict: str | None = None) -> int:
+        """Return how many rows have a verdict, or how many rows there are.
+
+        Raises InputError for a word that is no verdict.
+        """
+        if verdict is not None and verdict not in papers.VERDICTS:
+            raise unknown("verdict", verdict, papers.VERDICTS)
+        return sum(verdict in (None, row["verdict"]) for row in self.rows)
+
+    def row(self, quantity: str) -> dict[str, Any]:
+        """Return the row of a quantity, the first of that name.
+
+        Raises InputError for a quantity that no paper here has.
+        """
+        for row in self.rows:
+            if row["quantity"] == quantity:
+                return row
+        raise unknown("quantity", quantity, [row["quantity"] for row in self.rows])
+
+    def to_json(self) -> dict[str, Any]:
+        """Return {paper: page}, as `jaxtank compare all --json` prints them."""
+        return dict(self.pages)
+
+    def plot(self) -> dict[str, Any]:
+        """Return matplotlib figures {"published": measured over published, coloured by verdict}."""
+        return papers.overview(self.pages)
+
+    def _lines(self) -> list[Any]:
+        rows = [[name, *map(str, counted)] for name, counted in self._counts()]
+        return [tables.table(rows, ["paper", *papers.VERDICTS]), *self.notes]
+
+    def __str__(self) -> str:
+        return "\n".join(map(str, self._lines()))
+
+    def _repr_html_(self) -> str:
+        counts = html_table(
+            [[name, *counted] for name, counted in self._counts()], ["paper", *papers.VERDICTS]
+        )
+        folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
+        notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes)
+        return counts + "".join(folded) + notes
+
+    def _counts(self) -> list[tuple[str, list[int]]]:
+        """(paper, rows of each verdict), and their sums."""
+        found = []
+        for name, page in self.pages.items():
+            tally = Counter(row["verdict"] for row in page["rows"])
+            found.append((name, [tally[word] for word in papers.VERDICTS]))
+        sums = np.sum([counted for _, counted in found], axis=0, dtype=int)
+        return [*found, ("all", [int(n) for n in sums])] if len(found) > 1 else found
+
+
+def compare(*names: str) -> Comparison:
+    """Return what papers print beside what is measured here, a verdict for each number.
+
+    The runs take 3 to 20 s a paper; two papers run at a time.
+
+    Parameters
+    ----------
+    names : papers, as "gouta2022"; every one where none is named.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        For a paper that is unknown.
+
+    Examples
+    --------
+    >>> import jax, tuning
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> found = tuning.compare("cascaded")
+    >>> found.row("plant.rim")["verdict"], found.count("differs")
+    ('reproduced', 0)
+    """
+    chosen = list(dict.fromkeys(names)) or list(presets.PAPERS)
+    for name in chosen:
+        presets.load(name)  # which knows the nearest name
+    with warnings.catch_warnings(record=True) as noted, ThreadPoolExecutor(2) as pool:
+        warnings.simplefilter("always")
+        pages = dict(zip(chosen, pool.map(papers.measure, chosen)))
+    kept = dict.fromkeys(str(note.message) for note in noted)
+    return Comparison(pages, tuple(kept))
+
+
+def redraw(name: str) -> Any:
+    """Return a figure of a paper as a matplotlib figure of our runs, with what the paper states and
+    what is seen here below it.
+
+    Parameters
+    ----------
+    name : "PAPER/NUMBER", as `jaxtank figure` lists them.
+
+    Raises
+    ------
+    InputError
+        For a name that no figure has, and a figure that is no result.
+
+    Examples
+    --------
+    >>> import jax, tuning
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> figure = tuning.redraw("mirakhorli/3")
+    >>> figure.axes[0].get_title()
+    'memberships of input 1'
+    """
+    found = catalogue.find(name)
+    return drawing.draw(found, drawing.run(found))
+
+
+def _folded(name: str, rows: list[dict[str, Any]]) -> str:
+    """The rows of a paper, folded, each with a coloured verdict."""
+    head = "".join(
+        f"<th>{word}</th>"
+        for word in ("quantity", "unit", "published", "measured", "verdict", "where", "why")
+    )
+    body = "".join(_line(row) for row in rows)
+    return (
+        f"<details><summary>{html.escape(name)}: {len(rows)} rows</summary>"
+        f"<table><tr>{head}</tr>{body}</table></details>"
+    )
+
+
+def _line(row: dict[str, Any]) -> str:
+    word = row["verdict"]
+    texts = [row["quantity"], row["unit"], _number(row["published"]), _number(row["measured"])]
+    start = "".join(f"<td>{html.escape(str(cell))}</td>" for cell in texts)
+    end = "".join(f"<td>{html.escape(str(cell))}</td>" for cell in (row["where"], row["reason"]))
+    return f'<tr>{start}<td style="color:{COLOURS[word]}"><b>{html.escape(word)}</b></td>{end}</tr>'
+
+
+def _number(value: Any) -> str:
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else tables.numbers(value, 4)
