@@ -5,9 +5,10 @@ Imported by `jaxtank.rig`.
 
 import numpy as np
 
+from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.core.clock import Clock
-from jaxtank.core.tree import is_component, split_index, walk
+from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.disturbance_use import is_unused
 from jaxtank.rig.signals import steps
 from jaxtank.signals.inflows import InflowPulses
@@ -200,8 +201,11 @@ def _differences(case, holder, model, prefix):
     # no level depends on rims that are no physics
     vacant = () if getattr(model, "overflow", False) else ("rim", "caught")
     theirs = {name: value for name, value, _ in walk(model) if name not in vacant}
+    preset = _preset_of(case)
     for name, value, meta in walk(case.loop.plant):
         other = theirs.get(name)
+        if preset and _has(preset, f"plant.{name}", value) and _has(preset, prefix + name, other):
+            continue  # a difference that the preset itself has is meant
         if value is None or other is None or np.shape(other) != np.shape(value):
             continue
         own, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
@@ -215,6 +219,21 @@ def _differences(case, holder, model, prefix):
                 f" {here} = {_listed(own)} too (in a rig file a model that is left out follows the"
                 " plant)"
             )
+
+
+def _preset_of(case):
+    """The loop of the preset with the case's name, None where there is none."""
+    paper, _, name = case.name.partition("/")
+    cases = presets.load(paper).cases if paper in presets.PAPERS else {}
+    return cases[name].loop if name in cases else None
+
+
+def _has(loop, name, value):
+    """Whether parameter `name` of a loop has this value."""
+    try:
+        return value is not None and np.array_equal(get_value(loop, name), value)
+    except ValueError:  # InputError: the preset has no such parameter
+        return False
 
 
 def _uncertainty(case, name, value):

@@ -47,12 +47,11 @@ JUMPS = {
     )
 }
 """{case: (a kind of start, why)} that is left out."""
-TIED = {
-    "mirakhorli/hybrid": (
-        "the law's limits and the pumps' are both 0 V: moved apart, they are a kink of every sample"
-        " at rest"
-    )
-}
+TIED = dict.fromkeys(
+    ("mirakhorli/hybrid", "mirakhorli/hybrid-fitted"),
+    "the law's limits and the pumps' are both 0 V: moved apart, they are a kink of every sample"
+    " at rest",
+)
 """{case: why} every point lies on several kinks at once."""
 
 
@@ -77,12 +76,14 @@ def start(kind, rng, loop):
 
 
 def short(name):
-    """The case with a run of SAMPLES: changes of the setpoint come at once, for there is no time to
-    wait for them.
+    """The case with a run of SAMPLES, without noise: changes of the setpoint come at once, and a
+    delay is of ten samples, for there is no time to wait for them.
     """
     case = presets.find(name)
     dt = max(case.clock.dt, 0.05)  # 64 samples of 0.01 s are too short for the levels to move
     changes = {"clock.dt": dt, "clock.duration": (SAMPLES - 1) * dt}
+    if case.loop.actuator.delay:
+        changes |= {"actuator.delay": 10 * dt, "sensor.noise": 0.0}
     reference = case.loop.reference
     if isinstance(reference, Ramps):
         soon = tuple((10.0 * dt, i) for _, i in reference.changes[:2])

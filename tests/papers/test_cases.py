@@ -26,10 +26,11 @@ CONTRACT = {
     ),
     "gouta2022": (
         "enmpc chadpc pi pi-ff pid pid-ff fopi fopi-ff enmpc-printed chadpc-printed"
-        " chadpc-trapezoid"
+        " chadpc-trapezoid enmpc-fitted chadpc-fitted"
     ),
     "mirakhorli": (
         "sfc smc hybrid smc-printed lqi sfc-warm smc-warm hybrid-warm smc-printed-warm lqi-warm"
+        " smc-fitted sfc-fitted hybrid-fitted"
     ),
     "calofir": "backstepping backstepping-perturbed",
     "cascaded": "pi open-loop",
@@ -82,6 +83,41 @@ def test_names_of_the_contract():
         assert set(fields.split()) <= {
             n for n, _, _ in walk(presets.find(name).loop, kind="static")
         }
+
+
+STRONGER = {"actuator.high": 5.8, "plant.pump_gain": [1.05 * 27.43, 1.05 * 19.55]}
+RELAY = {"controller.surface": 10.0, "controller.ks": 100.0}
+ORDINARY = {  # gouta2022 notes S2.4
+    **{"plant.pump_gain": 16.7, "plant.drain": 0.66 * 0.7854, "plant.pipe": 0.66 * 0.9143},
+    **{"actuator.dead_zone": [1.5, 4.3], "actuator.delay": 0.98, "actuator.lag": 0.93},
+    **{"sensor.noise": 0.08, "x0": 0.3},
+}
+FITTED = {  # case: (the one it starts from, what is changed)
+    "gouta2022/enmpc-fitted": ("gouta2022/enmpc", ORDINARY),
+    "gouta2022/chadpc-fitted": ("gouta2022/chadpc", ORDINARY),
+    "mirakhorli/smc-fitted": ("mirakhorli/smc-printed", RELAY | STRONGER),
+    "mirakhorli/sfc-fitted": ("mirakhorli/sfc", STRONGER),
+    "mirakhorli/hybrid-fitted": (
+        "mirakhorli/hybrid",
+        RELAY
+        | STRONGER
+        | {"controller.form": "printed", "controller.switch": "sign"}
+        | {"controller.b": 3.25, "controller.w": 1.5, "controller.high": 5.8},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_a_fitted_case_is_another_one_with_what_the_notes_list(name):
+    case, (other, changes) = presets.find(name), FITTED[name]
+    wanted = rig.set_values(presets.find(other), changes)
+    assert jax.tree.structure(case.loop) == jax.tree.structure(wanted.loop)
+    for a, b in zip(jax.tree.leaves(case.loop), jax.tree.leaves(wanted.loop)):
+        np.testing.assert_array_equal(a, b)
+    assert case.free and case.clock == wanted.clock
+    assert rig.case_warnings(case) == []  # its own difference between plant and model is meant
+    far = rig.set_values(case, {"plant.pump_gain": [3.0, 3.0]})
+    assert "plant.pump_gain = [3, 3]" in rig.case_warnings(far)[0]
 
 
 @pytest.mark.slow

@@ -17,6 +17,10 @@ COARSE = {
         np.inf,
         "the law switches at every sample: a staircase in the gains (mirakhorli notes S4.2)",
     ),
+    **dict.fromkeys(
+        ("mirakhorli/smc-fitted", "mirakhorli/hybrid-fitted"),
+        (np.inf, "a relay (mirakhorli notes S7.2): a staircase in the gains"),
+    ),
     "khalid/*-constrained": (
         1e-3,
         (

@@ -1317,7 +1317,8 @@ def test_a_controller_that_does_not_fit_is_refused_by_input_validation(control, 
 
 def test_names_of_the_contract():
     cases = load("mirakhorli").cases
-    assert set(cases) == {n + suffix for n in CASES for suffix in ("", "-warm")}
+    fitted = {f"{kind}-fitted" for kind in ("smc", "sfc", "hybrid")}
+    assert set(cases) == {n + suffix for n in CASES for suffix in ("", "-warm")} | fitted
     names = jaxtank.parameters(cases["hybrid"].loop)
     assert np.shape(names["controller.K"]) == (2, 4)
     assert {f"controller.{n}" for n in ("surface", "ks", "phi", "b", "w")} <= set(names)

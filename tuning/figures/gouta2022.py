@@ -1,11 +1,10 @@
 """Figures of Gouta et al., 2022: two coupled tanks under ENMPC and CHADPC."""
 
-from jaxtank.presets.loops.gouta2022 import PAPER_LIKE
 from tuning.figures.figure import Figure, Run
 
 ENMPC = Run("ENMPC", "gouta2022/enmpc")
 CHADPC = Run("CHADPC", "gouta2022/chadpc")
-LIKE = (Run("ENMPC", "gouta2022/enmpc", PAPER_LIKE), Run("CHADPC", "gouta2022/chadpc", PAPER_LIKE))
+LIKE = (Run("ENMPC", "gouta2022/enmpc-fitted"), Run("CHADPC", "gouta2022/chadpc-fitted"))
 THIRD = (Run("CHADPC", "gouta2022/chadpc-trapezoid"),)
 BENCH = (
     "The paper measured this on its rig. Ours is a rig with dead zones, delay, lag and noise that"

@@ -1,13 +1,12 @@
 """Figures of Mirakhorli and Farrokhi, 2016: the non-minimum-phase quadruple tank."""
 
-from jaxtank.presets.loops.mirakhorli import RELAY, STRONGER, WIDE
 from tuning.figures.figure import Figure, Run
 
 PAPER = "mirakhorli"
 THREE = (
-    Run("SMC", "mirakhorli/smc-printed", {"controller.ks": 100.0, **STRONGER}),
-    Run("SFC", "mirakhorli/sfc", STRONGER),
-    Run("hybrid", "mirakhorli/hybrid", {**RELAY, **STRONGER, **WIDE}),
+    Run("SMC", "mirakhorli/smc-fitted"),
+    Run("SFC", "mirakhorli/sfc-fitted"),
+    Run("hybrid", "mirakhorli/hybrid-fitted"),
 )
 ASSUMED = (
     "The paper measured this on its rig. Pumps to 5.8 V and 5 % stronger than modelled, sliding"

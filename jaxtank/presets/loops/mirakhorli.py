@@ -3,10 +3,13 @@
 Imported by `jaxtank.presets.mirakhorli`.
 """
 
+import dataclasses
+from typing import Any
+
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.case import Free, Scenario
 from jaxtank.controllers import LQI, FuzzyBlend, SlidingMode, StateFeedback
-from jaxtank.core.tree import number
+from jaxtank.core.tree import number, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -68,18 +71,13 @@ def integral(model):
     )
 
 
-# What Table 3 needs besides what is printed (notes S7.2): pumps to 5.8 V and 5 % stronger than
-# modelled, the printed controller as a relay (ks 100 hides its chatter), memberships 3.25 +- 1.5 cm
+# the printed controller as a relay: ks 100 hides its chatter
 RELAY = {
     "controller.surface": 10.0,
     "controller.ks": 100.0,
     "controller.form": "printed",
     "controller.switch": "sign",
 }
-
-STRONGER = {"actuator.high": 5.8, "plant.pump_gain": [1.05 * 27.43, 1.05 * 19.55]}
-
-WIDE = {"controller.b": 3.25, "controller.w": 1.5, "controller.high": 5.8}
 
 SLIDING = ("controller.surface", "controller.ks", "controller.phi")
 
@@ -112,6 +110,29 @@ CONTROLLERS = {  # title, controller for a model, what `tune` changes
         ("controller.Q[4]", "controller.Q[5]", "controller.R"),
     ),
 }
+
+# cases of notes S7.2: what Table 3 needs besides what is printed
+FITTED = {"smc-fitted": "smc-printed", "sfc-fitted": "sfc", "hybrid-fitted": "hybrid"}
+
+
+def fitted(name):
+    """Return the closed loop of a case of FITTED (notes S7.2): pumps to 5.8 V and 5 % stronger than
+    modelled; the printed sliding mode as a relay; memberships of 3.25 +- 1.5 cm.
+    """
+    loop = build(FITTED[name])
+    values: dict = {"actuator.high": [5.8] * 2, "plant.pump_gain": [1.05 * 27.43, 1.05 * 19.55]}
+    if name != "sfc-fitted":
+        values |= {name: RELAY[name] for name in ("controller.surface", "controller.ks")}
+    if name == "hybrid-fitted":
+        values |= {
+            "controller.b": [3.25] * 2,
+            "controller.w": [1.5] * 2,
+            "controller.high": [5.8] * 2,
+        }
+        kind: Any = loop.controller
+        kind = dataclasses.replace(kind, form="printed", switch="sign")
+        loop = dataclasses.replace(loop, controller=kind)
+    return with_values(loop, values)
 
 
 def tuning_scenarios():
