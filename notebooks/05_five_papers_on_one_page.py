@@ -92,8 +92,8 @@ axes[0].set_ylabel("estimated disturbance [cm/s]")
 legend = figure.legend(loc="outside lower center", ncols=3)
 
 # %% [markdown]
-# With the delay the means are {{abs(means["delay of 0.05 s"][0]):.4f}} and
-# {{abs(means["delay of 0.05 s"][1]):.4f}} cm/s, with the dead zone
+# With the delay the means are at most {{np.max(np.abs(means["delay of 0.05 s"])):.5f}} cm/s in size, with
+# the dead zone
 # {{means["dead zone of 2.75 and 4.32 V"][0]:.4f}} and {{means["dead zone of 2.75 and 4.32 V"][1]:.4f}} cm/s. A
 # delay passes a constant voltage unchanged, so that it leaves no mean, whatever its length. A dead zone
 # always takes its share. Its size was chosen here to give the two means (*fitted*); what is evidence is
