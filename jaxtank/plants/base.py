@@ -20,7 +20,7 @@ class Plant(abc.ABC):
     scalars; where a class says `arrays = True`, those of many tanks are arrays.
 
     A plant has `outputs` and `rim` as fields. `TankNetwork` is one; a plant of another kind needs
-    no more than its vector field (notebook 10).
+    no more than its vector field (notebook 08).
 
     Examples
     --------

@@ -21,6 +21,7 @@ from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
 from jaxtank.plants.rigs import coupled_tanks
 from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.rows import calofir as rows
 from jaxtank.signals.setpoints import ramps
 
 A, C1, C2 = 0.0154, 1.0167e-4, 1.7253e-4  # sec. 3.1 [m^2], sec. 3.2 [m^2.5/s]
@@ -94,6 +95,7 @@ PUBLISHED = {
     "globally asymptotically stabilises": Published(
         "Proposition 2.1", "", "sec. 2", reason="needs h3 > 0, h1 > h3 and a pump without limits"
     ),
+    **rows.PUBLISHED,
 }
 
 
@@ -231,6 +233,7 @@ def measured(run):
             "from empty tanks, without a lower clip of h1 - h3, h1"
             f" {f'stays below {top:.0e}' if (top := dry.x[:, 0].max()) else 'stays at 0'} m",
         ),
+        **rows.measured(run),
     }
 
 

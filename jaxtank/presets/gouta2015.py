@@ -20,6 +20,8 @@ from jaxtank.observers import Direct, DisturbanceObserver
 from jaxtank.plants import state_coupled_four_tank
 from jaxtank.plants.hydraulics import disc
 from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.rows import gouta2015 as rows
+from jaxtank.presets.rows import robustness
 from jaxtank.signals.setpoints import ramps
 
 PRINTED_AREA = disc(15 * 2**0.5)  # D = 15 sqrt(2) cm, Table 1 [cm^2]
@@ -153,6 +155,8 @@ PUBLISHED = {
         reason="the plant is then 17 times too slow for them (notes S1)",
     ),
     "dead zone of 3 V": Published("'failure of the control test'", "", "Remark 4"),
+    **rows.PUBLISHED,
+    **robustness.PUBLISHED,
 }
 
 UNCERTAIN = {
@@ -269,6 +273,8 @@ def measured(run):
             "reproduced" if stuck > 10 * near and d.u.max() == 0 else "partly",
             f"total RMS error {stuck:.1f} cm: the pumps never start",
         ),
+        **rows.measured(run),
+        **robustness.claims(*robustness.everything(run)),
     }
 
 

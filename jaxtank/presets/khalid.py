@@ -11,6 +11,7 @@ from jaxtank.case import Case
 from jaxtank.controllers import Laguerre
 from jaxtank.presets.loops.khalid import CLOCK, CONTROLLERS, TUNABLE, build
 from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.rows import khalid as rows
 
 DEPARTURES = (
     (
@@ -76,6 +77,7 @@ PUBLISHED = {
     "Laguerre against GPC with two pumps": Published(
         "outperforms", "", "sec. V.B", reason=_SAME_RW
     ),
+    **rows.PUBLISHED,
 }
 
 UNCERTAIN = {
@@ -149,6 +151,7 @@ def measured(run):
         "controller.N": laguerre.N,
         **_horizon_claims({k: 1e3 * v[0] for k, v in error.items()}, over),
         **_laguerre_claims(error, over),
+        **rows.measured(run, edges),
     }
 
 

@@ -24,30 +24,14 @@ from jaxtank.presets.loops.mirakhorli import (
     tuning_scenarios,
 )
 from jaxtank.presets.paper import Claim, Preset, Published, verdict
+from jaxtank.presets.rows import mirakhorli as rows
+from jaxtank.presets.rows.mirakhorli import response
 
 # J of notes S3, with its weight of the total variation of the input
 COST = {"ise": 1.0, "input_deviation": 3.0, "input_travel": 0.1}
 # for the controller that chatters: its derivatives are not worth seven runs
 CHATTER_COST = {"rms_error_total": 1.0, "input_travel": 1e-3}
 
-_MISSING = (
-    "h(0), the pumps' range, the estimator of the level rates, the membership functions (Fig. 3)"
-    " and the length of the record are not given; overshoots and two settling times agree under one"
-    " set of assumptions, the rise times do not at the same time (notes S7.2)"
-)
-_LMSE = (
-    "the mean square error is not defined; ours is the mean of e^2 over 400 s, as a share of the"
-    " setpoint squared (notes S3)"
-)
-_CHOSEN = "the assumptions of notes S7.2 were chosen to come near Table 3"
-_TABLE = "Table 3, tank 1"
-
-TABLE_3 = {  # unit; SMC, SFC, hybrid
-    "overshoot": ("%", 44.16, 10.0, 13.33),
-    "rise time": ("s", 66.0, 80.0, 65.0),
-    "settling time": ("s", "none", 120.0, 90.0),
-    "LMSE": ("", 0.4275, 0.0339, 0.0331),
-}
 PUBLISHED = {
     "plant.split": Published(SPLIT, "-", "Table 1"),
     "plant.pump_gain": Published((27.43, 19.55), "cm^3/(s V)", "Table 1"),
@@ -79,14 +63,7 @@ PUBLISHED = {
     "fit of the model": Published(
         84.0, "%", "sec. 3", reason="the record and Appendix I are not available"
     ),
-    **{
-        f"{name}, {controller}": Published(
-            value, unit, _TABLE, reason=_LMSE if name == "LMSE" else _MISSING, fitted=_CHOSEN
-        )
-        for name, (unit, *values) in TABLE_3.items()
-        for controller, value in zip(("SMC", "SFC", "hybrid"), values)
-    },
-    "SFC rises more slowly": Published("than SMC and hybrid", "", "sec. 6, Table 3"),
+    **rows.PUBLISHED,
     "chattering of the SMC": Published("undesirable; none with the hybrid", "", "sec. 6, Fig. 7"),
     "30 % change of an outlet": Published(
         "hits the SFC much more than the hybrid",
@@ -152,50 +129,6 @@ DEPARTURES = (
 )
 
 
-def response(trajectory, output=0):
-    """Return the characteristics of a step from the steady state to SETPOINT (notes S3).
-
-    Parameters
-    ----------
-    trajectory : Trajectory as host arrays
-    output : index of the output
-
-    Returns
-    -------
-    {"overshoot" [% of the setpoint], "rise" from 10 to 90 % [s], "arrival" first at the setpoint
-    [s], "settling" last outside 5 % of it [s], "mean_square" of the error over the square of the
-    setpoint [-]}; a time that does not exist is None.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> t = np.arange(0.0, 100.0)
-    >>> run = SimpleNamespace(t=t, x=12.0 * (1.0 - np.exp(-t / 10.0))[:, None])
-    >>> response(run)["rise"], response(run)["settling"]
-    (22.0, 29.0)
-    """
-    t, h, r = trajectory.t, trajectory.x[:, output], SETPOINT[output]
-
-    def first(level):
-        return float(t[np.argmax(h >= level)]) if np.any(h >= level) else None
-
-    low, high = (first(h[0] + share * (r - h[0])) for share in (0.1, 0.9))
-    outside = np.flatnonzero(np.abs(h - r) > 0.05 * r)
-    return {
-        "overshoot": float(100.0 * (h.max() - r) / r),
-        "rise": None if high is None or low is None else high - low,
-        "arrival": first(r),
-        "settling": (
-            None
-            if outside.size and outside[-1] == len(t) - 1
-            else float(t[outside[-1]])
-            if outside.size
-            else 0.0
-        ),
-        "mean_square": float(np.mean((h - r) ** 2) / r**2),
-    }
-
-
 def steady_error(run, kind, values):
     """Return the mean error (2,) [cm] of the last 100 s of 400 s.
 
@@ -210,16 +143,6 @@ def steady_error(run, kind, values):
     return run(kind, {**start, **values})[1].e[-1000:].mean(axis=0)
 
 
-QUANTITIES = {  # of `response`: what Table 3 calls it, and its unit
-    "overshoot": ("overshoot", " %"),
-    "arrival": ("rise time", " s"),
-    "settling": ("settling time", " s"),
-    "mean_square": ("LMSE", ""),
-}
-SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("hybrid",)}
-"""{controller of Table 3: our cases}."""
-
-
 def measured(run):
     """Return what can be measured of PUBLISHED (see `jaxtank.presets.paper.Preset`)."""
     assumed = {
@@ -227,42 +150,12 @@ def measured(run):
         "SFC": response(run("sfc", STRONGER)[1]),
         "hybrid": response(run("hybrid", {**RELAY, **STRONGER, **WIDE})[1]),
     }
-    rise = {name: found["arrival"] for name, found in assumed.items()}
     return {
-        **_table_3(run, assumed),
+        **rows.measured(run, assumed),
         "gamma1 + gamma2": float(np.sum(run("sfc")[0].loop.plant.split)),
-        "SFC rises more slowly": Claim(
-            verdict(max(rise["SMC"], rise["hybrid"]) < rise["SFC"]),
-            "; ".join(f"{name} {_text(value, ' s')}" for name, value in rise.items())
-            + " under the assumptions of notes S7.2",
-        ),
         "chattering of the SMC": _chattering(run),
         **_steady_errors(run),
     }
-
-
-def _text(value, unit):
-    return "never" if value is None else f"{value:.3g}{unit}"
-
-
-def _table_3(run, assumed):
-    """A claim for each number of Table 3; assumed: responses with what notes S7.2 assumes."""
-    own, found = {kind: response(run(kind)[1]) for kind in CONTROLLERS}, {}
-    for quantity, (name, unit) in QUANTITIES.items():
-        for controller, cases in SAME_CONTROLLER.items():
-            value = assumed[controller][quantity]
-            printed = PUBLISHED[f"{name}, {controller}"].value
-            if value is None or isinstance(printed, str):  # it never settles
-                near = value is None and isinstance(printed, str)
-            else:
-                near = abs(value - printed) <= 0.11 * printed
-            others = ", ".join(f"{_text(own[case][quantity], unit)} in {case}" for case in cases)
-            found[f"{name}, {controller}"] = Claim(
-                # never simply "reproduced": the assumptions were chosen for it
-                "partly" if near else "not reproduced",
-                f"{_text(value, unit)} under the assumptions of notes S7.2; {others}",
-            )
-    return found
 
 
 def _chattering(run):
@@ -288,6 +181,7 @@ def _steady_errors(run):
         for kind, more in (("sfc", {}), ("hybrid", relay))
     )
     pump = {kind: steady_error(run, kind, stronger) for kind in ("sfc", "hybrid", "lqi")}
+    parked = np.abs(steady_error(run, "hybrid", {**narrow, **relay}))
     exact = float(np.abs(steady_error(run, "sfc", {})).max())
     spared = abs(hybrid) < 0.7 * abs(sfc) and abs(pump["hybrid"][1]) < 0.7 * abs(pump["sfc"][1])
     offset = max(map(abs, pump["sfc"])) > 0.01
@@ -298,6 +192,11 @@ def _steady_errors(run):
             " hybrid of the printed controller (b 3, w 1; 12 cm has no steady state then); pump 1"
             f" stronger by 30 %: tank 2 {pump['sfc'][1]:+.2f} and {pump['hybrid'][1]:+.2f} cm"
             " (corrected controller, b 1, w 0.5)",
+        ),
+        "hybrid switches between the controllers": Claim(
+            verdict(bool(np.all((parked > 2.0) & (parked < 4.0)))),
+            "outlet of tank 1 narrower by 30 %: the errors stay at {:.2f} and {:.2f} cm, between 2"
+            " and 4 cm, where both controllers have a share".format(*parked),
         ),
         "zero steady-state error of the SFC": Claim(
             "not reproduced" if exact > 0.01 else "partly" if offset else "reproduced",

@@ -383,7 +383,7 @@ def test_the_sdist_holds_what_builds_and_tests_it(built):
     assert {
         "tests/benchmarks/README.md",
         "notebooks/README.md",
-        "notebooks/images/tuned.gif",
+        "notebooks/images/filter.gif",
     } <= names
     assert not any("__pycache__" in n or n.endswith((".pyc", ".so", ".log")) for n in names)
 

@@ -4,7 +4,7 @@ without, on 200 plants.
     python tests/benchmarks/observers.py               # the table
     python tests/benchmarks/observers.py --markdown    # the same, into README.md here
 
-gouta2015: the plants of `robustness_table` (its sec. 5.3), c1, c2, c3, c7, c8 off by up to 5 and
+gouta2015: the plants of its sec. 5.3 in `jaxtank compare`, c1, c2, c3, c7, c8 off by up to 5 and
 10 %, ramps of 30 s, steps of 0.02 s. mirakhorli: outlets, orifices and pumps off by up to 5 and
 10 %, each by its own share. The first plateau of gouta2015, 20 s from a start that is no steady
 state of the wrong plants, is left out. No noise.
@@ -18,15 +18,15 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import robustness_table
-from robustness_table import SPREADS, N
 
 import tuning
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import number, with_values
 from jaxtank.loop import run as lp
 from jaxtank.observers import DisturbanceObserver
+from jaxtank.presets.rows import robustness
+from jaxtank.presets.rows.robustness import SPREADS, N
 
 GAIN = 0.5  # l of every tank: that of gouta2015/ngpc-observer [1/s]
 CASES = (
@@ -60,11 +60,10 @@ class Row(NamedTuple):
 
 def plants_of(name, spread):
     """(Case, {name: (N, ...)} of its plants, times of the plateaus' ends [s])."""
-    paper, controller = name.split("/")
-    if paper == "gouta2015":
-        case = robustness_table.case_of(controller)
-        values = robustness_table.coefficients(case.loop.plant, spread)
-        return case, values, robustness_table.CHANGES[1:]
+    if name.startswith("gouta2015/"):
+        case = rig.set_values(presets.find(name), robustness.SETTING)
+        values = robustness.coefficients(case.loop.plant, spread)
+        return case, values, robustness.CHANGES[1:]
     case, rng = presets.find(name), np.random.default_rng(2015)
     fields = {n: np.asarray(getattr(case.loop.plant, n)) for n in ("drain", "orifice", "pump_gain")}
     off = {n: rng.uniform(1 - spread, 1 + spread, (N, *v.shape)) for n, v in fields.items()}

@@ -3,6 +3,7 @@ form of the law.
 """
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -521,7 +522,13 @@ def test_what_is_measured():
         *["reproduced"] * 3,
         "partly",
         "not reproduced",
+        "partly",
+        *["reproduced"] * 3,
     ]
+    # settling times and saturated shares of notes S7.1, measured on another loop
+    assert found["larger gains settle sooner"].text.endswith("271 s, 179 s, 139 s, 193 s")
+    shares = re.findall(r"([\d.]+) %", found["larger gains saturate the pump"].text)
+    np.testing.assert_allclose(list(map(float, shares)), (0.0, 5.92, 12.5, 18.75), atol=0.3)
     # the constant flow of notes S7.1, measured
     assert "-0.0395 and -0.0490 m" in found["some steady state errors"].text
 

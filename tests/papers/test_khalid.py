@@ -8,6 +8,7 @@ qpOASES. Tolerances are theirs: RMS error 1e-4 m, overshoot 0.15 points, settlin
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.flatten_util
@@ -1038,7 +1039,18 @@ def test_published_claims_are_measured():
     found = paper.measured(run)
     assert set(found) == set(PRESET.published)
     for name, published in PRESET.published.items():
-        if not isinstance(published.value, str):
+        if not isinstance(published.value, str) and not name.startswith("pulses of"):
             np.testing.assert_allclose(found[name], published.value, rtol=1e-12)
+    assert found["pulses of H2, one pump"] == (0.03, 0.15)
     verdicts = [claim.verdict for claim in found.values() if hasattr(claim, "verdict")]
-    assert verdicts == ["partly", "reproduced", "partly", "partly", "reproduced", "not reproduced"]
+    assert verdicts == [
+        *("partly", "reproduced", "partly", "partly", "reproduced", "not reproduced"),
+        *("reproduced", "partly", "partly", "reproduced", "partly", "partly", "not reproduced"),
+    ]
+    # scenarios S1 and M1 of notes S7.2 and S7.3
+    text = found["pulses from 0 m: long control horizon"].text
+    horizon = [float(v) for v in re.findall(r"([\d.]+) mm", text)]
+    np.testing.assert_allclose(horizon, (33.99, 28.37), atol=0.1)
+    assert "overshoot 0.08, 8.18, 8.57 %" in found["pulses from 0 m: overshoot and undershoot"].text
+    both = found["pulses from 0 m: Laguerre with two pumps"].text
+    assert "15.56, 19.69 mm and 4.6, 3.9 % with Laguerre functions" in both

@@ -5,11 +5,14 @@ intervals.
 import numpy as np
 import observers
 import pytest
-import robustness_table
-from robustness_table import N, Row, interval, verdict
+from scipy.stats import beta
 
 import jaxtank
+from jaxtank import presets, rig
 from jaxtank.core.tree import with_values
+from jaxtank.presets.rows import robustness
+from jaxtank.presets.rows.robustness import CONTROLLERS, N, interval, verdict
+from tuning.report.papers import runner
 
 # law, spread, mean, sd, p5, p50, p95 of the total RMS error [cm], mean largest error at the
 # plateaus' ends [cm]
@@ -23,7 +26,7 @@ ROWS = [
 
 @pytest.fixture(scope="module")
 def everything():
-    return robustness_table.everything()
+    return robustness.everything(runner("gouta2015"))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +53,7 @@ def test_rows_of_the_study(everything, errors, controller, spread, mean, sd, p05
         low, high = np.quantile(values, (max(0.0, p - half), min(1.0, p + half)))
         assert low <= expected <= high
     found = everything[0][controller, spread]
-    ends = [round(t / robustness_table.EVERY) for t in robustness_table.CHANGES]
+    ends = [round(t / robustness.EVERY) for t in robustness.CHANGES]
     worst = np.abs(found.errors[:, ends]).max(axis=(1, 2))
     assert worst.mean() == pytest.approx(rest, abs=3 * worst.std() * np.sqrt(2 / N))
 
@@ -77,8 +80,8 @@ def test_backstepping_degrades_relatively_less_and_predictive_control_is_better(
 
 @pytest.mark.slow
 def test_runs_of_the_table_are_those_of_the_library(everything):
-    case = robustness_table.case_of("ngpc")
-    values = robustness_table.coefficients(case.loop.plant, 0.10)
+    case = rig.set_values(presets.find("gouta2015/ngpc"), robustness.SETTING)
+    values = robustness.coefficients(case.loop.plant, 0.10)
     i = int(np.argmax((values["plant.drain"] >= 0).all(axis=1)))  # a plant that the door lets in
     t = jaxtank.simulate(with_values(case.loop, {n: v[i] for n, v in values.items()}), case.clock)
     found = everything[0]["ngpc", 0.10]
@@ -91,7 +94,7 @@ def test_runs_of_the_table_are_those_of_the_library(everything):
         found.measures["input_travel"][i], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-8
     )
     np.testing.assert_allclose(found.errors[i], e[::25], atol=1e-9)
-    row = robustness_table.window(found, 0, 270.0, 470.0)[i]
+    row = robustness.window(found, 0, 270.0, 470.0)[i]
     assert (
         row == np.abs(found.errors[i, 540:940, 0]).max()
         and np.asarray(t.r)[::25][540, 1] < np.asarray(t.r)[::25][620, 1]
@@ -100,23 +103,15 @@ def test_runs_of_the_table_are_those_of_the_library(everything):
 
 @pytest.mark.slow
 def test_claims_of_the_paper(everything):
-    """What is borne out, and what is not; benchmarks/README.md says the same."""
-    table = robustness_table.rows(*everything)
-    held = {row.claim: row.holds for row in table}
-    assert {c for c, h in held.items() if h != "yes"} == {
-        "more robust: the smaller error",
-        "compensate the steady-state error",
-        "feasible trajectories (30 cm)",
-    } and "not settled" not in held.values()
-    page = robustness_table.README.read_text()
-    lines = (
-        page.split(robustness_table.BEGIN)[1].split(robustness_table.END)[0].strip().splitlines()
-    )
-    printed = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines[2:]]
-    assert [(cells[0], cells[1], cells[-1]) for cells in printed] == [
-        (r.claim, r.paper, r.holds) for r in table
-    ]
-    assert all(len(r.measured) == len(robustness_table.SPREADS) for r in table)
+    """What holds, and what does not: every claim of the preset is measured, none is left open."""
+    claims = robustness.claims(*everything)
+    assert set(claims) == set(robustness.PUBLISHED)
+    held = {name: claim.verdict for name, claim in claims.items()}
+    assert {name for name, word in held.items() if word == "not reproduced"} == {
+        f"uncertain plants: {what}"
+        for what in ("size of the error", "steady error", "feasible trajectories")
+    } and "partly" not in held.values()
+    assert all(text.count("% off: ") == 2 for _, text in claims.values())
 
 
 @pytest.mark.slow
@@ -132,8 +127,34 @@ def test_intervals_and_verdicts():
     rng = np.random.default_rng(5)
     estimate, low, high = interval(rng.normal(1.0, 2.0, 400))
     assert (high - low) / 2 == pytest.approx(1.96 * 2.0 / 20, rel=0.12) and low < estimate < high
-    assert verdict([(1, 0.5, 2), (1, 0.1, 2)]) == "yes" and verdict([(-1, -2, -0.5)]) == "no"
-    assert verdict([(1, 0.5, 2), (1, -0.1, 2)]) == "not settled"
-    assert "| a | b | 1 | 2 | yes |" in robustness_table.markdown(
-        [Row("a", "b", ("1", "2"), "yes")]
-    )
+    assert verdict([(1, 0.5, 2), (1, 0.1, 2)]) == "reproduced"
+    assert verdict([(-1, -2, -0.5)]) == "not reproduced"
+    assert verdict([(1, 0.5, 2), (1, -0.1, 2)]) == "partly"
+    for count, n in ((0, 50), (13, 50), (50, 50)):  # quantiles of the beta distribution
+        low = beta.ppf(0.025, count, n - count + 1) if count else 0.0
+        high = beta.ppf(0.975, count + 1, n - count) if count < n else 1.0
+        np.testing.assert_allclose(robustness.exact(count, n), (low, high), rtol=1e-9)
+
+
+def test_each_claim_follows_from_its_numbers():
+    """On made-up runs: errors of backstepping four times those of NGPC, as on the nominal plant."""
+    rng = np.random.default_rng(1)
+    found, nominal = {}, {"ngpc": 0.1, "backstepping": 0.4}
+    for spread in robustness.SPREADS:
+        share = rng.uniform(1.0, 1.1, N)
+        for controller in CONTROLLERS:
+            size = nominal[controller] * share
+            measures = {"rms_error_total": size, "max_level": np.full((N, 4), 29.0)}
+            for name in ("rms_input", "input_travel", "overshoot_percent", "saturated_fraction"):
+                measures[name] = size[:, None] * [1.0, 1.0]
+            errors = np.zeros((N, 2401, 2)) + size[:, None, None]
+            found[controller, spread] = robustness.Found(measures, errors, np.zeros(N, dtype=bool))
+    verdicts = {
+        n.partition(": ")[2]: c.verdict for n, c in robustness.claims(found, nominal).items()
+    }
+    assert verdicts["stable loops"] == verdicts["feasible trajectories"] == "reproduced"
+    assert verdicts["precision"] == "reproduced" and verdicts["steady error"] == "not reproduced"
+    for name in ("size of the error", "growth of the error"):  # NGPC is better, growth is equal
+        assert verdicts[name] != "reproduced"
+    for name in ("overshoot", "voltage", "changes of the voltage", "time at the limits"):
+        assert verdicts[name] == "not reproduced"

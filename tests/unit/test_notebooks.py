@@ -141,7 +141,7 @@ def notebook(legend="tuned", value="error 0.297 cm\n", prose="It falls to 0.297 
         ({"value": "error 0.303 cm\n"}, "stdout"),
         ({"value": "errors 0.297 cm\n"}, "stdout"),
         ({"value": "error 0.297 cm 3\n"}, "stdout"),
-        ({"prose": "It falls to 0.31 cm."}, "text"),
+        ({"prose": "It falls to 0.320 cm."}, "text"),
         ({"prose": "It rises to 0.297 cm."}, "text"),
     ],
 )

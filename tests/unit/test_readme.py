@@ -46,7 +46,8 @@ def blocks(language, *pages):
 
 
 def words(line):
-    return tuple(shlex.split(line, comments=True)[1:])
+    command = line.partition(" >")[0]  # without the file that its output goes to
+    return tuple(shlex.split(command, comments=True)[1:])
 
 
 COMMANDS = list(

@@ -125,14 +125,21 @@ def save_run(case, run, payload, folder, gif=False, page=None, against=None, col
         from jaxtank.plots.animation import film
 
         beside = None if against is None else (against[0].loop, against[1])
-        names = (case.name,) if against is None else (case.name, against[0].name)
+        titles = _titles([case, *([] if against is None else [against[0]])])
         try:
-            moving, still = film(case.loop, run, against=beside, titles=names)
+            moving, still = film(case.loop, run, against=beside, titles=titles)
         except Exception as error:
             failed("run.gif", error)
         else:
             written += write_folder(Path(folder), {"run.gif": moving, "film.png": still})
     return written
+
+
+def _titles(cases):
+    """Names of the cases of a film, with the safety filter where not all of them have one."""
+    some = len({case.loop.safety_filter is None for case in cases}) > 1
+    filtered = lambda case: some and case.loop.safety_filter is not None
+    return tuple(case.name + ", safety filter" * filtered(case) for case in cases)
 
 
 def _for_journal(case, run, folder, columns):

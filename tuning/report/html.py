@@ -82,6 +82,7 @@ def document(
     provenance=None,
     files=None,
     live="",
+    live_last=False,
 ):
     """Return the whole page as text; the same arguments give the same bytes.
 
@@ -109,17 +110,21 @@ def document(
         {name: text} to be unfolded.
     live : str
         Element with the live page (`tuning.report.panel`), "" for none.
+    live_last : bool
+        Whether the live page follows the numbers; otherwise it comes before the words.
     """
     body = [f"<h1>{escape(title)}</h1>", f"<p>{escape(subtitle)}</p>" if subtitle else ""]
     body.append(f'<p class="status{"" if good else " warn"}">{escape(status)}</p>')
     if facts:
         cells = (f"<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>" for k, v in facts)
         body.append(f'<dl class="facts">{"".join(cells)}</dl>')
-    if live:  # wider than the text
-        body += ["</header>", *_chapter("Move its parameters", [live]), "<main>"]
+    moved = _chapter("Move its parameters", [live] if live else [])
+    if moved and not live_last:  # wider than the text
+        body += ["</header>", *moved, "<main>"]
     body += _chapter("In words", [_list(sentences)] if sentences else [])
     body += _chapter("Pictures", [_figure(*picture) for picture in pictures])
     body += _chapter("Numbers", [_part(p) for p in _grouped(parts)])
+    body += moved if live_last else []
     for name, text in (files or {}).items():
         folded = f"<summary>{escape(name)}</summary><pre>{escape(text)}</pre>"
         body.append(f"<details>{folded}</details>")
@@ -132,7 +137,7 @@ def document(
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>",
-            "<header>" if live else "<main>",
+            "<header>" if live and not live_last else "<main>",
             *filter(None, body),
             "</main>\n</body>\n</html>\n",
         ]

@@ -228,6 +228,7 @@ def save(pages, folder, command=None):
             command,
             {"jaxtank": jaxtank.__version__, "jax": jax.__version__, "numpy": np.__version__},
             live="\n".join(panel(next(iter(presets.load(p).cases.values()))) for p in pages),
+            live_last=True,
         )
 
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]

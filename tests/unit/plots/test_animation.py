@@ -17,6 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.plants import network
 from jaxtank.plots import animation, style
 from jaxtank.plots import run as run_plots
+from tuning.report import artifacts
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +165,13 @@ def test_simulate_writes_one_where_asked(tmp_path, capsys):
     assert main.main([*asked, "--against", "cascaded/pi"]) == 0
     assert matplotlib.image.imread(tmp_path / "out" / "run.gif").shape[1] > 1.5 * alone[1]
     assert matplotlib.image.imread(tmp_path / "out" / "film.png").size > 0
+
+
+def test_titles_of_a_film_mention_the_safety_filter_where_one_rig_has_it():
+    case = lambda safety: SimpleNamespace(name="a/b", loop=SimpleNamespace(safety_filter=safety))
+    assert artifacts._titles([case(None), case(1)]) == ("a/b", "a/b, safety filter")
+    assert artifacts._titles([case(1), case(1)]) == ("a/b", "a/b")
+    assert artifacts._titles([case(None)]) == ("a/b",)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,85 @@
+"""calofir, secs. 2 to 5: further rows of `jaxtank compare`. Imported by the preset of calofir."""
+
+import numpy as np
+
+from jaxtank.presets.paper import Claim, Published, verdict
+
+GAINS = ((0.01, 0.01), (0.02, 0.02), (0.02, 0.1), (0.1, 0.1))  # K_phi, K_y of notes S7.1 [1/s]
+PUBLISHED = {
+    "controller.K_phi and controller.K_y": Published(
+        "chosen by experiment",
+        "1/s",
+        "sec. 2",
+        reason="no values are printed; ours follow from overshoot (notes S4.3)",
+    ),
+    "larger gains settle sooner": Published(
+        "larger K_y and K_phi reduce the settling time",
+        "",
+        "sec. 2",
+        reason="up to 0.02 and 0.1 1/s; beyond, h1 overshoots, since h3 is regulated, and takes"
+        " longer (notes S4.3)",
+    ),
+    "larger gains saturate the pump": Published(
+        "the input grows, and is often limited", "", "sec. 2"
+    ),
+    "level of the second tank": Published("has the same characteristic", "", "sec. 4, Fig. 2"),
+    "needs an exact model": Published("requires it", "", "sec. 5"),
+    "faults of Fig. 3": Published(
+        "some faults", "", "sec. 4, Fig. 3", reason="neither described nor quantified (notes A3)"
+    ),
+    "equations as printed": Published(
+        "eqs. (12)-(21)",
+        "",
+        "sec. 3",
+        reason="they contradict each other: (12a) has no steady state, (20) defines v and calls it"
+        " phi; no controller follows from them (notes S5)",
+    ),
+}
+
+
+def settling(trajectory):
+    """Return when h1 has entered 2 % of its first step for the last time [s]."""
+    first = trajectory.e[:600, 0]
+    step = abs(float(trajectory.r[0, 0] - trajectory.x[0, 0]))
+    outside = np.flatnonzero(np.abs(first) > 0.02 * step)
+    return float(trajectory.t[outside[-1] + 1]) if outside.size else 0.0
+
+
+def measured(run):
+    """Return {quantity: Claim} of PUBLISHED, but for what cannot be measured."""
+    case, plain = run("backstepping")
+    runs = [run("backstepping", _gains(*pair))[1] for pair in GAINS]
+    times = [settling(t) for t in runs]
+    limits = [float(case.loop.actuator.low[0]), float(case.loop.actuator.high[0])]
+    full = [100.0 * float(np.isin(t.u, limits).mean()) for t in runs]
+    sooner = np.diff(times) < 0.0
+    listed = ", ".join(f"{a:g} and {b:g} 1/s" for a, b in GAINS)
+    drain = np.asarray(case.loop.plant.drain)
+    off = run("backstepping", {"plant.drain": (0.75 * drain).tolist()})[1]
+    ends = np.abs(off.e[[599, 1199], 0])
+    share = plain.x[[599, 1199], 1] / plain.x[[599, 1199], 0]
+    alike = float(np.corrcoef(plain.x[:, 0], plain.x[:, 1])[0, 1])
+    return {
+        "larger gains settle sooner": Claim(
+            "partly" if sooner.any() and not sooner.all() else verdict(bool(sooner.all())),
+            f"step to 0.48 m with {listed}: {', '.join(f'{t:.0f} s' for t in times)}",
+        ),
+        "larger gains saturate the pump": Claim(
+            verdict(bool(np.all(np.diff(full) >= 0.0)) and full[-1] > full[0]),
+            f"at a limit with {listed}: {', '.join(f'{s:.3g} %' for s in full)} of the time",
+        ),
+        "level of the second tank": Claim(
+            verdict(alike > 0.9 and abs(share[0] / share[1] - 1.0) < 0.01),
+            f"correlation with h1 {alike:.3f}; h3/h1 {share[0]:.4f} and {share[1]:.4f} at the ends"
+            " of the plateaus",
+        ),
+        "needs an exact model": Claim(
+            verdict(ends.max() > 1e-3),
+            f"c2 smaller by 25 % than in the model leaves {ends[0]:.4f} and {ends[1]:.4f} m (counts"
+            " if above 0.001 m)",
+        ),
+    }
+
+
+def _gains(phi, y):
+    return {"controller.K_phi": phi, "controller.K_y": y}

@@ -1,0 +1,166 @@
+"""khalid, sec. V: further rows of `jaxtank compare`, of the pulses from 0 m as printed.
+
+Imported by the preset of khalid.
+"""
+
+import numpy as np
+
+from jaxtank.presets.loops.khalid import scenario
+from jaxtank.presets.paper import Claim, Published, verdict
+
+_OURS = "at 0 m gravity alone decides: the cases run between levels that a pump can hold (notes S3)"
+_WHERE = "sec. V.A, Figs. 2-5"
+PUBLISHED = {
+    "pulses of H2, one pump": Published((0.0, 0.12), "m", "sec. V.A", reason=_OURS),
+    "pulses of H1 and H2, two pumps": Published(
+        (0.0, 0.12, 0.0, 0.15), "m", "sec. V.B", None, _OURS
+    ),
+    "controller.N, two pumps": Published(4, "-", "sec. V.B"),
+    "computational cost of Laguerre": Published("reduced", "", "sec. V.A, conclusion"),
+    "undershoot against control horizon": Published(
+        "not eliminated by any", "", "sec. V.A", reason="true of 10 and 30, not of 2 (notes S8)"
+    ),
+    "pulses from 0 m: long control horizon": Published(
+        "improves performance",
+        "",
+        _WHERE,
+        reason="the error falls and the overshoot grows (notes S8)",
+    ),
+    "pulses from 0 m: control horizon beyond 10": Published("not much improvement", "", _WHERE),
+    "pulses from 0 m: overshoot and undershoot": Published(
+        "lots of both, with every control horizon",
+        "",
+        _WHERE,
+        reason="no level falls below an empty tank: undershoots of Figs. 2-4 are of deviations, or"
+        " of a model without an end at 0 m (notes H3)",
+    ),
+    "pulses from 0 m: overshoot of Laguerre": Published(
+        "reduced considerably against GPC 30",
+        "",
+        "sec. V.A, Fig. 5",
+        reason="r_w is not printed; at the same r_w little changes (notes S8)",
+    ),
+    "pulses from 0 m: Laguerre with two pumps": Published(
+        "outperforms GPC",
+        "",
+        "sec. V.B, Figs. 6-7",
+        reason="they are equal at the same r_w, with 8 variables for 20 (notes S8)",
+    ),
+}
+SISO = ("gpc-nc2", "gpc", "gpc-nc30", "laguerre")
+MIMO = ("gpc-mimo", "laguerre-mimo")
+
+
+def from_empty(name):
+    """Return the values that make scenario `name` of notes S3 of a case with its pumps.
+
+    Examples
+    --------
+    >>> from_empty("S1")["reference.targets"]
+    [0.12, 0.0, 0.12, 0.0]
+    """
+    reference, x0, u0 = scenario(name)
+    return {
+        "reference.initial": np.asarray(reference.initial).tolist(),
+        "reference.targets": np.asarray(reference.targets).tolist(),
+        "x0": np.asarray(x0).tolist(),
+        "actuator.initial": np.asarray(u0).tolist(),
+    }
+
+
+def measured(run, edges):
+    """Return {quantity: what was found} of PUBLISHED; edges: of `jaxtank.presets.khalid`."""
+    error, over, under = {}, {}, {}  # RMS [mm], overshoot and undershoot [%] of each output
+    for names, start in ((SISO, "S1"), (MIMO, "M1")):
+        for name in names:
+            case, t = run(name, from_empty(start))
+            found = edges(case.loop.reference, t)
+            error[name] = 1e3 * np.sqrt((t.e**2).mean(axis=0))
+            over[name] = [channel["overshoot"][0] for channel in found]
+            under[name] = [channel["overshoot"][1] for channel in found]
+    return {**_sizes(run), **_undershoot(run, edges), **_from_empty(error, over, under)}
+
+
+def _pulses(case):
+    """(low, high) of each output's pulses [m]."""
+    reference = case.loop.reference
+    levels = [
+        [float(v) for (_, i), v in zip(reference.changes, reference.targets) if i == output]
+        for output in range(reference.channels)
+    ]
+    return tuple(v for one in levels for v in (min(one), max(one)))
+
+
+def _sizes(run):
+    """The pulses of our cases, and the variables of the programmes."""
+    loops = {name: run(name, {"clock.substeps": 2})[0].loop for name in (*SISO, *MIMO)}
+    count = {
+        name: loop.plant.pumps * getattr(loop.controller, "N", getattr(loop.controller, "Nc", 0))
+        for name, loop in loops.items()
+    }
+    return {
+        "pulses of H2, one pump": _pulses(run("gpc", {"clock.substeps": 2})[0]),
+        "pulses of H1 and H2, two pumps": _pulses(run("gpc-mimo", {"clock.substeps": 2})[0]),
+        "controller.N, two pumps": loops["laguerre-mimo"].controller.N,
+        "computational cost of Laguerre": Claim(
+            verdict(
+                count["laguerre"] < count["gpc"] and count["laguerre-mimo"] < count["gpc-mimo"]
+            ),
+            "variables of a programme: {} for {} of GPC with one pump, {} for {} with two".format(
+                *(count[n] for n in ("laguerre", "gpc", "laguerre-mimo", "gpc-mimo"))
+            ),
+        ),
+    }
+
+
+def _undershoot(run, edges):
+    """The undershoot at falling edges of the cases' own pulses [%]."""
+    under = {}
+    for name in SISO[:3]:
+        case, t = run(name, {"clock.substeps": 2})
+        under[name] = edges(case.loop.reference, t)[0]["overshoot"][1]
+    some = [value > 1.0 for value in under.values()]
+    return {
+        "undershoot against control horizon": Claim(
+            "partly" if any(some) and not all(some) else verdict(all(some)),
+            "below the lower level with Nc 2, 10, 30: "
+            + ", ".join(f"{value:.2f} %" for value in under.values())
+            + " of the step (counts if above 1 %)",
+        )
+    }
+
+
+def _from_empty(error, over, under):
+    """The claims on pulses from 0 m."""
+    one = [error[name][0] for name in SISO]
+    top = [over[name][0] for name in SISO]
+    low = max(under[name][0] for name in SISO)
+    gain = 1.0 - top[3] / top[2]
+    apart = float(np.abs(error["laguerre-mimo"] / error["gpc-mimo"] - 1.0).max())
+    both = "; ".join(
+        "{:.2f}, {:.2f} mm and {:.1f}, {:.1f} % with {}".format(*error[n], *over[n], shown)
+        for n, shown in zip(MIMO, ("GPC", "Laguerre functions"))
+    )
+    return {
+        "pulses from 0 m: long control horizon": Claim(
+            "partly" if one[1] < one[0] and top[1] > top[0] else verdict(one[1] < one[0]),
+            f"RMS error {one[0]:.2f} mm with Nc 2, {one[1]:.2f} mm with Nc 10; overshoot"
+            f" {top[0]:.2f} and {top[1]:.2f} %",
+        ),
+        "pulses from 0 m: control horizon beyond 10": Claim(
+            verdict(one[2] > 0.95 * one[1]),
+            f"RMS error {one[1]:.2f} mm with Nc 10, {one[2]:.2f} mm with Nc 30",
+        ),
+        "pulses from 0 m: overshoot and undershoot": Claim(
+            "partly" if max(top) > 5.0 else "not reproduced",
+            f"overshoot {top[0]:.2f}, {top[1]:.2f}, {top[2]:.2f} % with Nc 2, 10, 30; undershoot at"
+            f" most {low:.2g} %",
+        ),
+        "pulses from 0 m: overshoot of Laguerre": Claim(
+            "partly" if 0.0 < gain < 0.2 else verdict(gain >= 0.2),
+            f"{top[3]:.2f} % against {top[2]:.2f} %: {100 * gain:.0f} % less at the same r_w",
+        ),
+        "pulses from 0 m: Laguerre with two pumps": Claim(
+            "not reproduced" if apart < 0.02 else "partly", f"RMS errors and overshoots {both}"
+        ),
+    }

@@ -1,0 +1,194 @@
+# %% [markdown]
+# # What a limit costs
+#
+# **Question:** A tank is made lower. Who pays for it in tracking error: the gains, a filter, or nobody,
+# because even the best conceivable input needs the height?
+#
+# The rig is the four-tank rig of [Gouta, Hadj Said and M'sahli
+# (2015)](https://doi.org/10.1016/j.jfranklin.2015.08.004) under backstepping, with samples of 0.1 s.
+#
+# Run time: about {{run_time}} s. {{links}}
+
+# %%
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxtank
+import tuning
+from jaxtank.plots.style import FILTERED, PUBLISHED, REFERENCE, RIM, TUNED
+
+jaxtank.notebook()
+
+# %% [markdown]
+# ## Two gains, one map
+#
+# The error is the root of the mean squared error of both outputs, summed,
+#
+# $$J(k, k_1) = \sqrt{\overline{e_1^2}} + \sqrt{\overline{e_2^2}},$$
+#
+# and the limit is on the highest level of any tank, $\max_{i,t} h_i(t) \le H$. With two gains both can
+# be drawn: 900 runs, one call.
+
+# %%
+case = jaxtank.presets.find("gouta2015/backstepping")
+case = jaxtank.rig.set_values(case, {"clock.dt": 0.1})
+names = ["rms_error_total", "max_level"]
+
+
+@jax.jit
+@jax.vmap
+def outcome(k, k1):
+    loop = jaxtank.with_values(case.loop, {"controller.k": k, "controller.k1": k1})
+    values = jaxtank.evaluate(loop, case.clock, names)
+    return values["rms_error_total"], values["max_level"].max()
+
+
+# %%
+k, k1 = np.meshgrid(np.geomspace(1e-3, 5.0, 30), np.geomspace(5e-3, 5.0, 30))
+error, highest = (np.reshape(v, k.shape) for v in outcome(k.ravel(), k1.ravel()))
+
+# %% [markdown]
+# **Guess first:** colours are the error, lines the highest level. Do the lines run along the colours,
+# or across?
+
+# %%
+fig, ax = plt.subplots(figsize=(6.6, 4.2), layout="constrained")
+ax.set(xscale="log", yscale="log", xlabel="k [1/s]", ylabel="k1 [1/s]")
+cuts = np.geomspace(error.min(), error.max(), 20)
+filled = ax.contourf(k, k1, error, cuts, cmap="cividis_r", norm="log")
+fig.colorbar(filled, label="tracking error, rms [cm]", format="%.2g")
+lines = ax.contour(k, k1, highest, [29, 30, 32, 34, 36], colors="black", linewidths=[1, 2, 1, 1, 1])
+ax.clabel(lines, fmt="%g cm")
+ax.plot(0.03, 0.088, "s", color=PUBLISHED, markeredgecolor="white", label="published")
+ax.legend(loc="lower left", labelcolor="white");
+
+# %% [markdown]
+# Along them, but for small $k$. Whatever the gains, a small error comes with a high level: there is
+# little to choose.
+# The published gains have {{(v := jaxtank.evaluate(case.loop, case.clock, names))["rms_error_total"]:.2f}} cm
+# and a level of {{float(v["max_level"].max()):.1f}} cm in tanks of 30 cm.
+#
+# ## Three ways to pay
+#
+# - **Gains**: for each height $H$, the gains with the least error under the limit
+#   (`tuning.tradeoff`; its searches use the exact derivative of the highest level).
+# - **A filter**: gains that follow well, and caps on the pumps only where a level comes near $H$
+#   (notebook 04).
+# - **Physics**: the best input that there is, found with the whole reference known in advance
+#   (`tuning.bound`). No controller can be better, except by what it gains between the 4 s for which
+#   each input is held here.
+
+# %%
+free = {"controller.k": (1e-3, 5.0), "controller.k1": (1e-3, 5.0)}
+heights = np.array([24.0, 26.0, 28.0, 30.0, 31.0, 32.0, 33.0, 34.0])
+curve = tuning.tradeoff(case, "max_level", heights[3:], free=free, limits={})["points"]
+gains = {point["limit"]: point["objective"] for point in curve}
+curve_at = next(point["parameters"] for point in curve if point["limit"] == 30.0)
+best = {H: tuning.bound(case, limits={"max_level": H}, interval=4.0, iterations=60).cost
+        for H in (24.0, 28.0, 30.0, 34.0)}
+
+# %%
+fast = jaxtank.rig.set_values(case, {"controller.k": 1.34, "controller.k1": 1.79})
+
+
+def capped(H):
+    held = fast.with_safety_filter(limit=[30.0, 30.0, H, H])
+    return float(jaxtank.evaluate(held.loop, held.clock, names)["rms_error_total"])
+
+
+filtered = {H: capped(H) for H in heights.tolist()}
+
+# %% [markdown]
+# **Guess first:** at 30 cm, the height of the tanks: how far apart are the three?
+
+# %% tags=["thumbnail"]
+fig, ax = plt.subplots(figsize=(7, 3.6), layout="constrained")
+rows = ((gains, TUNED, "o-", "best gains"), (filtered, FILTERED, "^-", "fast gains, filter"),
+        (best, REFERENCE, "s--", "best input, known in advance"))
+for found, colour, marker, label in rows:
+    ax.semilogy(sorted(found), [found[H] for H in sorted(found)], marker, color=colour, label=label)
+ax.plot(v["max_level"].max(), v["rms_error_total"], "s", color=PUBLISHED, label="published gains")
+ax.axvline(30, color=RIM, label="rim")
+ax.set(xlabel="highest level allowed in tanks 3 and 4 [cm]", ylabel="tracking error, rms [cm]")
+ax.legend();
+
+# %% [markdown]
+# At 30 cm: {{gains[30.0]:.2f}} cm by gains, {{filtered[30.0]:.3f}} cm by the filter, {{best[30.0]:.3f}} cm
+# at best. Most of what the rim costs is not physics. It is the way in which a fixed gain obeys: to keep
+# the one highest level in 20 minutes below the rim, it must be slow all the time. The filter is slow
+# only in those seconds ({{100 * float(jaxtank.evaluate((held := fast.with_safety_filter()).loop, held.clock, ["filter_active_fraction"])["filter_active_fraction"]):.1f}} %
+# of the samples at 30 cm).
+#
+# Below about 28 cm the filter pays more and more, and so does the best input
+# ({{best[24.0]:.2f}} cm at 24 cm): a setpoint of 14 cm needs 28.4 cm in tank 4 at rest. This part is
+# physics.
+#
+# ## A slider on the rim
+#
+# The limit of the filter is a number like any other. Where a kernel runs, the sliders of this figure move
+# the limits of tanks 3 and 4, for 200 plants whose flows differ by up to 5 %. Here both are moved to
+# 24 cm.
+#
+# **Guess first:** which setpoints can no longer be held?
+
+# %%
+limits = {"safety_filter.limit[2]": (20.0, 30.0), "safety_filter.limit[3]": (20.0, 30.0)}
+figure = fast.with_safety_filter().explore(free=limits, plants=200)
+wide, many = figure.moved, case.explore(plants=200).moved.measures["max_level"]
+rest, rest2 = (jaxtank.analysis.equilibrium(case.loop.plant, r)[0] for r in ((8, 14), (16, 10)))
+low = figure.move({name: 24.0 for name in limits})
+figure
+
+# %% [markdown]
+# 8 and 14 cm, and 16 and 10 cm: on the nominal plant they need {{rest[3]:.1f}} cm in tank 4 and
+# {{rest2[2]:.1f}} cm in tank 3. The levels stop at 24 cm on every plant, and the lower tanks divide what
+# there is. The mean error over the 200 plants is {{low.measures["rms_error_total"].mean():.2f}} cm, in
+# place of {{wide.measures["rms_error_total"].mean():.2f}} cm with limits of 30 cm. The words below the
+# sliders give the price from exact derivatives:
+#
+# - {{figure.words[2]}}
+# - {{figure.words[3]}}
+
+# %% [markdown]
+# ## Conclusion
+#
+# - Under a limit of 30 cm the best gains have an error of {{gains[30.0]:.2f}} cm, fast gains under a filter
+#   {{filtered[30.0]:.3f}} cm, and the best input that there is {{best[30.0]:.3f}} cm.
+# - So a level limit should not be kept by slow gains. Keep it where it acts, and tune the gains for the
+#   rest of the time.
+# - Below about 28 cm nobody can help: at 24 cm the best input has {{best[24.0]:.2f}} cm, the filter
+#   {{filtered[24.0]:.2f}} cm. The frontier of the best input says when to stop tuning and to
+#   change the rig, or the setpoints.
+# - These figures are without noise. The default answer of `tuning.tune` has a price on the changes of the
+#   inputs as well, and keeps the gains lower.
+#
+# ## Exercises
+#
+# **1.** What do the fast gains cost the pumps? Compare the total variation of the inputs
+# (`input_travel`) with that of the published gains.
+#
+# <details><summary>Answer</summary>
+#
+# {{np.sum(jaxtank.evaluate(held.loop, held.clock, ["input_travel"])["input_travel"]):.0f}} V for both pumps,
+# in place of {{np.sum(jaxtank.evaluate(case.loop, case.clock, ["input_travel"])["input_travel"]):.0f}} V:
+# nearly ten times as much, even without noise.
+# </details>
+#
+# **2.** Read the map: which gains on it hold 30 cm with the least error, and what is the use of $k$?
+#
+# <details><summary>Answer</summary>
+#
+# The largest $k$ and a $k_1$ of about 0.01 1/s: `tuning.tradeoff` ends at
+# $k$ = {{curve_at["controller.k"]:.2g}} and $k_1$ = {{curve_at["controller.k1"]:.2g}} 1/s. A large $k$ makes the
+# inner loop fast, so that $k_1$ alone decides how fast the level rises.
+# </details>
+#
+# **3.** The other way round: how high must tanks 3 and 4 be, so that the published gains pass no rim on
+# the nominal plant? And on 95 % of 200 plants?
+#
+# <details><summary>Answer</summary>
+#
+# {{float(v["max_level"].max()):.1f}} cm, and {{np.quantile(many.max(axis=1), 0.95):.1f}} cm
+# (`case.explore(plants=200).moved.measures["max_level"]` has the highest levels of each plant).
+# </details>
