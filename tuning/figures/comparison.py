@@ -87,8 +87,7 @@ class Comparison(Shown):
             [[name, *counted] for name, counted in self._counts()], ["paper", *papers.VERDICTS]
         )
         folded = (_folded(name, page["rows"]) for name, page in self.pages.items())
-        notes = "".join(f"<p>{html.escape(note)}</p>" for note in self.notes)
-        return counts + "".join(folded) + notes
+        return counts + "".join(folded) + _noted(self.notes)
 
     def _counts(self) -> list[tuple[str, list[int]]]:
         """(paper, rows of each verdict), and their sums."""
@@ -172,6 +171,13 @@ def _folded(name: str, rows: list[dict[str, Any]]) -> str:
         f"<details><summary>{html.escape(name)}: {len(rows)} rows</summary>"
         f"<table><tr>{head}</tr>{body}</table></details>"
     )
+
+
+def _noted(notes: tuple[str, ...]) -> str:
+    """Warnings of the runs, folded; nothing where there are none."""
+    lines = "".join(f"<p>{html.escape(note)}</p>" for note in notes)
+    heading = f"warnings of the runs: {len(notes)}"
+    return f"<details><summary>{heading}</summary>{lines}</details>" if notes else ""
 
 
 def _line(row: dict[str, Any]) -> str:

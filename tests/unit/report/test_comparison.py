@@ -38,7 +38,7 @@ def test_rows_are_counted_by_verdict_and_found_by_quantity():
 
 def test_a_notebook_shows_every_row_with_its_texts_escaped():
     shown = made()._repr_html_()
-    assert shown.count("<details>") == 2 and "one: 2 rows" in shown
+    assert shown.count("<details>") == 3 and "one: 2 rows" in shown
     assert "<td>&lt;b&gt;area&lt;/b&gt;</td>" in shown and "x &lt; y &amp; z" in shown
     assert "<td>2</td><td>2  2.5</td>" in shown and "<td>-</td>" in shown
     assert "<td>a claim</td>" in shown and "a &lt;note&gt;" in shown and "<b>area" not in shown
