@@ -114,6 +114,8 @@ before, after = figure.moved, figure.move({"controller.k1": 0.17})
 figure
 
 # %% [markdown]
+# With $k_1$ = 0.17 1/s:
+#
 # - {{figure.words[0]}}
 # - {{figure.words[1]}}
 # - {{figure.words[2]}}
@@ -171,10 +173,10 @@ ax.set(xlabel="time of a ramp [s]", ylabel="plants above a rim [%]", ylim=(0, 10
 # orifice grows with the square of the flow through it: if the lower outlets pass 5 % more and the
 # upper ones 5 % less,
 #
-# $$h_4 = \left(\frac{1.05}{0.95}\right)^2 \cdot {{rest[3]:.1f}}\ \mathrm{cm}
+# $$h_4 = \left(\frac{1.05}{0.95}\right)^2 \cdot {{rest[3]:.2f}}\ \mathrm{cm}
 #   = {{rest[3] * (1.05 / 0.95) ** 2:.1f}}\ \mathrm{cm},$$
 #
-# above the rim, under any controller, at any speed.
+# above the rim, under any controller, at any speed. Unequal errors of the orifices are worse.
 
 # %% [markdown]
 # ## Conclusion

@@ -1,7 +1,8 @@
 # %% [markdown]
 # # The slope of a flood
 #
-# **Question:** How does a litre on the floor depend on a gain, and when can one trust its derivative?
+# **Question:** How does the volume lost over a rim depend on an integral time or a gain, and when can one
+# trust the derivative?
 #
 # First one tank from scratch, in 20 lines of JAX; then the four-tank rig of [Gouta, Hadj Said and
 # M'sahli (2015)](https://doi.org/10.1016/j.jfranklin.2015.08.004), whose runs are differentiated in the
@@ -70,8 +71,8 @@ ax.set(xlabel="time [s]", ylabel="level [cm]")
 ax.legend();
 
 # %% [markdown]
-# The first two: {{float(flood(2.0)[0]):.0f}} and {{float(flood(4.0)[0]):.0f}} cm³. While the tank fills, the
-# integral goes on growing, and the outlet needs time to take it back.
+# The first two: {{float(flood(2.0)[0]):.0f}} and {{float(flood(4.0)[0]):.0f}} cm³. The integral
+# grows as long as the level is below its setpoint, and shrinks only after the level has passed it.
 #
 # ## The derivative
 #
@@ -103,8 +104,8 @@ ax.set(xlabel="integral time Ti [s]", ylabel="volume lost [cm^3]", ylim=(-60, No
 ax.legend();
 
 # %% [markdown]
-# From the left ones, roughly: they point to a longer integral time, although the curve is bent and they
-# stop too early. The right one is exact as well, and useless: where nothing is lost, the slope is
+# From the left ones, roughly: they point to a longer integral time, but reach zero too early, because
+# the curve is convex. The right one is exact as well, and useless: where nothing is lost, the slope is
 # {{float(slope(9.0)):.0f}}. A search for the shortest integral time with a dry floor stands still anywhere on
 # this side. That is the first way in which a derivative misleads: **it does not see beyond a flat
 # piece**.
@@ -127,9 +128,9 @@ for _ in range(5):
 np.round(found, 4)
 
 # %% [markdown]
-# {{int(np.argmax(np.abs(np.array(found) - found[-1]) < 5e-3))}} steps, to {{found[-1]:.3f}} s. There
-# {{float(volume(found[-1] + 0.01)):.2f}} cm³ are lost, and at 0.5 s less {{float(volume(found[-1] - 0.5)):.1f}}
-# cm³. This is how the tuner of the package keeps limits: it asks how far a level is from its rim, not
+# {{int(np.argmax(np.abs(np.array(found) - found[-1]) < 5e-4))}} steps, to {{found[-1]:.3f}} s. With
+# 0.01 s more, {{float(volume(found[-1] + 0.01)):.2f}} cm³ are lost; with 0.5 s less,
+# {{float(volume(found[-1] - 0.5)):.1f}} cm³. This is how the tuner of the package keeps limits: it asks how far a level is from its rim, not
 # how much was lost.
 #
 # ## A root at zero
@@ -217,7 +218,8 @@ axes[0].legend();
 # <details><summary>Answer</summary>
 #
 # 0, exactly: the pump is at its limit all the time, so no gain acts. A search that starts there has
-# nothing to go by. Several starts help.
+# nothing to go by. Several starts help only where some of them leave the limit. (Run the cells of `step`
+# and `flood` again after the change: compiled functions keep the old numbers.)
 # </details>
 #
 # **2.** Find the integral time that just touches a rim at 21 cm.
@@ -235,7 +237,6 @@ axes[0].legend();
 #
 # At 0.11 1/s it is wrong by
 # {{float(jnp.abs(levels + 0.022 * along - run(0.11))[260:330, 1].max()):.3f}} cm, at 0.132 1/s by
-# {{float(jnp.abs(levels + 0.044 * along - run(0.132))[260:330, 1].max()):.3f}} cm. The error grows with the
-# square of the step: twice the step, about four times the error (somewhat less here, since higher terms
-# help).
+# {{float(jnp.abs(levels + 0.044 * along - run(0.132))[260:330, 1].max()):.3f}} cm. So just below 0.11 1/s. Twice
+# the step gives about three times the error; an error of pure second order would give four times.
 # </details>

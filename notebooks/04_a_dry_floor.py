@@ -80,8 +80,8 @@ figure = responses(case.loop, {"no filter": run, "safety filter": safe}, "the sa
 # %% [markdown]
 # Less than nothing. The highest level is {{float(np.max(dry["max_level"])):.2f}} cm, no water is lost,
 # and the error is {{dry["rms_error_total"]:.3f}} cm in place of {{wet["rms_error_total"]:.3f}} cm: what
-# stays in the tanks can be used. Where one pump is capped, the other one does what serves both lower
-# tanks best.
+# stays in the tanks can be used. (Where one pump is capped, the package also lets
+# the other one do what serves both lower tanks best.)
 #
 # ## 300 plants
 #
@@ -129,7 +129,7 @@ ax.legend();
 # ## Attack it
 #
 # 300 random plants are no proof, and neither is what follows; but it is a better test. `tuning.attack`
-# looks for the plant, the start and the errors of the readings that bring a level highest, by
+# looks for the plant and the start that bring a level highest, by
 # following the derivatives of the highest level. The coefficients may even change in the course of a
 # run, and here the pumps do not follow a controller: they switch at random.
 
@@ -139,10 +139,11 @@ attack
 
 # %% [markdown]
 # {{"No limit was passed" if not attack.passed else "A limit was passed"}}: the highest level of a tank
-# is {{100 * attack.worst.level / attack.worst.limit:.3f}} % of its limit.
+# is {{100 * attack.worst.level / attack.worst.limit:.3f}} % of its limit. (The cap lets the worst plant come
+# as near to its limit as one likes, from below.)
 #
 # **Your turn.** Find a plant within 5 % that spills: change the ten factors (outlets of the four
-# tanks, four orifices, two pumps) between 0.95 and 1.05, and run the cell.
+# tanks, of which 3 and 4 have none to the basin; four orifices; two pumps) between 0.95 and 1.05, and run the cell.
 
 # %%
 mine = [0.95, 0.95, 1.0, 1.0, 0.95, 0.95, 0.95, 0.95, 1.05, 1.05]
@@ -171,8 +172,8 @@ ax.set(xlabel="pumps deliver more than nominal by [%]", ylabel="highest level [c
 ax.legend();
 
 # %% [markdown]
-# At {{100 * excess[int(np.argmax(over > 30))]:.0f}} %: all other coefficients are nominal here, so the
-# pumps may use the whole tolerance alone. And beyond, the limit is not lost at once. Pumps that
+# At {{float(np.interp(30, over, 100 * excess)):.1f}} %: 5 % from the tolerance of the pumps, and 5 % from
+# that of the outlets, which are nominal here. And beyond, the limit is not lost at once. Pumps that
 # deliver three times their nominal flow bring a level {{float(over[-1]) - 30:.2f}} cm above its rim,
 # because the filter closes them again at the next reading.
 

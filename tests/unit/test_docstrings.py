@@ -20,7 +20,7 @@ SECTIONS = {"Parameters", "Returns", "Examples"}
 # Objects that functions return: the example is that of the function.
 RESULTS = {
     *("Attack", "Trajectory", "Bound", "Certificate", "Ensemble", "Estimation", "Identification"),
-    *("Answer", "Feasibility", "Judged"),
+    *("Answer", "Comparison", "Feasibility", "Judged"),
     *("Identifications", "Log", "ParameterChange", "TuningResult"),
 }
 

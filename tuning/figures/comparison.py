@@ -143,6 +143,10 @@ def redraw(name: str) -> Any:
     ----------
     name : "PAPER/NUMBER", as `jaxtank figure` lists them.
 
+    Returns
+    -------
+    matplotlib.figure.Figure
+
     Raises
     ------
     InputError
