@@ -102,7 +102,7 @@ tuning.compare_experiments(case, free, duration=1000.0, voltage=[3.0], **usual)
 #   an overflow that does not occur.
 # - A single step does not find the pump gain and the offset either: at one voltage, only their sum
 #   $k_4 (u + u_0)$ acts.
-# - Small changes about a steady state find the time constants, and hardly the gains.
+# - Small changes about a steady state find one coefficient to a few per cent, and little else.
 #
 # The record was made differently: many voltages, slow and fast, and both tanks over their rims. The
 # same calculation for its input, of which 250 samples last 1000 s:

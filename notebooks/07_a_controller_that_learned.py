@@ -225,8 +225,9 @@ legend = figure.legend(loc="outside lower center", ncols=3), axes[0].set_ylabel(
 # %% [markdown]
 # The network has {{error(unseen["network"]):.2f}} cm, the predictive controller
 # {{error(unseen["ngpc"]):.2f}} cm. It oscillates after steps
-# that it does not know. (Where both stay away from the setpoints, at the end, the upper tanks are at
-# their limits: no controller can do more.) The limits hold on
+# that it does not know. (Both stay away from two pairs of setpoints, 12 and 5 cm, and 6 and 14 cm: there one
+# of the upper tanks would need a negative outflow. No controller can hold them, and their error hides a part of
+# the difference.) The limits hold on
 # {{100 * unseen["network"].share_held()["share"]:.0f}} % of the plants: the filter has learned nothing and
 # can forget nothing.
 #

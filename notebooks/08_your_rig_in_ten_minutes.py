@@ -139,7 +139,8 @@ figure = responses(case.loop, {"first guess": before, "tuned": after}, "buffer a
 #
 # The controller becomes a C99 file without any dependency: one function for the start, one for each
 # sample, anti-windup and limits of the pump included. (The safety filter can be exported with it; here
-# it is left out, for a short text.) `"m"` gives MATLAB, `"js"` JavaScript.
+# it is left out, for a short text: without it, the levels are those of another loop than the one that was
+# judged above.) `"m"` gives MATLAB, `"js"` JavaScript.
 
 # %%
 code = jaxtank.export.export(result.tuned.without_safety_filter(), "c", name="product")
