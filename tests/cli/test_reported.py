@@ -43,7 +43,10 @@ def test_without_limits_nothing_is_reported_to_hold():
         and "a level above its rim is not reported" in page
     )
     page = repr(tuning.tune(case, nominal=True, limits={"max_level": "rim"}, **QUICK))
-    assert "all limits held" in page and "rims are limits" in page
+    assert "all limits held" in page and "rims are limits only" in page
+    case = case.replace(limits={"max_level": "rim"}).with_safety_filter()
+    page = repr(tuning.tune(case, **QUICK))  # which leaves the rims to the filter
+    assert "a safety filter caps the pumps" in page and "is not reported" not in page
 
 
 def test_one_tank_is_one_tank(capsys):

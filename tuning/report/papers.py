@@ -261,18 +261,20 @@ def overview(pages):
         DIFFERS: (responses.BEFORE, "X"),
     }
     with responses.styled():
-        figure, ax = plt.subplots(figsize=(7.2, 0.8 + 0.2 * len(rows)), layout="constrained")
+        figure, ax = plt.subplots(figsize=(7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows)), layout="constrained")
+        styles = {word: styles[word] for word in styles if word in {r["verdict"] for _, r, _ in rows}}
         for k, (_, row, ratios) in enumerate(rows):
             colour, marker = styles[row["verdict"]]
             ax.plot(ratios, [k] * len(ratios), marker, color=colour, markersize=5, alpha=0.8)
         ax.axvline(1.0, color=responses.REFERENCE, linewidth=1.0)
         ax.set_xscale("log")
         ax.set(xlabel="measured / published [-]", ylim=(len(rows) - 0.4, -0.6))
-        names = [f"{paper}: {responses.plain(row['quantity'])}" for paper, row, _ in rows]
+        start = (lambda paper: f"{paper}: ") if len(pages) > 1 else (lambda paper: "")
+        names = [start(paper) + responses.plain(row["quantity"]) for paper, row, _ in rows]
         ax.set_yticks(range(len(rows)), names, fontsize=7)
         for word, (colour, marker) in styles.items():
             ax.plot([], [], marker, color=colour, label=word)
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=len(styles))
     return {"published": figure}
 
 

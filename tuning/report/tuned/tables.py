@@ -12,7 +12,7 @@ COSTLIEST, MANY = 5, 12
 
 def parts_of(result):
     """Return what is printed of a TuningResult but for its message: lines and Tables."""
-    problem, evaluations = result.problem, result.evaluations
+    evaluations = result.evaluations
     parts = [
         f"{result.tuned.name}: {result.status} ({result.method},"
         f" {evaluations['simulations']} simulations, {evaluations['gradients']} of them with"
@@ -29,8 +29,10 @@ def parts_of(result):
         parts += [str(result.bound), ""]
     if result.tuned.loop.plant.overflow:
         rims = "rims are physics: liquid above them overflows"
-    elif any(limit.measure == "max_level" for limit in problem.limits):
+    elif any(limit["name"].startswith("max_level") for limit in result.constraints):
         rims = "rims are limits only: nothing spills in the model, so a level may be above its rim"
+        if result.tuned.loop.safety_filter is not None:
+            rims = "rims are limits, for which a safety filter caps the pumps"
     else:
         rims = (
             "rims are neither physics nor limits here: nothing spills in the model, and a level"
