@@ -79,8 +79,8 @@ axes[0].set(ylabel="lower level [V]", title="the record, and a rig with guessed 
 axes[1].plot(record.t, record.u, color="0.4", linewidth=1)
 axes[1].set(ylabel="pump [V]", xlabel="time [s]")
 # %% [markdown]
-# It stays stable and is wrong by {{rms(at_first):.1f}} V RMS: the tanks forget where they began, not how
-# wrong the pump gain is. Where the record is flat at 10 V the lower tank overflows.
+# It stays stable and is wrong by {{rms(at_first):.1f}} V RMS: an error of the start decays, an error of
+# the pump gain does not. Where the record is flat at 10 V the lower tank overflows.
 #
 # ## Which experiment?
 #
@@ -100,7 +100,7 @@ tuning.compare_experiments(case, free, duration=1000.0, voltage=[3.0], **usual)
 # %% [markdown]
 # - `caught`, by none of them: no tank overflows in these runs, and no reading can depend on a share of
 #   an overflow that does not occur.
-# - A single step does not find the pump gain and the offset either: at one voltage, only their sum
+# - A single step does not find the pump gain and the offset either: at one voltage, only the inflow
 #   $k_4 (u + u_0)$ acts.
 # - Small changes about a steady state find one coefficient to a few per cent, and little else.
 #
@@ -118,7 +118,7 @@ tuning.compare_experiments(case, free, duration=0.0, inputs=inputs, **usual)
 #
 # The rig is simulated with the recorded voltage, and Gauss-Newton with exact sensitivities reduces
 # the difference to the readings. Four searches start from different points. The last quarter of the
-# record is held out: a fit to the first three quarters predicts it.
+# record is kept for validation: a fit to the first three quarters predicts it.
 
 # %% tags=["times"]
 found = tuning.identify(guess, record, free, starts=4, law="pi")
@@ -127,7 +127,7 @@ found
 # %% [markdown]
 # The RMS error is {{found.quality["rmse"][0]:.3f}} V, where the guess gave {{rms(at_first):.1f}} V. The
 # fit to three quarters has {{found.validation["fitted"]["rmse"][0]:.2f}} V there, and
-# {{found.validation["held_back"]["rmse"][0]:.2f}} V in the quarter that it has not seen.
+# {{found.validation["held_back"]["rmse"][0]:.2f}} V in the validation quarter.
 #
 # One line of the report needs attention: from sample to sample the residual has a correlation of
 # {{found.quality["residual_autocorrelation"][0]:.2f}}. Noise has none. The formula above counts each
@@ -162,7 +162,7 @@ for ax, (name, unit) in zip(axes, shown.items()):
 # level reaches 10 V for the first time, after {{overflow / 60:.0f}} min.
 #
 # - Before the first overflow `caught` has no interval at all, as the plan said.
-# - The thick intervals shrink with the readings. The thin ones, which can be trusted, stop: with 192
+# - The thick intervals shrink with the readings, at first quickly. The thin ones stop shrinking: with 192
 #   readings the standard deviation of the pump gain is
 #   {{100 * fits[192].parameters["plant.pump_gain[0]"]["sd"] / fits[192].parameters["plant.pump_gain[0]"]["value"]:.1f}} %,
 #   with 1024 it is
@@ -177,7 +177,7 @@ for ax, (name, unit) in zip(axes, shown.items()):
 # The fit to the first three quarters becomes a case. It keeps the covariance, so that an ensemble
 # draws its plants from what the data leave open.
 #
-# **Guess first:** how much of the held-out quarter lies within the band of 90 % of the plants?
+# **Guess first:** how much of the validation quarter lies within the band of 90 % of the plants?
 
 # %%
 early = fits[768]
@@ -202,17 +202,17 @@ seen = np.interp(plants.fan["t"], record.t, record.y[:, 0])
 within = np.mean(((seen > low) & (seen < high))[plants.fan["t"] >= record.t[768]])
 
 # %% [markdown]
-# The prediction follows every turn of the held-out quarter, with {{rms(best, slice(768, None)):.2f}} V
+# The prediction follows every turn of the validation quarter, with {{rms(best, slice(768, None)):.2f}} V
 # RMS where the first guess has {{rms(at_first, slice(768, None)):.1f}} V. But only
 # {{100 * within:.0f}} % of the readings there lie within the band. The band shows what the
-# *parameters* leave open; what the *model* leaves out is not in it. On another part of this
-# benchmark, methods of identification were published with 0.18 to 0.45 V.
+# *parameters* leave open; what the *model* leaves out is not in it. So even the widened intervals are
+# too narrow.
 #
 # ## A controller for it
 #
 # With `law="pi"` the identification has proposed a PI controller from the identified model. Its plants
-# are drawn from the covariance. The figure is live where a kernel runs; the picture has a gain of 1.0
-# in place of the proposed one (dashed).
+# are drawn from the covariance. The figure is live in a running notebook; the picture has a gain of 1.0
+# instead of the proposed one (dashed).
 #
 # **Guess first:** what happens in the upper tank, which has no sensor in the record?
 
@@ -222,7 +222,8 @@ higher = figure.move({"controller.Kc[0]": 1.0})
 figure
 
 # %% [markdown]
-# The lower tank follows sooner, and the upper one pays: {{figure.words[0]}}. The proposed gain is slow
+# The lower tank follows sooner and overshoots, and the upper one comes to its limits:
+# {{figure.words[0]}}. The proposed gain is slow
 # and safe. Gains between the two are found by `tuning.tune(found.identified)`.
 #
 # ## Conclusion
@@ -233,9 +234,10 @@ figure
 #   {{rms(at_first):.1f}} V, and predicts a quarter that it has not seen with
 #   {{found.validation["held_back"]["rmse"][0]:.2f}} V.
 # - Look at the correlation of the residual before you believe an interval: here
-#   {{found.quality["residual_autocorrelation"][0]:.2f}}, and honest intervals are
+#   {{found.quality["residual_autocorrelation"][0]:.2f}}, and intervals that take it into account are
 #   {{found.quality["widened"]:.1f}} times wider than those for white noise.
-# - Once the model limits the fit, more data do not narrow the honest intervals. A better model does.
+# - Once the model limits the fit, more data do not make the widened intervals narrower. A better model
+#   would.
 #
 # ## Exercises
 #
@@ -244,7 +246,7 @@ figure
 #
 # <details><summary>Answer</summary>
 #
-# No: the RMS error stays where it was, also in the held-out quarter, and the intervals become two to
+# No: the RMS error stays where it was, also in the validation quarter, and the intervals become two to
 # three times as wide. The new number is nearly a common factor of the others. What is missing in the
 # model is something else.
 # </details>
@@ -254,8 +256,8 @@ figure
 #
 # <details><summary>Answer</summary>
 #
-# The error is small because few readings are easy to fit: the report names `caught` as not identifiable
-# and gives wide intervals for the rest. Few data are flexible enough to be explained by a wrong rig.
+# The report names `caught` as not identifiable and gives wide intervals for the rest. A short record can
+# be fitted by a wrong model.
 # </details>
 #
 # **3.** Leave the offset of the pump out of `free`, and set it to zero:

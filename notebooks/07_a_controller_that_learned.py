@@ -84,9 +84,9 @@ figure = responses(newborn.loop, {"untrained network": run}, "random weights, un
 
 # %% [markdown]
 # On {{np.sum(~found["untrained network"].held)}} of {{found["untrained network"].samples}}; without
-# the filter on {{np.sum(~unsafe.held)}}. The levels follow nothing (the mean error is
-# {{np.mean(found["untrained network"].error):.0f}} cm), and the upper tanks stop just below their rims.
-# A network may now learn on this rig without a risk.
+# the filter on {{np.sum(~unsafe.held)}}. The levels do not follow (the mean error is
+# {{np.mean(found["untrained network"].error):.0f}} cm), and tank 4 stops just below its rim.
+# While the network learns, no tank of a plant within the tolerances overflows.
 #
 # ## Learning
 #
@@ -143,7 +143,7 @@ ax.set(xlabel="step of the training [-]", ylabel="root of the cost", ylim=(0.2, 
 legend = figure.legend(loc="outside right center")
 
 # %% [markdown]
-# After {{int(np.argmax(np.array(history) < rivals["ngpc"]))}} steps. Backstepping is passed after
+# After {{int(np.argmax(np.array(history) < rivals["ngpc"]))}} steps. Backstepping is overtaken after
 # {{int(np.argmax(np.array(history) < rivals["backstepping"]))}}.
 #
 # ## The test
@@ -151,10 +151,10 @@ legend = figure.legend(loc="outside right center")
 # 256 other plants, with noise in the readings, which the network has never had. All controllers have
 # the same safety filter.
 #
-# The comparison must be fair: the horizon $T_p$ of the predictive controller, 11 s in the paper, was
-# not chosen for these plants. So it is varied, with and without the observer. A small error can also be
-# bought with restless pumps, so the figure has both: to the left the pumps are quiet, below the
-# tracking is good.
+# The horizon $T_p$ of the predictive controller, 11 s in the paper, was not chosen for these plants. So
+# it is varied, with and without the observer; backstepping keeps the gains of the paper. A small error
+# often needs much motion of the pumps, so the figure has both: to the left the pumps move little, below
+# the tracking is good.
 #
 # **Guess first:** will the network lie below the line of `ngpc`, on it, or above?
 
@@ -191,20 +191,21 @@ legend = ax.legend()
 # - With a horizon of 4 s `ngpc` reaches {{error(sweep["ngpc"][0]):.2f}} cm, but needs
 #   {{moves(sweep["ngpc"][0]):.0f}} %: a short horizon amplifies the noise.
 # - With an observer the error is {{error(found["ngpc-observer"]):.2f}} cm at
-#   {{moves(found["ngpc-observer"]):.1f}} %. A disturbance estimate is worth something that the network,
-#   which has no memory, cannot have.
+#   {{moves(found["ngpc-observer"]):.1f}} %. The estimate of the disturbance needs a memory, which the
+#   network does not have.
 # - The limits held on {{100 * min(np.mean(j.held) for row in sweep.values() for j in row):.0f}} % of the
 #   plants at every point of the lines, and on {{100 * np.mean(found["network"].held):.0f}} % with the network.
 #
 # ## Setpoints that it has never seen
 #
-# The paper's controllers contain a model of the rig. The network has seen one sequence of setpoints, 64
-# times. Now the setpoints go up to 14 cm in other combinations, in ramps of 20 s in place of 60 s.
+# The paper's controllers contain a model of the rig. The network has seen one sequence of setpoints, on
+# 64 plants, and that was the one of the last figure. Now the setpoints have other combinations, which
+# the rig can hold, in ramps of 20 s instead of 60 s.
 #
 # **Guess first:** who is better now, the network or `ngpc` without an observer?
 
 # %%
-changes = [(20, 0, 12.0), (20, 1, 12.0), (300, 1, 5.0), (600, 1, 14.0), (900, 0, 6.0)]
+changes = [(20, 0, 12.0), (20, 1, 12.0), (300, 1, 9.0), (600, 1, 14.0), (900, 0, 10.0)]
 other = jaxtank.signals.ramps([3.0, 3.0], changes, ramp=20.0)
 new = {
     name: case.replace(loop=dataclasses.replace(case.loop, reference=other))
@@ -224,27 +225,24 @@ legend = figure.legend(loc="outside lower center", ncols=3), axes[0].set_ylabel(
 
 # %% [markdown]
 # The network has {{error(unseen["network"]):.2f}} cm, the predictive controller
-# {{error(unseen["ngpc"]):.2f}} cm. It oscillates after steps
-# that it does not know. (Both stay away from two pairs of setpoints, 12 and 5 cm, and 6 and 14 cm: there one
-# of the upper tanks would need a negative outflow. No controller can hold them, and their error hides a part of
-# the difference.) The limits hold on
-# {{100 * unseen["network"].share_held()["share"]:.0f}} % of the plants: the filter has learned nothing and
-# can forget nothing.
+# {{error(unseen["ngpc"]):.2f}} cm. The limits hold on
+# {{100 * unseen["network"].share_held()["share"]:.0f}} % of the plants: the filter does not depend on what the
+# network has seen.
 #
 # ## Wear
 #
-# The last figure is live where a kernel runs: it moves the gain of pump 1 of 64 plants, also far out of
+# The last figure is live in a running notebook: it moves the gain of pump 1 of 64 plants, also far out of
 # the 5 % of the training and of the proof. In the picture the pump has lost 20 %.
 
 # %%
 gain = float(plant.pump_gain[0])
 figure = trained.explore(free={"plant.pump_gain[0]": (0.6 * gain, 1.2 * gain)}, plants=64)
-worn = figure.move({"plant.pump_gain[0]": 0.8 * gain})
+sound, worn = figure.moved, figure.move({"plant.pump_gain[0]": 0.8 * gain})
 figure
 
 # %% [markdown]
-# The mean error of the 64 plants is {{np.mean(worn.measures["rms_error_total"]):.2f}} cm,
-# and {{100 * np.mean(np.any(worn.measures["max_level"] > 30.0, axis=1)):.0f}} % of them rise above a rim. Drag
+# The mean error of the 64 plants is {{np.mean(worn.measures["rms_error_total"]):.2f}} cm, with the nominal gain
+# {{np.mean(sound.measures["rms_error_total"]):.2f}} cm, and {{100 * np.mean(np.any(worn.measures["max_level"] > 30.0, axis=1)):.0f}} % of them rise above a rim. Drag
 # the slider the other way: a pump that is stronger than the proof assumes is the dangerous one.
 #
 # ## Conclusion
@@ -253,22 +251,22 @@ figure
 #   through the whole loop train {{sum(np.size(w) for w in weights.values())}} weights in seconds.
 # - The safety filter needs no trust in the controller: with random weights a limit was violated on
 #   {{np.sum(~found["untrained network"].held)}} of 256 plants, without it on {{np.sum(~unsafe.held)}}.
-# - The network passed both printed controllers ({{error(found["network"]):.2f}} cm against
+# - On the setpoints of its training the network is better than both printed controllers ({{error(found["network"]):.2f}} cm against
 #   {{error(found["ngpc"]):.2f}} and {{error(found["backstepping"]):.2f}} cm). A shorter horizon gives
-#   nearly the same error with {{moves(sweep["ngpc"][0]) / moves(found["network"]):.0f}} times the motion of
+#   nearly the same error with {{moves(sweep["ngpc"][0]) / moves(found["network"]):.1f}} times the motion of
 #   the pumps, an observer a smaller one.
-# - On setpoints that it had never seen it was no better than the model:
-#   {{error(unseen["network"]):.2f}} against {{error(unseen["ngpc"]):.2f}} cm.
+# - On setpoints that it had never seen: {{error(unseen["network"]):.2f}} cm, and
+#   {{error(unseen["ngpc"]):.2f}} cm for the predictive controller, which contains a model.
 #
 # ## Exercises
 #
-# **1.** Give the network a memory: return the integrals of the two errors as its state, and let it see
-# them (a `w1` of 16 x 10). Is it better after the same 70 steps?
+# **1.** Give the network a memory: return the sums of the two errors as its state, and let it see them,
+# scaled by 0.05 (a `w1` of 16 x 10). Is it better after the same 70 steps?
 #
 # <details><summary>Answer</summary>
 #
-# No. Its error on the setpoints of the paper becomes larger by more than half, and it is far worse on
-# the new ones. Integrals make the loop slower to train: 70 steps are too few.
+# Hardly: 0.32 cm on the setpoints of the paper, as before, and 0.36 cm in place of 0.42 cm on the new ones
+# (with random weights of ours; yours will differ a little).
 # </details>
 #
 # **2.** Train without the filter (`loop=newborn.without_safety_filter().loop` in `cost`), and judge with
@@ -286,6 +284,6 @@ figure
 #
 # <details><summary>Answer</summary>
 #
-# On the new setpoints it is then better than `ngpc`, and on those of the paper about as good as before.
+# On the new setpoints it then has 0.28 cm in place of 0.42 cm, and on those of the paper 0.32 cm, as before.
 # What a network is to know must be in its training.
 # </details>

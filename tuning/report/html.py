@@ -124,7 +124,8 @@ def document(
     body += _chapter("In words", [_list(sentences)] if sentences else [])
     body += _chapter("Pictures", [_figure(*picture) for picture in pictures])
     body += _chapter("Numbers", [_part(p) for p in _grouped(parts)])
-    body += moved if live_last else []
+    after = bool(moved) and live_last
+    body += ["</main>", *moved, "<footer>"] if after else []
     for name, text in (files or {}).items():
         folded = f"<summary>{escape(name)}</summary><pre>{escape(text)}</pre>"
         body.append(f"<details>{folded}</details>")
@@ -139,7 +140,7 @@ def document(
             f"<title>{escape(title)}</title>\n<style>{style()}</style>\n</head>\n<body>",
             "<header>" if live and not live_last else "<main>",
             *filter(None, body),
-            "</main>\n</body>\n</html>\n",
+            f"</{'footer' if after else 'main'}>\n</body>\n</html>\n",
         ]
     )
 
