@@ -261,8 +261,12 @@ def overview(pages):
         DIFFERS: (responses.BEFORE, "X"),
     }
     with responses.styled():
-        figure, ax = plt.subplots(figsize=(7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows)), layout="constrained")
-        styles = {word: styles[word] for word in styles if word in {r["verdict"] for _, r, _ in rows}}
+        figure, ax = plt.subplots(
+            figsize=(7.2 if len(pages) > 1 else 6.0, 0.8 + 0.2 * len(rows)), layout="constrained"
+        )
+        styles = {
+            word: styles[word] for word in styles if word in {r["verdict"] for _, r, _ in rows}
+        }
         for k, (_, row, ratios) in enumerate(rows):
             colour, marker = styles[row["verdict"]]
             ax.plot(ratios, [k] * len(ratios), marker, color=colour, markersize=5, alpha=0.8)
@@ -274,7 +278,9 @@ def overview(pages):
         ax.set_yticks(range(len(rows)), names, fontsize=7)
         for word, (colour, marker) in styles.items():
             ax.plot([], [], marker, color=colour, label=word)
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=len(styles))
+        figure.legend(
+            *ax.get_legend_handles_labels(), loc="outside lower center", ncols=len(styles)
+        )
     return {"published": figure}
 
 
