@@ -172,7 +172,7 @@ def one(source, check):
     try:
         notebook, took = execute(source)
     except CellExecutionError as error:  # a kernel that dies or draws badly once in many runs
-        print(f"{source.stem}: run once more after: {str(error).strip().splitlines()[-1]}")
+        print(f"{source.stem}: run once more after\n{error}")
         notebook, took = execute(source)
     path, faults = source.with_suffix(".ipynb"), []
     if check:
