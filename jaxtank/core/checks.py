@@ -3,6 +3,7 @@
 Imports core only; may be imported by every folder.
 """
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any, cast
 
@@ -14,6 +15,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.fields import is_real, number
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import walk
+
+SMALL = 16
+"""Entries of an array that is checked number by number, at most."""
 
 
 def check_leaves(
@@ -67,6 +71,8 @@ def check_value(name: str, value: Any, meta: Mapping[str, Any]) -> None:
     Traceback (most recent call last):
     jaxtank.core.errors.InputError: k = 0 1/s: must be above 0 1/s
     """
+    if _is_good(value, meta):
+        return
     if isinstance(value, list | tuple | str):  # to jax a list is several leaves, and no array
         raise InputError(
             f"{name} = {shortened(cast(Any, value))}: must be a number or an array, np.array(...)"
@@ -88,6 +94,20 @@ def check_value(name: str, value: Any, meta: Mapping[str, Any]) -> None:
         return
     index = tuple(int(i) for i in np.argwhere(~good)[0])
     raise InputError(_out_of_range(name, array[index], index, meta))
+
+
+def _is_good(value: Any, meta: Mapping[str, Any]) -> bool:
+    """Return True for a small array of float64 that is good: what nearly every leaf is, by plain
+    numbers, which takes a third of the time that arrays take.
+    """
+    if type(value) is not np.ndarray or value.dtype != np.float64 or value.size > SMALL:
+        return False
+    low, high = meta["low"], meta["high"]
+    low, high = -math.inf if low is None else low, math.inf if high is None else high
+    numbers: list[float] = value.ravel().tolist()
+    if meta["strict"]:
+        return all(low < v <= high and math.isfinite(v) for v in numbers)
+    return all(low <= v <= high and math.isfinite(v) for v in numbers)
 
 
 def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[str, Any]) -> str:

@@ -5,6 +5,7 @@ them, and every printed unit follows. Imports core only; may be imported by ever
 "m^3/s").
 """
 
+import functools
 import re
 
 from jaxtank.core.errors import InputError
@@ -50,6 +51,7 @@ def check_unit(where: str, text: str) -> str:
     return text
 
 
+@functools.cache
 def local(unit: str, units: tuple[str, str] = DEFAULT) -> str:
     """Return a unit in the units of a rig.
 

@@ -6,9 +6,10 @@ May import `loop.closed_loop`, `loop.step_size` and the folders below `jaxtank.l
 # pyright: reportUnknownMemberType=false
 
 import dataclasses
+import hashlib
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -24,6 +25,13 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import check_caught
+
+KEPT = 64
+"""Loops that have passed and are remembered, by structure and values, so that the next call of
+`evaluate` or `simulate` need not look again: the checks take longer than a short run.
+"""
+
+_PASSED: dict[Any, None] = {}
 
 _DOCUMENTED = re.compile(r"\(([a-z0-9, +]+)\) ")
 """The shape with which the documentation of a leaf begins."""
@@ -66,6 +74,54 @@ def check(
         )
     check_clock(clock)
     check_key(key)
+    signature = _signature(loop, clock, key is None)
+    if signature is None or signature not in _PASSED:
+        _check_parts(loop, clock, key)
+        _remember(_PASSED, signature)
+    if not _traced(loop.plant):
+        check_step(loop, clock)  # it may warn, every time
+
+
+def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
+    """What the checks depend on, as a hashable value: structure of the loop, and a digest of shapes,
+    types and values of its leaves; None where it has none, as inside a trace.
+    """
+    leaves, structure = cast(tuple[list[Any], Any], jax.tree.flatten(loop))
+    digest = hashlib.blake2b(digest_size=16)
+    for value in leaves:
+        if isinstance(value, Tracer) or not isinstance(value, np.ndarray | jax.Array | float):
+            return None
+        array = np.asarray(value) if _plain(value) else np.zeros((), dtype=object)
+        if array.dtype.hasobject:
+            return None
+        digest.update(f"{array.shape}{array.dtype.str}".encode())
+        digest.update(array.tobytes())
+    signature = structure, clock, keyless, digest.digest()
+    try:
+        hash(signature)
+    except TypeError:  # a static field of a user's own
+        return None
+    return signature
+
+
+def _plain(value: Any) -> bool:
+    """Return False for an array of random keys, which are no numbers."""
+    return not jax.dtypes.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended)
+
+
+def _remember(passed: dict[Any, None], signature: Any) -> None:
+    """Add a signature to those that have passed; the oldest goes."""
+    if signature is None:
+        return
+    passed[signature] = None
+    if len(passed) > KEPT:
+        passed.pop(next(iter(passed)), None)
+
+
+def _check_parts(
+    loop: ClosedLoop, clock: Clock, key: jax.Array | jax.ShapeDtypeStruct | None
+) -> None:
+    """Every check that looks at the loop."""
     _check_sizes(loop)
     _check_saturation(loop)
     _check_delay(loop.actuator, clock)
@@ -74,8 +130,6 @@ def check(
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, own in _plants(loop):
         check_caught(own, name)
-    if not _traced(loop.plant):
-        check_step(loop, clock)
     loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)
