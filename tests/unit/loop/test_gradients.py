@@ -275,3 +275,33 @@ def test_by_the_duration_of_a_ramp_and_its_target_through_a_run():
     forward = np.asarray(jax.jit(jax.jacfwd(f))(z))
     assert np.all(np.abs(forward) > 1e-6)
     np.testing.assert_allclose(forward, differences(f, z), rtol=1e-5)
+
+
+def test_the_matrix_of_many_parameters_is_that_of_few(monkeypatch):
+    """Slopes that are stored first give the matrix and the slopes of those that are not, of one run
+    and of several side by side: nothing is written over before it is read.
+    """
+    from jaxtank.loop import derivatives
+
+    case = presets.find("gouta2015/backstepping")
+    clock = dataclasses.replace(case.clock, dt=1.0, duration=300.0)
+    names = ("plant.area", "plant.drain", "plant.orifice", "plant.pump_gain", "controller.k1")
+    values = {n: get_value(case.loop, n) for n in names}
+    squares = {"mean_square_error": 2.0, "mean_square_travel": -0.5}
+
+    def found(limit):
+        monkeypatch.setattr(derivatives, "OUTER", limit)
+        jax.clear_caches()
+
+        def one(k):
+            loop = with_values(case.loop, {"controller.k": k})
+            return jaxtank.sensitivities(
+                loop, clock, ("rms_error_total", "max_level"), values, None, squares
+            )
+
+        return one(0.03), jax.vmap(one)(np.linspace(0.02, 0.04, 5))
+
+    few, many = found(100), found(0)
+    for a, b in zip(jax.tree.leaves(few), jax.tree.leaves(many), strict=True):
+        scale = np.abs(np.asarray(a, float)).max()
+        np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-11 * scale)

@@ -86,7 +86,7 @@ def test_rough_search_starts_the_true_one(gouta):
 
 @pytest.mark.slow
 def test_gauss_newton_of_many_parameters(gouta):
-    """Above OUTER parameters the matrix grows by a product; compared with J'J of differences of the
+    """Above OUTER parameters the slopes are stored first; compared with J'J of differences of the
     whole error.
     """
     case = schedule(quick(gouta), {"controller.k1": "r1"}, np.linspace(3.0, 8.0, OUTER + 2))
