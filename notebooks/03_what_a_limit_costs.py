@@ -70,7 +70,7 @@ ax.legend(loc="lower left", labelcolor="white");
 # The published gains have {{published["rms_error_total"]:.2f}} cm
 # and a level of {{float(published["max_level"].max()):.1f}} cm in tanks of 30 cm.
 #
-# ## Three ways to pay
+# ## Three ways to keep a limit
 #
 # - **Gains**: for each height $H$, the gains with the least error under the limit
 #   (`tuning.tradeoff`; its searches use the exact derivative of the highest level).
@@ -121,8 +121,8 @@ ax.legend();
 
 # %% [markdown]
 # At 30 cm: {{gains[30.0]:.2f}} cm by gains, {{filtered[30.0]:.3f}} cm by the filter, {{best[30.0]:.3f}} cm
-# at best. Most of what the rim costs is not physics. It is the way in which a fixed gain obeys: to keep
-# the one highest level in 20 minutes below the rim, it must be slow all the time. The filter is slow
+# at best. Most of what the rim costs is not physics. It comes from gains that are the same all the time: to keep
+# the highest level of 20 minutes below the rim, they must be slow in every minute. The filter is slow
 # only in those seconds ({{100 * float(jaxtank.evaluate((held := fast.with_safety_filter()).loop, held.clock, ["filter_active_fraction"])["filter_active_fraction"]):.1f}} %
 # of the samples at 30 cm).
 #
@@ -150,7 +150,7 @@ figure
 # {{rest2[2]:.1f}} cm in tank 3. The levels stop at 24 cm on every plant, and the lower tanks divide what
 # there is. The mean error over the 200 plants is {{low.measures["rms_error_total"].mean():.2f}} cm, in
 # place of {{wide.measures["rms_error_total"].mean():.2f}} cm with limits of 30 cm. The words below the
-# sliders give the price from exact derivatives:
+# sliders tell what 10 % of a limit is worth, from exact derivatives:
 #
 # - {{figure.words[2]}}
 # - {{figure.words[3]}}

@@ -140,7 +140,8 @@ attack
 # %% [markdown]
 # {{"No limit was passed" if not attack.passed else "A limit was passed"}}: the highest level of a tank
 # is {{100 * attack.worst.level / attack.worst.limit:.3f}} % of its limit. (The cap lets the worst plant come
-# as near to its limit as one likes, from below.)
+# as near to its limit as one likes, from below. The note above on levels between two samples is for loops
+# without a filter: steps 2 and 3 of the proof hold at every instant, not at the readings alone.)
 #
 # **Your turn.** Find a plant within 5 % that spills: change the ten factors (outlets of the four
 # tanks, of which 3 and 4 have none to the basin; four orifices; two pumps) between 0.95 and 1.05, and run the cell.
@@ -204,7 +205,7 @@ ax.legend();
 #
 # **2.** Design the filter for flows within 10 %
 # (`case.replace(uncertain={"plant.drain": 0.1, "plant.orifice": 0.1, "plant.pump_gain": 0.1})`).
-# What does the nominal plant pay?
+# What does this cost on the nominal plant?
 #
 # <details><summary>Answer</summary>
 #

@@ -36,7 +36,9 @@ jaxtank.notebook()
 #
 # The five unknowns are $k_1$ (`orifice`), $k_3$ (`drain`), $k_4$ (`pump_gain`), $c$ (`caught`) and the
 # offset of the pump, which enters as the constant inflow $k_4 u_0$ (`disturbance.level`). They start
-# from a guess.
+# from a guess. Both levels are in volts, so the volt is this rig's unit of length: tanks of 1 V², under
+# a gravity of 0.5 V/s² ($\sqrt{2g} = 1$), whose orifices in V² and gain in V³/(s V) have the values of
+# $k_1$, $k_3$ and $k_4$.
 
 # %%
 first = {"plant.pump_gain": 0.03, "plant.orifice": 0.03, "plant.drain[1]": 0.05}
@@ -77,7 +79,7 @@ axes[0].plot(at_first.t, at_first.x[:, 1], label="first guess")
 axes[0].legend(loc="upper center")
 axes[0].set(ylabel="lower level [V]", title="the record, and a rig with guessed numbers")
 axes[1].plot(record.t, record.u, color="0.4", linewidth=1)
-axes[1].set(ylabel="pump [V]", xlabel="time [s]")
+axes[1].set(ylabel="pump [V]", xlabel="time [s]");
 # %% [markdown]
 # It stays stable and is wrong by {{rms(at_first):.1f}} V RMS: an error of the start decays, an error of
 # the pump gain does not. Where the record is flat at 10 V the lower tank overflows.
@@ -120,7 +122,7 @@ tuning.compare_experiments(case, free, duration=0.0, inputs=inputs, **usual)
 # the difference to the readings. Four searches start from different points. The last quarter of the
 # record is kept for validation: a fit to the first three quarters predicts it.
 
-# %% tags=["times"]
+# %%
 found = tuning.identify(guess, record, free, starts=4, law="pi")
 found
 
@@ -145,7 +147,7 @@ fits = {n: part(n) for n in sizes}
 overflow = float(record.t[np.argmax(record.y[:, 0] > 9.9)])  # s
 
 # %%
-shown = {"plant.pump_gain[0]": "[1/s]", "plant.orifice[0]": "[V^0.5/s]", "plant.caught[0]": "[-]"}
+shown = {"plant.pump_gain[0]": "[V^3/(s V)]", "plant.orifice[0]": "[V^2]", "plant.caught[0]": "[-]"}
 figure, axes = plt.subplots(1, 3, figsize=(9.5, 3.2), layout="constrained")
 for ax, (name, unit) in zip(axes, shown.items()):
     for n, fit in fits.items():

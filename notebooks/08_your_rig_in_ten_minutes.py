@@ -113,7 +113,7 @@ figure
 # One call. It searches on 32 plants, with noise of the level sensors, and then judges the answer on
 # 256 other plants.
 
-# %% tags=["times"]
+# %%
 result = tuning.tune(case)
 result
 
@@ -225,7 +225,7 @@ peak = lambda run, a, b: float(run.x[(run.t >= a) & (run.t < b), 0].max())
 # {{8 - float(runs["cone"].x[runs["cone"].t >= 205, 0].min()):.1f}} cm below its setpoint. The tuner takes the cone like
 # any other rig: the derivatives come from the ten lines above.
 
-# %% tags=["times"]
+# %%
 tuned = tuning.tune(cone)
 tuned
 

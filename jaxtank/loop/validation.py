@@ -83,7 +83,7 @@ def check(
 
 
 def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
-    """What the checks depend on, as a hashable value: structure of the loop, and a digest of shapes,
+    """What the checks depend on, hashable: structure of the loop, clock, and a digest of shapes,
     types and values of its leaves; None where it has none, as inside a trace.
     """
     leaves, structure = cast(tuple[list[Any], Any], jax.tree.flatten(loop))

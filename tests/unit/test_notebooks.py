@@ -155,6 +155,9 @@ def test_rounding_times_and_addresses_are_no_differences(stale):
     assert stale.differences(notebook(), notebook(value="error  0.298 cm\n")) == []
     slow = notebook(value="2.1 ms", tags=["times"]), notebook(value="9.4 ms", tags=["times"])
     assert stale.differences(*slow) == []
+    for text in ("2 gains changed ({} s)\n", "{} s, 9 simulations with", "margin {}e-14 cm\n"):
+        pair = [notebook(value=text.format(took)) for took in ("12.7", "3.1")]
+        assert stale.differences(*pair) == []
     a, b = (notebook(prose=f"Run time: about {n} s. <a at 0x7f{n}abcdef>") for n in (20, 50))
     assert stale.differences(a, b) == []
 

@@ -28,7 +28,7 @@ from tuning.storage.evaluation_log import EvaluationCache
 
 FORWARD_LIMIT = 40
 """Number of free parameters up to which derivatives run forward with the simulation; above,
-checkpointed reverse, without a Gauss-Newton matrix. The costs cross there (four-tank, derivatives of
+checkpointed reverse, without a Gauss-Newton matrix. Costs cross there (four-tank, derivatives of
 five measures in runs: forward 7, 11 and 26 with 24, 40 and 60 parameters, reverse 9.4 to 11).
 """
 

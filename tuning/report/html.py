@@ -24,6 +24,9 @@ DENSE = 800
 LONG = 60
 """Characters of a cell above which its text is wrapped."""
 
+COLUMNS = 80
+"""Of the lines that commands print."""
+
 WIDE = 480.0
 """Width of a picture [pt] above which it can be enlarged in a narrow window."""
 
@@ -185,12 +188,31 @@ def _part(part):
     if ruled or any("   " in line.strip() for line in lines):
         return f"<pre>{escape(part)}</pre>"
     found = []
-    for dashed, group in itertools.groupby(lines, lambda line: line.startswith("- ")):
+    dashed_lines = itertools.groupby(_unwrapped(lines), lambda line: line.startswith("- "))
+    for dashed, group in dashed_lines:
         if dashed:
             found.append(_list(line[2:] for line in group))
         else:
             found += [f"<p>{escape(line)}</p>" for line in group if line.strip()]
     return "\n".join(found)
+
+
+def _unwrapped(lines):
+    """Yield lines as they were before they were wrapped for a terminal: an indented line goes on
+    with the item of a list, and any other one with a line that had no room for its first word.
+    """
+    whole, last = "", ""
+    for line in lines:
+        full = last and len(last) + 1 + len(line.split(" ")[0]) > COLUMNS
+        goes_on = line.startswith("  ") if whole.startswith("- ") else full
+        if whole and goes_on and not line.startswith("- "):
+            whole += f" {line.strip()}"
+        else:
+            if whole:
+                yield whole
+            whole = line
+        last = line
+    yield whole
 
 
 NUMBER = re.compile(r"[-+<>=≤≥ ]*[-+]?\d[\d.,e+\-: %]*( ?(s|cm|m|V))?|-")

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import textwrap
 import xml.etree.ElementTree
 from html.parser import HTMLParser
 
@@ -378,6 +379,21 @@ def test_parts_become_tables_lists_and_paragraphs():
     )
     # still text where text is wanted
     assert "x<1" in read.words and str(table).splitlines()[0] == "name  value"
+
+
+def test_lines_wrapped_for_a_terminal_are_one_paragraph_or_item():
+    sentence = (
+        "limits hold on 256 of 256 validation plants of the rig with two tanks, proved for tank 1"
+    )
+    item = (
+        "the search tightened limits by up to 13 %, so that they hold on validation plants as well"
+    )
+    lines = textwrap.wrap(sentence, 80) + ["short", "another"]
+    lines += textwrap.wrap(item, 80, initial_indent="- ", subsequent_indent="  ")
+    table = tables.table([["x", 2]], ["name", "value"])
+    text = html.fragment(["\n".join(lines), table])
+    for whole in (f"<p>{sentence}</p>", "<p>short</p>", "<p>another</p>", f"<li>{item}</li>"):
+        assert whole in text
 
 
 BROWSER = next(
