@@ -316,7 +316,6 @@ RIVALS = {
     "python-control (continuous controller)": python_control,
 }
 WHOLE = (numba_loop, casadi_accumulated, plain_scan, jax_as_it_comes)
-ABSENT = ("jaxonomy", "fugacio")
 
 
 def main(words):
@@ -330,7 +329,7 @@ def main(words):
     resting = int(np.argmax(np.any(r != r[:, :1], axis=0)))
     names = ("rms_error_total",)
     ours = lambda: jaxtank.evaluate(case.loop, case.clock, names)["rms_error_total"]
-    calls, steps, missing = {"jaxtank": ours}, {"jaxtank": case.clock.samples}, list(ABSENT)
+    calls, steps, missing = {"jaxtank": ours}, {"jaxtank": case.clock.samples}, []
     with tempfile.TemporaryDirectory() as folder:
         function = bench.c_loop(folder)
         if function is None:
@@ -384,19 +383,22 @@ def main(words):
         "samples",
     ]
     print(tables.table(rows, heads))
-    print(f"not here: {', '.join(missing)}")
+    if missing:
+        print(f"not here: {', '.join(missing)}")
     if "--markdown" in words:
-        lines = [
-            f"| {' | '.join(heads)} |",
-            "|---" * len(heads) + "|",
-            *(f"| {' | '.join(row)} |" for row in rows),
-        ]
-        text = README.read_text()
-        table = "\n".join(lines)
-        write_atomic(
-            README,
-            re.sub(f"{BEGIN}.*?{END}", lambda _: f"{BEGIN}\n{table}\n{END}", text, flags=re.DOTALL),
-        )
+        store(BEGIN, END, heads, rows)
+
+
+def store(begin, end, heads, rows):
+    """Write a table to README.md, between its marks."""
+    lines = [
+        f"| {' | '.join(heads)} |",
+        "|---" * len(heads) + "|",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
+    text, table = README.read_text(), "\n".join(lines)
+    found = re.sub(f"{begin}.*?{end}", lambda _: f"{begin}\n{table}\n{end}", text, flags=re.DOTALL)
+    write_atomic(README, found)
 
 
 if __name__ == "__main__":
