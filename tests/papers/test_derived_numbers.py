@@ -1,5 +1,5 @@
-"""Coefficients that follow from the printed parameters, as computed by hand from the papers' formulas
-to all digits: what every run of these rigs is made of.
+"""Coefficients that follow from the printed parameters, computed by hand from the formulas of the
+papers to all digits: what every run of these rigs is made of.
 """
 
 import numpy as np
