@@ -52,6 +52,11 @@ HAIR, BESIDE = (
     # beside several kinks: how far the derivative is looked at, and how near it must be: curvature
     # moves it by 1e-5
 )
+SIDES = 0.01
+"""Share of the tolerance by which the slopes of both sides of several kinks must differ: those of
+single kinks nearly cancel in some directions.
+"""
+
 TOLERANCE = 1e-6
 FLOOR = 1e-3  # share of a component's largest slope below which an error is relative to that share
 BOTH_WAYS = 1e-9  # forward against reverse,
@@ -169,7 +174,7 @@ def audit(subject, seed=0):
                     ]
                 )
                 right = (np.abs(beside - slopes) / scale[k, d] < BESIDE).all(axis=0) & (
-                    apart >= subject.tolerance
+                    apart >= SIDES * subject.tolerance
                 )
                 outside = right & (error[k, d] >= subject.tolerance)
                 error[k, d], piled = np.where(outside, 0.0, error[k, d]), piled + int(outside.sum())
