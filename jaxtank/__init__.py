@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from jaxtank.interop import gymnasium as environment  # noqa: F401
     from jaxtank.interop import python_control as neighbours  # noqa: F401
     from jaxtank.loop.closed_loop import ClosedLoop as ClosedLoop
+    from jaxtank.loop.many import evaluate_many as evaluate_many
     from jaxtank.loop.margins import stability_margins as stability_margins
     from jaxtank.loop.run import evaluate as evaluate
     from jaxtank.loop.run import sensitivities as sensitivities
@@ -80,6 +81,7 @@ _NAMES = {
     "ClosedLoop": "jaxtank.loop.closed_loop",
     "simulate": "jaxtank.loop.run",
     "evaluate": "jaxtank.loop.run",
+    "evaluate_many": "jaxtank.loop.many",
     "sensitivities": "jaxtank.loop.run",
     "stability_margins": "jaxtank.loop.margins",
     "check": "jaxtank.loop.validation",

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -106,7 +107,7 @@ def _signature(loop: ClosedLoop, clock: Clock, keyless: bool) -> Any:
 
 def _plain(value: Any) -> bool:
     """Return False for an array of random keys, which are no numbers."""
-    return not jax.dtypes.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended)
+    return not jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.extended)
 
 
 def _remember(passed: dict[Any, None], signature: Any) -> None:

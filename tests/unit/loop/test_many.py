@@ -1,0 +1,168 @@
+"""Many runs at once: in batches, and in a Pallas kernel, which runs in the interpreter here and is
+lowered for a GPU without one.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import presets
+from jaxtank.core.errors import InputError
+from jaxtank.loop.many import _mapped
+
+NAMES = ("rms_error_total", "max_level", "iae")
+
+
+def short(name, samples=60):
+    case = presets.find(name)
+    clock = dataclasses.replace(case.clock, duration=(samples - 1) * case.clock.dt)
+    return case.loop, clock
+
+
+def spread(loop, name, count=5):
+    share = np.random.default_rng(0).uniform(0.9, 1.1, count)
+    own = np.asarray(jaxtank.parameters(loop)[name])
+    return {name: share.reshape(-1, *(1,) * own.ndim) * own}
+
+
+def one_by_one(loop, clock, rows, key=None):
+    count = len(next(iter(rows.values())))
+    runs = []
+    for i in range(count):
+        here = jaxtank.with_values(loop, {n: v[i] for n, v in rows.items()})
+        noise = None if key is None else jax.random.fold_in(key, i)
+        runs.append(jaxtank.evaluate(here, clock, NAMES, noise))
+    return {n: np.stack([run[n] for run in runs]) for n in NAMES}
+
+
+@pytest.mark.parametrize("batch", [2, 5, 256])
+def test_batches_give_what_single_runs_give(batch):
+    loop, clock = short("gouta2015/backstepping")
+    rows = spread(loop, "plant.orifice")
+    found = jaxtank.evaluate_many(loop, clock, NAMES, rows, batch=batch)
+    for name, expected in one_by_one(loop, clock, rows).items():
+        np.testing.assert_allclose(found[name], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_each_run_has_noise_of_its_own():
+    loop, clock = short("cascaded/pi")
+    loop = jaxtank.with_values(loop, {"sensor.noise": [0.1, 0.1]})
+    rows, key = {"controller.Kc": np.ones((4, 1))}, jax.random.key(3)
+    found = jaxtank.evaluate_many(loop, clock, NAMES, rows, key, batch=3)
+    expected = one_by_one(loop, clock, rows, key)
+    np.testing.assert_allclose(found["iae"], expected["iae"], rtol=1e-12)
+    assert len(np.unique(np.round(np.ravel(expected["iae"]), 9))) == 4
+
+
+def test_it_can_be_differentiated_and_compiled_into_a_larger_program():
+    loop, clock = short("gouta2015/backstepping")
+
+    def mean(share):
+        rows = {"plant.orifice": share[:, None] * loop.plant.orifice}
+        return jnp.mean(jaxtank.evaluate_many(loop, clock, NAMES, rows, batch=2)["iae"])
+
+    share, step = np.linspace(0.95, 1.06, 3), 1e-5  # none at rest, where |error| has a kink
+    slopes = jax.jit(jax.jacfwd(mean))(share)
+    for i, move in enumerate(step * np.eye(3)):
+        difference = (mean(share + move) - mean(share - move)) / (2 * step)
+        assert float(slopes[i]) == pytest.approx(float(difference), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [("gouta2015/backstepping", "plant.orifice"), ("cascaded/pi", "controller.Kc")],
+)
+def test_the_kernel_gives_what_batches_give(name, what):
+    loop, clock = short(name)
+    rows = spread(loop, what)  # 5 runs, the last one repeated to fill the second block of 4
+    expected = jaxtank.evaluate_many(loop, clock, NAMES, rows)
+    found = jaxtank.evaluate_many(loop, clock, NAMES, rows, kernel=True, batch=4)
+    for name in NAMES:
+        assert found[name].shape == expected[name].shape
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("mirakhorli/hybrid", "plant.orifice"),
+        ("gouta2022/chadpc", "plant.pump_gain"),
+        ("khalid/gpc", "plant.pump_gain"),
+    ],
+)
+def test_the_kernel_gives_what_batches_give_for_other_controllers(name, what):
+    test_the_kernel_gives_what_batches_give(name, what)
+
+
+@pytest.fixture
+def for_gpu(monkeypatch):
+    """Trace as if a GPU were there; programs of the CPU are forgotten before and after."""
+    jax.clear_caches()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    yield
+    monkeypatch.undo()
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("kernel", [False, True])
+def test_one_program_for_a_gpu_without_a_call_to_the_host(for_gpu, kernel):
+    loop, clock = short("gouta2015/backstepping")
+    rows = spread(loop, "plant.orifice", 64)
+
+    def run(rows):
+        return jaxtank.evaluate_many(loop, clock, NAMES[:2], rows, kernel=kernel, batch=32)
+
+    text = jax.jit(run).trace(rows).lower(lowering_platforms=("cuda",)).as_text()
+    calls = [line for line in text.splitlines() if "custom_call" in line]
+    assert "callback" not in text and "lapack" not in text
+    assert len(calls) == kernel and all("xla.gpu.triton" in line for line in calls)
+
+
+@pytest.mark.parametrize(
+    ("values", "options", "words"),
+    [
+        ({}, {}, "at least one parameter"),
+        ({"controller.Kc": np.ones(3)}, {}, r"must be \('N', 1\)"),
+        ({"controller.Kc": np.ones((0, 1))}, {}, "must be"),
+        ({"controller.Kc": np.full((3, 1), np.inf)}, {}, "finite"),
+        ({"controller.Kp": np.ones((3, 1))}, {}, "Kc"),
+        ({"controller.Kc": np.ones((3, 1)), "x0": np.ones((2, 2))}, {}, "3 of controller.Kc, 2"),
+        ({"controller.Kc": np.ones((3, 1))}, {"batch": 0}, "batch = 0"),
+        ({"controller.Kc": np.ones((3, 1))}, {"key": jax.random.key(0), "kernel": True}, "noise"),
+        ({"reference.level": np.ones((3, 1))}, {"kernel": True}, "depend on reference.level"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(values, options, words):
+    loop, clock = short("cascaded/pi")
+    if "reference.level" in values:
+        name = next(n for n in jaxtank.parameters(loop) if n.startswith("reference."))
+        own = np.asarray(jaxtank.parameters(loop)[name])
+        values, words = {name: np.stack([own] * 3)}, f"depend on {name}"
+    with pytest.raises(InputError, match=words):
+        jaxtank.evaluate_many(loop, clock, ["iae"], values, **options)
+
+
+def test_the_kernel_refuses_arrays_and_measures_of_the_linearised_loop():
+    loop, clock = short("khalid/gpc-constrained")
+    rows = spread(loop, "plant.pump_gain")
+    with pytest.raises(InputError, match="a step of this loop has arrays"):
+        jaxtank.evaluate_many(loop, clock, ["iae"], rows, kernel=True)
+    with pytest.raises(InputError, match="sensitivity_peak is no running measure"):
+        jaxtank.evaluate_many(loop, clock, ["sensitivity_peak"], rows, kernel=True)
+
+
+def test_the_program_of_batches_does_not_grow_with_their_number():
+    """One loop over batches: the text of the program is the same for 8 and for 8,000 runs."""
+    loop, clock = short("gouta2015/backstepping")
+
+    def lines(count):
+        rows = {"controller.k1": jnp.linspace(0.05, 0.1, count)}
+        lowered = jax.jit(lambda rows: _mapped(loop, rows, None, clock, NAMES, 4)).lower(rows)
+        return len(lowered.as_text().splitlines())
+
+    assert lines(8) == lines(8000)
