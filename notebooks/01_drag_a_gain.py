@@ -57,7 +57,7 @@ published = jaxtank.evaluate(case.loop, case.clock, names)
 run
 
 # %% [markdown]
-# The lower tanks do not. The upper ones do: tank 4 rises to {{published["max_level"][3]:.1f}} cm. To follow a
+# No lower tank comes near its rim. The upper tanks pass theirs: tank 4 rises to {{published["max_level"][3]:.1f}} cm. To follow a
 # ramp, a lower tank needs more inflow, and twice the flow through an orifice needs four times the level
 # above it. (In this model nothing flows over a rim, so that one sees how far it is
 # passed. `plant.overflow` switches that on.)
@@ -90,7 +90,7 @@ left.legend()
 right.semilogx(k1, level, color=TUNED, label="tank 4")
 right.axvline(0.088, color=PUBLISHED, linestyle="--")
 right.axhline(30, color=RIM, label="rim")
-right.set(xlabel="k1 [1/s]", ylabel="highest level [cm]")
+right.set(xlabel="k1 [1/s]", ylabel="highest level of tank 4 [cm]")
 right.legend();
 # %% [markdown]
 # The error falls from {{error[0]:.2f}} to {{error[-1]:.2f}} cm, and the level of tank 4 rises from
@@ -101,8 +101,8 @@ right.legend();
 # ## 200 plants
 #
 # The orifices and pumps of a real rig are known to a few per cent. The figure shows 200 plants whose
-# flows differ from the nominal ones by up to 5 %, while the controller uses the nominal ones. Where a
-# kernel runs, its sliders move all 200 at once; here $k_1$ is moved to 0.17 1/s, and the dashed lines
+# flows differ from the nominal ones by up to 5 %, while the controller uses the nominal ones. If
+# you run this notebook, its sliders move all 200 at once; here $k_1$ is moved to 0.17 1/s, and the dashed lines
 # are the median before.
 #
 # **Guess first:** the nominal plant passes the rim by
@@ -140,7 +140,7 @@ ax.legend();
 # %% [markdown]
 # Down, which is good, and to the right, which is not. For the level the clouds are much wider than
 # the distance between them: 5 % in the flows matters more than a gain twice as large.
-# A plant whose lower outlets are wide needs more inflow, and so a higher upper tank.
+# A plant whose lower outlets are wide needs more inflow, and so a higher level in an upper tank.
 #
 # ## Give it more time?
 #
@@ -169,16 +169,17 @@ ax.set(xlabel="time of a ramp [s]", ylabel="plants above a rim [%]", ylim=(0, 10
 ax.legend(loc="lower right");
 
 # %% [markdown]
-# On {{200 * shares[-1]:.0f}} of them. Slower ramps can never help more than down to the line: on
-# {{100 * cannot:.0f}} % of the plants the setpoints themselves are above what the rims allow. At rest at 8 and 14 cm, tank 4 of the nominal plant stands at
-# {{(rest := jaxtank.analysis.equilibrium(case.loop.plant, (8.0, 14.0))[0])[3]:.1f}} cm. The level above an
+# With ramps of 120 s, {{200 * shares[-1]:.0f}} of the 200 plants still pass a rim. However slow the ramps, the
+# share cannot fall below the line: on {{100 * cannot:.0f}} % of the plants the setpoints themselves are above what the
+# rims allow. At rest at 16 and 10 cm, tank 3 of the nominal plant stands at
+# {{(rest := jaxtank.analysis.equilibrium(case.loop.plant, (16.0, 10.0))[0])[2]:.1f}} cm. The level above an
 # orifice grows with the square of the flow through it: if the lower outlets pass 5 % more and the
 # upper ones 5 % less,
 #
-# $$h_4 = \left(\frac{1.05}{0.95}\right)^2 \cdot {{rest[3]:.2f}}\ \mathrm{cm}
-#   = {{rest[3] * (1.05 / 0.95) ** 2:.1f}}\ \mathrm{cm},$$
+# $$h_3 = \left(\frac{1.05}{0.95}\right)^2 \cdot {{rest[2]:.2f}}\ \mathrm{cm}
+#   = {{rest[2] * (1.05 / 0.95) ** 2:.1f}}\ \mathrm{cm},$$
 #
-# above the rim, under any controller, at any speed. Unequal errors of the orifices are worse.
+# above the rim, under any controller, at any speed.
 
 # %% [markdown]
 # ## Conclusion
@@ -193,13 +194,13 @@ ax.legend(loc="lower right");
 #
 # ## Exercises
 #
-# **1.** The words below the sliders say that 10 % more $k$ changes almost nothing. Multiply it by ten:
-# what becomes of the error of the nominal plant with the published $k_1$?
+# **1.** With the published gains, what do 10 % more $k$ change, and what does ten times $k$?
 #
 # <details><summary>Answer</summary>
 #
-# {{(at := lambda k: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.k": k}), case.clock, names))(0.3)["rms_error_total"]:.3f}} cm
-# in place of {{published["rms_error_total"]:.3f}} cm. The inflow is reached three times faster, since
+# 10 % more change the error from {{published["rms_error_total"]:.3f}} to
+# {{(at := lambda k: jaxtank.evaluate(jaxtank.with_values(case.loop, {"controller.k": k}), case.clock, names))(0.033)["rms_error_total"]:.3f}} cm, ten times as much to
+# {{at(0.3)["rms_error_total"]:.3f}} cm. The inflow is then reached three times faster, since
 # $k + k_1$ is 0.388 in place of 0.118 1/s. A derivative is right for a small step; it does not say
 # what a large one does. Notebook 02 is about that.
 # </details>

@@ -86,8 +86,8 @@ axes[1].set(ylabel="pump [V]", xlabel="time [s]");
 #
 # ## Which experiment?
 #
-# Before the record, one would have had to choose an experiment. The covariance that an experiment
-# leaves is known before it is made. With the sensitivities $J$ of its readings and their noise
+# Suppose that no record exists yet, and an experiment must be chosen. The covariance that it leaves can
+# be computed before it is made, for a model without errors and white noise. With the sensitivities $J$ of its readings and their noise
 # $\sigma$ it is
 #
 # $$\operatorname{cov}(\hat\theta) = \sigma^2\,(J^\top J)^{-1}.$$
@@ -104,10 +104,10 @@ tuning.compare_experiments(case, free, duration=1000.0, voltage=[3.0], **usual)
 #   an overflow that does not occur.
 # - A single step does not find the pump gain and the offset either: at one voltage, only the inflow
 #   $k_4 (u + u_0)$ acts.
-# - Small changes about a steady state find one coefficient to a few per cent, and little else.
+# - Several small changes about a steady state find one coefficient to a few per cent, and little else.
 #
 # The record was made differently: many voltages, slow and fast, and both tanks over their rims. The
-# same calculation for its input, of which 250 samples last 1000 s:
+# same calculation for the recorded input (250 samples are 1000 s, as long as the experiments above):
 
 # %%
 inputs = {
@@ -132,9 +132,12 @@ found
 # {{found.validation["held_back"]["rmse"][0]:.2f}} V in the validation quarter.
 #
 # One line of the report needs attention: from sample to sample the residual has a correlation of
-# {{found.quality["residual_autocorrelation"][0]:.2f}}. Noise has none. The formula above counts each
+# {{found.quality["residual_autocorrelation"][0]:.2f}}. White noise has 0. The formula above counts each
 # reading as new information. Here it would give intervals that are
-# {{found.quality["widened"]:.1f}} times too narrow, so they are widened by this factor.
+# {{found.quality["widened"]:.1f}} times too narrow, so they are widened by this factor. The plan was for white noise of 0.1 V;
+# with this residual the standard deviation of the pump gain is
+# {{100 * found.parameters["plant.pump_gain[0]"]["sd"] / found.parameters["plant.pump_gain[0]"]["value"]:.1f}} % where the plan has 0.26 %. A plan ranks experiments; it does
+# not know the errors of the model.
 #
 # ## Intervals while readings arrive
 #
@@ -164,7 +167,8 @@ for ax, (name, unit) in zip(axes, shown.items()):
 # level reaches 10 V for the first time, after {{overflow / 60:.0f}} min.
 #
 # - Before the first overflow `caught` has no interval at all, as the plan said.
-# - The thick intervals shrink with the readings, at first quickly. The thin ones stop shrinking: with 192
+# - The thick intervals shrink with the readings, at first quickly. The thin ones do not become narrower after
+#   the first quarter of an hour, that of `caught` even wider: with 192
 #   readings the standard deviation of the pump gain is
 #   {{100 * fits[192].parameters["plant.pump_gain[0]"]["sd"] / fits[192].parameters["plant.pump_gain[0]"]["value"]:.1f}} %,
 #   with 1024 it is
@@ -207,13 +211,13 @@ within = np.mean(((seen > low) & (seen < high))[plants.fan["t"] >= record.t[768]
 # The prediction follows every turn of the validation quarter, with {{rms(best, slice(768, None)):.2f}} V
 # RMS where the first guess has {{rms(at_first, slice(768, None)):.1f}} V. But only
 # {{100 * within:.0f}} % of the readings there lie within the band. The band shows what the
-# *parameters* leave open; what the *model* leaves out is not in it. So even the widened intervals are
-# too narrow.
+# *parameters* leave open; what the *model* leaves out is not in it, and here this is
+# more.
 #
 # ## A controller for it
 #
 # With `law="pi"` the identification has proposed a PI controller from the identified model. Its plants
-# are drawn from the covariance. The figure is live in a running notebook; the picture has a gain of 1.0
+# are drawn from the covariance. If you run this notebook, the figure is live; the picture has a gain of 1.0
 # instead of the proposed one (dashed).
 #
 # **Guess first:** what happens in the upper tank, which has no sensor in the record?
@@ -225,12 +229,12 @@ figure
 
 # %% [markdown]
 # The lower tank follows sooner and overshoots, and the upper one comes to its limits:
-# {{figure.words[0]}}. The proposed gain is slow
-# and safe. Gains between the two are found by `tuning.tune(found.identified)`.
+# {{figure.words[0]}}. With the proposed gain no tank overflows, but the
+# lower level needs minutes to follow. Gains between the two are found by `tuning.tune(found.identified)`.
 #
 # ## Conclusion
 #
-# - An experiment can be judged before it is made. A step at one voltage does not separate the gain of a
+# - Experiments can be compared before they are made. A step at one voltage does not separate the gain of a
 #   pump from its offset, and a share of an overflow needs an overflow.
 # - The identified rig has an error of {{found.quality["rmse"][0]:.2f}} V where the guess had
 #   {{rms(at_first):.1f}} V, and predicts a quarter that it has not seen with
