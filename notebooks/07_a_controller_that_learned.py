@@ -191,9 +191,9 @@ legend = ax.legend()
 # - As printed (Tp = 11 s), `ngpc` has {{error(found["ngpc"]):.2f}} cm and moves its pumps by
 #   {{moves(found["ngpc"]):.1f}} % per sample. The network has {{error(found["network"]):.2f}} cm with
 #   {{moves(found["network"]):.1f}} %, backstepping {{error(found["backstepping"]):.2f}} cm with
-#   {{moves(found["backstepping"]):.1f}} %: it lies below the line of `ngpc`.
-# - Backstepping with fast gains has {{error(found["backstepping, fast gains"]):.2f}} cm, with
-#   {{moves(found["backstepping, fast gains"]):.0f}} %: without a price on the motion it is the better one.
+#   {{moves(found["backstepping"]):.1f}} %. The network lies below the line of `ngpc`.
+# - Backstepping with fast gains has {{error(found["backstepping, fast gains"]):.2f}} cm and moves its pumps by
+#   {{moves(found["backstepping, fast gains"]):.0f}} %: with noise in the readings such gains are of little use.
 # - With a horizon of 4 s `ngpc` reaches {{error(sweep["ngpc"][0]):.2f}} cm, but needs
 #   {{moves(sweep["ngpc"][0]):.0f}} %: a short horizon amplifies the noise.
 # - With an observer the error is {{error(found["ngpc-observer"]):.2f}} cm at

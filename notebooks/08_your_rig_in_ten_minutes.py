@@ -9,7 +9,7 @@
 # exported. In the second half a vessel is a cone, which no list of straight tanks can describe: it
 # takes ten lines of Python. The quadruple tank of K. H. Johansson,
 # [IEEE Trans. Control Syst. Technol. 8 (2000) 456](https://doi.org/10.1109/87.845876), which needs the same
-# few lines, is one of the package's cases (`johansson/minimum-phase`).
+# few lines, is one of the package's cases (`johansson/pi-minimum`).
 #
 # Run time: about {{run_time}} s. {{links}}
 
@@ -144,7 +144,7 @@ figure = responses(case.loop, {"first guess": before, "tuned": after}, "buffer a
 # sample, anti-windup and limits of the pump included. `"m"` gives MATLAB, `"js"` JavaScript. The safety
 # filter is exported with it unless it is taken off, as here, to keep the text short. That is another loop:
 # on the 256 plants it keeps the limits on {{100 * (bare := tuning.validate(result.tuned.without_safety_filter())).share_held()["share"]:.0f}} %, with a mean error of
-# {{np.mean(bare.error):.2f}} cm. On a rig, export it with the filter.
+# {{np.mean(bare.error):.2f}} cm; but only with the filter is it proved for every plant.
 
 # %%
 code = jaxtank.export.export(result.tuned.without_safety_filter(), "c", name="product")

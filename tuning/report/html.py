@@ -203,7 +203,7 @@ def _unwrapped(lines):
     """
     whole, last = "", ""
     for line in lines:
-        full = last and len(last) + 1 + len(line.split(" ")[0]) > COLUMNS
+        full = len(last) <= COLUMNS < len(last) + 1 + len(line.split(" ")[0])
         goes_on = line.startswith("  ") if whole.startswith("- ") else full
         if whole and goes_on and not line.startswith("- "):
             whole += f" {line.strip()}"
