@@ -86,8 +86,9 @@ def evaluate_many(
     >>> jaxtank.evaluate_many(loop, clock, ["max_level"], gains)["max_level"].shape
     (5, 2)
     """
-    names, rows = tuple(measures), {n: jnp.asarray(v) for n, v in values.items()}
+    names = (measures,) if isinstance(measures, str) else tuple(measures)
     ms.check_names(names)
+    rows = {n: jnp.asarray(v) for n, v in values.items()}
     count = _count(loop, rows, batch)
     check(with_values(loop, {n: v[0] for n, v in rows.items()}), clock, key)
     if kernel:
