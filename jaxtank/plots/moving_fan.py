@@ -154,7 +154,7 @@ class _Panel:
         self.ax, self.t = ax, t
         self.bounds = [v if abs(v) < UNLIMITED else np.inf for v in bounds]
         self.still = [v for v in (before, setpoint) if v is not None and np.isfinite(v).all()]
-        self.shape = np.empty((2 * len(t), 2))
+        self.shape = np.zeros((2 * len(t), 2))  # its ordinates are read before the first `move`
         self.shape[:, 0] = np.concatenate([t, t[::-1]])
         self.bands = [
             ax.add_collection(

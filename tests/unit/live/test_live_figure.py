@@ -133,6 +133,25 @@ def test_lines_are_moved_and_not_made_again(fan):
     )
 
 
+def test_nothing_is_read_from_memory_that_was_not_written(case, monkeypatch):
+    """What an earlier owner of the memory left there may be 1e308: no axis can hold that, and now
+    and then a notebook ended with a singular matrix.
+    """
+    real, t = np.empty, np.arange(5.0)
+
+    def left_over(shape, *args, **kwargs):
+        made = real(shape, *args, **kwargs)
+        if made.shape == (2 * len(t), 2) and made.dtype == float:
+            made[:] = np.array([1.0, -1.0])[:, None].repeat(len(t), axis=0) * 1.7e308
+        return made
+
+    monkeypatch.setattr(np, "empty", left_over)
+    x, u = np.ones((6, 5, case.loop.plant.tanks)), np.ones((6, 5, case.loop.plant.pumps))
+    picture = MovingFan(case.loop, t, np.ones((5, len(case.loop.plant.outputs))), x, u)
+    for _, _, panel in picture.panels:
+        assert np.abs(panel.ax.dataLim.get_points()).max() < 1e3
+
+
 def test_a_pump_without_limits_is_drawn_without_them(case):
     """Its limits are numbers so large that a picture cannot hold them."""
     wide = jaxtank.with_values(case.loop, {"actuator.low": [-1e300], "actuator.high": [1e300]})
