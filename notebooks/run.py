@@ -25,7 +25,7 @@ import jupytext
 import nbformat
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
-from stale import differences, text_differs
+from stale import differences, joined, text_differs
 
 FOLDER = Path(__file__).resolve().parent
 FIELD = re.compile(r"\{\{(.+?)\}\}")
@@ -80,6 +80,8 @@ def tidy(notebook):
     """Remove from a notebook what differs from run to run without a meaning."""
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
+        if "outputs" in cell:
+            cell.outputs = joined(cell.outputs)
         for output in cell.get("outputs", []):
             if output.output_type == "stream":  # a warning names a file of this run alone
                 output.text = re.sub(r"\S*ipykernel_\d+/\d+\.py", "notebook", output.text)

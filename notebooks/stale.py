@@ -75,6 +75,22 @@ def text_differs(stored, fresh, numbers=True):
     return None
 
 
+def joined(outputs):
+    """Return the outputs of a cell, what it printed in one piece where a slow kernel sent several.
+
+    nbclient's own coalesce_streams would also join what stands before and after a picture.
+    """
+    found = []
+    for output in outputs:
+        before = found[-1] if found else {}
+        if output["output_type"] == "stream" and output["name"] == before.get("name"):
+            text = "".join(before["text"]) + "".join(output["text"])
+            found[-1] = type(output)(output, text=text)
+        else:
+            found.append(output)
+    return found
+
+
 def described(output):
     """Return {what: text} of one output of a cell: what a reader sees of it."""
     kind = output["output_type"]
@@ -112,7 +128,7 @@ def differences(stored, fresh):
         if a["cell_type"] == "code":
             if source[0] != source[1]:
                 found.append(f"{place}: the code differs")
-            outputs = [[described(o) for o in cell["outputs"]] for cell in (a, b)]
+            outputs = [[described(o) for o in joined(cell["outputs"])] for cell in (a, b)]
             kinds = [[list(o) for o in one] for one in outputs]
             if kinds[0] != kinds[1]:
                 found.append(f"{place}: stored outputs {kinds[0]}, now {kinds[1]}")

@@ -19,6 +19,7 @@ from jaxtank import measures as ms
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, run_of, takes_arrays
 from jaxtank.loop.run import evaluate_and_flag
@@ -46,8 +47,8 @@ def evaluate_many(
 ) -> dict[str, jax.Array]:
     """Run the loop at N sets of values and keep only running measures.
 
-    What `jax.vmap` of `evaluate` gives, some runs at a time, so that memory and speed do not depend
-    on N. It can be differentiated, and called inside `jax.jit`.
+    What `jax.vmap` of `evaluate` gives, some runs at a time, so that neither the memory of the
+    runs nor the time of each depends on N. It can be differentiated, and called inside `jax.jit`.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def evaluate_many(
     key : jax random key, optional
         For the sensor noise; run i has that of jax.random.fold_in(key, i).
     batch : int
-        Runs side by side.
+        Runs side by side; in a kernel a power of 2.
     kernel : bool
         Run the samples in one Pallas kernel, for a GPU: a loop without a launch for each step. It
         has no noise, no derivatives, and setpoints that are the same in all runs. Without a GPU it
@@ -88,20 +89,37 @@ def evaluate_many(
     """
     names = (measures,) if isinstance(measures, str) else tuple(measures)
     ms.check_names(names)
-    rows = {n: jnp.asarray(v) for n, v in values.items()}
+    rows = _rows(values)
     count = _count(loop, rows, batch)
     check(with_values(loop, {n: v[0] for n, v in rows.items()}), clock, key)
     if kernel:
+        if batch & (batch - 1):
+            raise InputError(f"batch = {batch}: must be a power of 2 runs in a kernel")
         return _in_kernel(loop, clock, names, rows, key, batch)
     return _mapped(loop, rows, key, clock, names, min(batch, count))
+
+
+def _rows(values: Any) -> dict[str, jax.Array]:
+    """`values` as arrays; raises InputError for what is none."""
+    if not isinstance(values, Mapping) or not values:
+        raise InputError(
+            "values: must be {parameter: array with a row for each run}, of one parameter at least"
+        )
+    rows: dict[str, jax.Array] = {}
+    for name, value in values.items():
+        try:
+            rows[str(name)] = jnp.asarray(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(
+                f"{name} = {shortened(value)}: must be an array of numbers, a row for each run"
+            ) from error
+    return rows
 
 
 def _count(loop: ClosedLoop, rows: Mapping[str, jax.Array], batch: Any) -> int:
     """The number of runs; raises InputError for rows of several lengths, shapes or out of range."""
     if not isinstance(batch, int) or isinstance(batch, bool) or batch < 1:
         raise InputError(f"batch = {batch!r}: must be a whole number of at least 1 run")
-    if not rows:
-        raise InputError("evaluate_many needs at least one parameter: values is empty")
     for name, value in rows.items():
         shape = np.shape(get_value(loop, name))
         if value.ndim < 1 or value.shape[1:] != shape or not value.shape[0]:
@@ -170,8 +188,8 @@ def _in_kernel(
         ended = looped(jax.vmap(advance, in_axes=(0, 0, None)), padded, start, xs, block)
     except Unfit as error:
         raise InputError(
-            "kernel: a step of this loop has arrays (a programme, a Kalman filter, ten tanks or"
-            " more), which a kernel of single numbers cannot hold: kernel=False"
+            "kernel: a step of this loop has arrays (a quadratic programme, a Kalman filter, ten"
+            " tanks or more), which a kernel of single numbers cannot hold: kernel=False"
         ) from error
     found: Any = jax.vmap(finish)(padded, ended)
     return jax.tree.map(lambda v: v[:count], found)

@@ -43,12 +43,12 @@ def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> A
     jaxpr, structure = closed.jaxpr, jax.tree.structure(shape)
     once, inside, same = _split(jaxpr)
     constants = dict(zip(jaxpr.constvars, closed.consts))
-    _run(once, constants, same)
+    run(once, constants, same)
 
     def lean(state, x):
         values = {**constants, **dict(zip(jaxpr.invars, jax.tree.leaves((state, x))))}
-        _run(inside, values, same)
-        return jax.tree.unflatten(structure, [_read(v, values, same) for v in jaxpr.outvars])
+        run(inside, values, same)
+        return jax.tree.unflatten(structure, [read(v, values, same) for v in jaxpr.outvars])
 
     return jax.lax.scan(lean, carry, xs, length=length)
 
@@ -106,20 +106,37 @@ def _key(eqn, operands):
     return eqn.primitive, read, tuple(sorted((name, str(p)) for name, p in eqn.params.items()))
 
 
-def _run(eqns, values, same):
-    """Do the operations in order, reading and writing {variable: value}."""
+def run(eqns, values, same):
+    """Do the operations in order, reading and writing {variable: value}; same: {variable: the one
+    it equals}.
+
+    Examples
+    --------
+    >>> jaxpr = jax.make_jaxpr(lambda x: 2.0 * x)(1.0).jaxpr
+    >>> values = {jaxpr.invars[0]: 3.0}
+    >>> run(jaxpr.eqns, values, {})
+    >>> float(read(jaxpr.outvars[0], values, {}))
+    6.0
+    """
     for eqn in eqns:
         bound = eqn.primitive.get_bind_params(eqn.params)
         # a pair in older releases of jax
         functions, params = bound if isinstance(bound, tuple) else ((), bound)
         with eqn.ctx.manager:  # the metadata that `materialised` gives a call
             out = eqn.primitive.bind(
-                *functions, *(_read(v, values, same) for v in eqn.invars), **params
+                *functions, *(read(v, values, same) for v in eqn.invars), **params
             )
         values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out]))
 
 
-def _read(v, values, same):
+def read(v, values, same):
+    """Return the value of a variable, or of a literal.
+
+    Examples
+    --------
+    >>> read(Literal(2.0, jax.core.ShapedArray((), jnp.float32)), {}, {})
+    2.0
+    """
     return v.val if isinstance(v, Literal) else values[same.get(v, v)]
 
 

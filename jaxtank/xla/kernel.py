@@ -3,10 +3,10 @@
 Imports `xla` only; used by `loop.many`.
 
 What it is for, estimated for an H100 in float64, 1e6 plants of 120,001 steps: about 600 operations
-a step and plant are 7e13, 3 to 4 s of its arithmetic; with square roots and divisions 5 to 7 s in a
-loop that keeps levels and sums in registers. As `jax.lax.scan` each step is a launch of one fused
-kernel that reads and writes 100 bytes a plant: 15 to 25 s. It has been run by Pallas's interpreter,
-and lowered to Triton; no GPU was at hand to run it on.
+a step and plant are 7e13, 2 s at the 34e12 a second of its data sheet; with square roots and
+divisions 5 to 7 s in a loop that keeps levels and sums in registers. As `jax.lax.scan` each step is
+a launch of one fused kernel that reads and writes 100 bytes a plant: 15 to 25 s. It has been run by
+Pallas's interpreter, and lowered to Triton; no GPU was at hand to run it on.
 """
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.extend.core import Literal
 
 from jaxtank.xla.barrier import materialised
+from jaxtank.xla.hoist import read, run
 
 BARRIER = "_as_it_is"
 """Name of the call that `materialised` makes on a CPU, which stays one."""
@@ -72,16 +73,16 @@ def looped(advance: Callable[..., Any], rows: Any, start: Any, xs: Any, block: i
     size = sum(map(len, groups))
 
     def kernel(*refs: Any) -> None:
-        read, parts = iter(refs[:size]), []
+        given, parts = iter(refs[:size]), []
         for group in groups:
-            parts.append([next(read) for _ in group])
+            parts.append([next(given) for _ in group])
         values = dict(zip((*shared, *own), (r[...] for r in (*parts[0], *parts[2]))))
         changing = closed.jaxpr.invars[len(jax.tree.leaves(rows)) :]
 
         def body(k: Any, carry: Any) -> Any:
             here = values | dict(zip(changing, (*carry, *(r[k] for r in parts[1]))))
-            _run(inside, here)
-            return tuple(_read(v, here) for v in closed.jaxpr.outvars)
+            run(inside, here, {})
+            return tuple(read(v, here, {}) for v in closed.jaxpr.outvars)
 
         last = jax.lax.fori_loop(0, samples[0].shape[0], body, tuple(r[...] for r in parts[3]))
         for ref, value in zip(refs[size:], last, strict=True):
@@ -93,7 +94,7 @@ def looped(advance: Callable[..., Any], rows: Any, start: Any, xs: Any, block: i
     def blocked(v: Any) -> Any:
         return pl.BlockSpec((block, *v.shape[1:]), lambda i: (i, *(0,) * (v.ndim - 1)))
 
-    run = pl.pallas_call(
+    ended = pl.pallas_call(
         kernel,
         grid=(moving[0].shape[0] // block,),
         in_specs=[*map(whole, (*groups[0], *samples)), *map(blocked, (*groups[2], *moving))],
@@ -102,7 +103,7 @@ def looped(advance: Callable[..., Any], rows: Any, start: Any, xs: Any, block: i
         compiler_params=triton.CompilerParams(),
         interpret=jax.default_backend() == "cpu",
     )
-    return jax.tree.unflatten(structure, run(*(v for group in groups for v in group)))
+    return jax.tree.unflatten(structure, ended(*(v for group in groups for v in group)))
 
 
 def _before(closed: Any, rows: list[Any], block: int) -> tuple[Any, Any, list[Any]]:
@@ -127,14 +128,14 @@ def _before(closed: Any, rows: list[Any], block: int) -> tuple[Any, Any, list[An
     if any(len(v.aval.shape) > 1 for eqn in inside for v in eqn.outvars):
         raise Unfit
     known = dict(zip(jaxpr.constvars, map(jnp.asarray, closed.consts)))
-    _run(once, known)
+    run(once, known, {})
     used = {v for eqn in inside for v in eqn.invars if not isinstance(v, Literal)}
     used |= {v for v in jaxpr.outvars if not isinstance(v, Literal)}
     wanted = [v for v in (*lanes, *(v for eqn in each for v in eqn.outvars)) if v in used]
 
     def prepare(*given: Any) -> Any:
         here = known | dict(zip(lanes, given))
-        _run(each, here)
+        run(each, here, {})
         return [here[v] for v in wanted]
 
     parted = [v.reshape(-1, block, *v.shape[1:]) for v in rows]
@@ -149,27 +150,11 @@ def _inlined(jaxpr: Any, constants: Any, arguments: Any) -> list[Any]:
     values: dict[Any, Any] = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *arguments)))
     for eqn in jaxpr.eqns:
         inner = eqn.params.get("call_jaxpr", eqn.params.get("jaxpr"))
-        given = [_read(v, values) for v in eqn.invars]
+        given = [read(v, values, {}) for v in eqn.invars]
         if eqn.params.get("name") == BARRIER:
             values.update(zip(eqn.outvars, materialised(tuple(given))))
         elif eqn.primitive.name in CALLS:
             values.update(zip(eqn.outvars, _inlined(inner.jaxpr, inner.consts, given)))
         else:
-            _run([eqn], values)
-    return [_read(v, values) for v in jaxpr.outvars]
-
-
-def _run(eqns: list[Any], values: dict[Any, Any]) -> None:
-    """Do the operations in order, reading and writing {variable: value}."""
-    for eqn in eqns:
-        bound = eqn.primitive.get_bind_params(eqn.params)
-        functions, params = bound if isinstance(bound, tuple) else ((), bound)
-        given = (_read(v, values) for v in eqn.invars)
-        with eqn.ctx.manager:  # the metadata that `materialised` gives a call
-            found = eqn.primitive.bind(*functions, *given, **params)
-        found = found if eqn.primitive.multiple_results else [found]
-        values.update(zip(eqn.outvars, found))
-
-
-def _read(variable: Any, values: dict[Any, Any]) -> Any:
-    return variable.val if isinstance(variable, Literal) else values[variable]
+            run([eqn], values, {})
+    return [read(v, values, {}) for v in jaxpr.outvars]

@@ -162,6 +162,17 @@ def test_rounding_times_and_addresses_are_no_differences(stale):
     assert stale.differences(a, b) == []
 
 
+def test_print_that_a_slow_kernel_sent_in_pieces_is_no_difference(stale):
+    whole, parted = notebook(), notebook()
+    piece = {"output_type": "stream", "name": "stdout"}
+    parted["cells"][0]["outputs"][:1] = [{**piece, "text": t} for t in ("error 0.", "297 cm\n")]
+    assert stale.differences(whole, parted) == stale.differences(parted, whole) == []
+    outputs = parted["cells"][0]["outputs"]
+    assert stale.joined(outputs) == whole["cells"][0]["outputs"]
+    apart = [outputs[0], outputs[2], outputs[1]]  # before and after a picture
+    assert stale.joined(apart) == apart
+
+
 def test_changed_code_kinds_and_counts_of_cells_are_found(stale):
     other = copy.deepcopy(notebook())
     other["cells"][0]["source"] = "b()"

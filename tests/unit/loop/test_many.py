@@ -126,7 +126,11 @@ def test_one_program_for_a_gpu_without_a_call_to_the_host(for_gpu, kernel):
 @pytest.mark.parametrize(
     ("values", "options", "words"),
     [
-        ({}, {}, "at least one parameter"),
+        ({}, {}, "one parameter at least"),
+        ([1.0], {}, "one parameter at least"),
+        ({"controller.Kc": "abc"}, {}, "Kc = 'abc': must be an array of numbers"),
+        ({"controller.Kc": [[1.0], [1.0, 2.0]]}, {}, "must be an array of numbers"),
+        ({"controller.Kc": np.ones((3, 1))}, {"kernel": True, "batch": 6}, "power of 2"),
         ({"controller.Kc": np.ones(3)}, {}, r"must be \('N', 1\)"),
         ({"controller.Kc": np.ones((0, 1))}, {}, "must be"),
         ({"controller.Kc": np.full((3, 1), np.inf)}, {}, "finite"),

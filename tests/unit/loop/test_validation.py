@@ -55,8 +55,6 @@ def test_an_array_that_is_changed_in_place_is_looked_at_again(looks):
     loop = jaxtank.with_values(case.loop, {"controller.Kc": gain})
     held = loop.controller.Kc
     jaxtank.check(loop, case.clock)
-    if not held.flags.writeable:
-        pytest.skip("leaves are read-only")
     held[...] = np.nan
     with pytest.raises(InputError, match="Kc"):
         jaxtank.check(loop, case.clock)
