@@ -26,6 +26,9 @@ LOWEST = 1e-7
 ZOOMS, ZOOM = 5, 15
 """A bracket on the grid is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
 
+CLOSER = 10
+"""The same, where no Newton step follows: brackets are then narrower than 1e-9 of a frequency."""
+
 
 class Margins(NamedTuple):
     """Margins of a loop with m inputs; inf where nothing crosses, and all of them only if `stable`.
@@ -44,7 +47,7 @@ class Margins(NamedTuple):
     delay_frequency: Any  # (m,) the same for the delay margin [rad/s]
 
 
-def margins(loop: OpenLoop) -> Margins:
+def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
     """Return the Margins of a loop, with derivatives of the margins by A, B and C.
 
     The sensitivity peak and every crossover are bracketed on a grid of frequencies and narrowed
@@ -55,6 +58,7 @@ def margins(loop: OpenLoop) -> Margins:
     Parameters
     ----------
     loop : OpenLoop
+    slopes : False for the margins alone, whose program compiles in two thirds of the time.
 
     Returns
     -------
@@ -75,8 +79,12 @@ def margins(loop: OpenLoop) -> Margins:
     w = _grid(still)
     L, _ = fr.response(form, jnp.exp(1j * w * loop.dt))
     brackets = _brackets(w, L)
+    if not slopes:
+        log, L = _narrowed(form, brackets, CLOSER)
+        S, stable = _sensitivity(L), _is_stable(still, form)
+        return _margins_of(brackets.exists, jnp.exp(log), S, _largest_gain(S[:1])[0], stable)
     stop = jax.lax.stop_gradient(brackets.low)
-    found = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets)))
+    found = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets, ZOOMS)[0]))
     return _values(loop, still, brackets._replace(low=stop), found, _is_stable(still, form))
 
 
@@ -229,24 +237,29 @@ def _crossing(L: Any) -> Any:
     return jnp.concatenate([_largest_gain(S)[:, None], jnp.imag(alone), size, size], axis=1)
 
 
-def _narrowed(form: OpenLoop, brackets: _Brackets) -> Any:
-    """Logarithms of the frequencies in the brackets, narrowed ZOOMS times; all in one call."""
+def _narrowed(form: OpenLoop, brackets: _Brackets, zooms: int) -> tuple[Any, Any]:
+    """(logarithms of the frequencies in the brackets, narrowed `zooms` times, L (1 + 3 m, m, m) at
+    the lower ends of the last brackets); all in one call.
+    """
     count = brackets.low.shape[0]
     index = np.arange(count)
 
     def zoom(_, ends):
-        low, high = ends
+        low, high, _ = ends
         log = low[:, None] + (high - low)[:, None] * jnp.linspace(0.0, 1.0, ZOOM)  # (count, ZOOM)
         L, _ = fr.response(form, jnp.exp(1j * form.dt * jnp.exp(jnp.ravel(log))))
         values = _crossing(L).reshape(count, ZOOM, count)[index, :, index]
+        L = L.reshape(count, ZOOM, *L.shape[1:])
         k = jnp.argmax(values[0])
         first = jnp.argmax((values[:, :-1] < 0.0) != (values[:, 1:] < 0.0), axis=1)
         left = first.at[0].set(jnp.maximum(k - 1, 0))
         right = (first + 1).at[0].set(jnp.minimum(k + 1, ZOOM - 1))
-        return log[index, left], log[index, right]
+        return log[index, left], log[index, right], L[index, left]
 
-    low, high = jax.lax.fori_loop(0, ZOOMS, zoom, (brackets.low, brackets.high))
-    return 0.5 * (low + high)
+    m = form.B.shape[1]
+    none = jnp.zeros((count, m, m), jnp.result_type(form.A, jnp.complex64))
+    low, high, L = jax.lax.fori_loop(0, zooms, zoom, (brackets.low, brackets.high, none))
+    return 0.5 * (low + high), L
 
 
 def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable: Any) -> Margins:
@@ -271,7 +284,15 @@ def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable
     S = every[0]
     u, v, _ = _pair(jax.lax.stop_gradient(S))
     peak = jnp.real(jnp.conj(u) @ S @ v)
-    one = jnp.where(brackets.exists, _alone(every)[index, which], 1.0)  # no zero to divide by
+    return _margins_of(brackets.exists, w, every, peak, stable)
+
+
+def _margins_of(exists: Any, w: Any, S: Any, peak: Any, stable: Any) -> Margins:
+    """The Margins of S (1 + 3m, m, m) at the frequencies w (1 + 3m,), of which some `exists`."""
+    m = S.shape[1]
+    which = np.concatenate([[0], np.tile(np.arange(m), 3)])
+    index = np.arange(len(which))
+    one = jnp.where(exists, _alone(S)[index, which], 1.0)  # no zero to divide by
     size, angle = jnp.log(jnp.abs(one)), jnp.angle(one)
     wrapped = jnp.mod(angle + jnp.pi, 2.0 * jnp.pi)
     found = jnp.where(
@@ -279,6 +300,6 @@ def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable
         jnp.exp(jnp.abs(size)),
         jnp.where(index <= 2 * m, jnp.degrees(jnp.pi - jnp.abs(angle)), wrapped / w),
     )
-    found = jnp.where(brackets.exists, found, jnp.inf)
+    found = jnp.where(exists, found, jnp.inf)
     parts = lambda v: (v[1 : m + 1], v[m + 1 : 2 * m + 1], v[2 * m + 1 :])
     return Margins(stable, peak, *parts(found), w[0], *parts(w))

@@ -116,7 +116,9 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     bare = dataclasses.replace(
         loop, reference=Constant(level=r[0]), disturbance=None, faults=None, safety_filter=None
     )
-    one = functools.partial(_compiled, bare, dataclasses.replace(clock, duration=clock.dt))
+    one = functools.partial(
+        _compiled, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced
+    )
     if traced:
         # one after the other: a program for one of them is compiled in half the time
         return (r, *cast(tuple[Any, ...], jax.lax.map(one, r)))
@@ -128,11 +130,13 @@ def _stacked(*values: Any) -> Any:
     return np.stack([np.asarray(v) for v in values])
 
 
-@compiled("clock", keep=True)
-def _compiled(loop: ClosedLoop, clock: Clock, r: Any) -> tuple[Any, am.Margins]:
-    """(Linearised, Margins) of one plateau with setpoints r (outputs,)."""
+@compiled("clock", "slopes", keep=True)
+def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any, am.Margins]:
+    """(Linearised, Margins) of one plateau with setpoints r (outputs,); slopes: whether their
+    derivatives may be asked for.
+    """
     found = linearised(loop, clock, r)
-    return found._replace(open_loop=found.open_loop[:3]), am.margins(found.open_loop)
+    return found._replace(open_loop=found.open_loop[:3]), am.margins(found.open_loop, slopes)
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:

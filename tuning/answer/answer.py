@@ -97,7 +97,9 @@ class Answer(Shown):
                 "plants_stated": self.setting.stated,
                 "objective": dict(self.setting.objective),
                 "safety_filter": self.setting.filter,
-                "nominal_error": dict(self.nominal),
+                "nominal_error": {
+                    side: float(dict(m)["rms_error_total"]) for side, m in self.measures.items()
+                },
                 "plants": {name: j.to_json() for name, j in sides.items() if j is not None},
                 "kept": [name for name, stays in self.kept.items() if stays],
                 "idle_limits_of_tanks": list(self.idle),

@@ -5,24 +5,28 @@ Imported by `recommend` and by the report.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from tuning.answer.plants import run_plants
 from tuning.answer.setting import Setting, limited_levels, measured, setting_of
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
+from tuning.problem.limits import resolve_limits
 from tuning.problem.result import Shown
+from tuning.problem.scenarios import noisy
 from tuning.search.options import check_options, check_precision
-from tuning.uncertainty.result import Ensemble
 from tuning.uncertainty.sampling import clopper_pearson
-from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET
 
 FRESH = 256
 """Plants on which an answer is judged."""
+
+NOMINAL = ("rms_error_total", "rms_error", "settling_time", "recovery_time")
+"""Measures of the nominal plant, which runs beside them, besides those of every plant."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -37,6 +41,8 @@ class Judged(Shown):
     held : (N,) True where every limit holds; failed : (N,) True where the run diverged.
     infeasible : (N,) True where no controller can hold a setpoint; None where that is not known.
     limits : the Limits; measures : {name: (N, ...)}.  unit : of length.
+    nominal : {name: value} of the nominal plant without noise: the measures above and NOMINAL; None
+        where the case states noise, or that run diverged.
     """
 
     cost: np.ndarray
@@ -49,6 +55,7 @@ class Judged(Shown):
     limits: list[Any]
     measures: dict[str, np.ndarray]
     unit: str
+    nominal: dict[str, np.ndarray] | None = None
 
     @property
     def samples(self) -> int:
@@ -189,23 +196,22 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
 
     The same plants and noise for the same seed and round; other ones than any search draws.
     """
-    case, limits = setting.searched, dict(setting.case.limits)
-    found = cast(
-        Ensemble,
-        ensemble(
-            case.replace(limits=limits),
-            setting.distributions,
-            samples=samples,
-            key=(SEED_OFFSET + seed + 104_729 * round_) % 2**31,
-            measures=measured(setting),
-            limits=limits,
-            fan=False,
-        ),
+    case, names = setting.searched, measured(setting)
+    limits = resolve_limits(case, setting.case.limits)
+    wanted = (*names, *(limit.measure for limit in limits))
+    own = tuple(m for m in NOMINAL if ms.serves(m, case.loop)) if not noisy(setting.case) else ()
+    found = run_plants(
+        case,
+        setting.distributions,
+        samples,
+        (SEED_OFFSET + seed + 104_729 * round_) % 2**31,
+        tuple(dict.fromkeys((*wanted, *own))),
+        bool(own),
     )
-    by = {m: np.asarray(v) for m, v in found.measures.items()}
+    by = {m: found.measures[m] for m in dict.fromkeys(wanted)}
     rows = {m: v.reshape(samples, -1) for m, v in by.items()}
     cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
-    past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in found.limits]
+    past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in limits]
     changes = np.sqrt(rows["mean_square_travel"]) / setting.span
     return Judged(
         cost=np.asarray(cost),
@@ -215,8 +221,9 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         held=~(found.failed | np.any(past, axis=0)) if past else ~found.failed,
         failed=found.failed,
         infeasible=_unreachable(setting.case, found.values),
-        limits=found.limits,
+        limits=limits,
         measures=by,
+        nominal=found.nominal,
         unit=unit_of(setting),
     )
 

@@ -26,7 +26,7 @@ from tuning.cluster.problems import check_sent
 from tuning.feasible.study import apply_mend, can_judge, feasibility
 from tuning.problem.functions import digests
 from tuning.problem.problem import Problem
-from tuning.problem.reported import margin_measures, run_measures
+from tuning.problem.reported import Deferred, margin_measures, reported_names, run_measures
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.result import TuningResult
@@ -126,8 +126,8 @@ def _answer(made, before, values):
     """Return the Answer: what was judged, on which plants, and the case's own run."""
     setting, found, problem, after = made.setting, made.found, made.problem, made.after
     own = problem.own_values()
-    sides = {"before": setting.case, "after": setting.tuned(values)}
-    nominal = {side: _nominal(case, problem.needed) for side, case in sides.items()}
+    sides = {"before": (setting.case, before), "after": (setting.tuned(values), after)}
+    nominal = {side: _nominal(*both, problem.needed) for side, both in sides.items()}
     errors = {side: float(m["rms_error_total"]) for side, m in nominal.items()}
     stays = {n: bool(k) for n, k in zip(own, found.kept)} if found.kept is not None else {}
     return Answer(
@@ -152,14 +152,22 @@ def _lost(setting, problem, nominal, values):
     return lost_outputs(own, {side: [table] for side, table in nominal.items()}, values)
 
 
-def _nominal(case, needed):
+def _nominal(case, judged, needed):
     """Return the measures of the case's own run, without noise unless it has some, and the
-    stability margins of its linearised loop.
+    stability margins of its linearised loop. What was not judged beside the plants is run when it
+    is asked for.
     """
-    key = jax.random.key(0) if noisy(case) else None
+    margins = margin_measures(case.loop, case.clock)
     of_run = [m for m in needed if m not in ms.linear()]
-    found = run_measures(case.loop, case.clock, key, of_run)
-    return found | margin_measures(case.loop, case.clock)
+
+    def make():
+        key = jax.random.key(0) if noisy(case) else None
+        return run_measures(case.loop, case.clock, key, of_run) | margins
+
+    if judged is None or not judged.nominal:
+        return make()
+    names = (*reported_names(case.loop, of_run), *margins)
+    return Deferred(names, judged.nominal | margins, make)
 
 
 def _idle(setting, before, after):

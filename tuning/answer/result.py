@@ -38,7 +38,7 @@ def result_of(
         parameters=_parameters(problem, found, values),
         objective={"before": _mean(answer.before), "after": _mean(answer.after)}
         | {"terms": dict(setting.objective)},
-        measures={side: dict(m) for side, m in answer.measures.items()},
+        measures=dict(answer.measures),
         tables=tables,
         constraints=_rows(answer, problem),
         symmetry=None,

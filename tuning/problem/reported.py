@@ -6,7 +6,7 @@ Imported by `search` and by `jaxtank simulate`.
 # functions of jax and of `measures` whose types are not complete
 # pyright: reportUnknownMemberType=false
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,48 @@ def run_measures(
     key : of the sensor noise, None where there is none. besides : names, of which the functions of
     the user's and the margins of the linearised loop are reported too.
     """
-    values = lp.evaluate(loop, clock, _names(loop, besides), key)
+    values = lp.evaluate(loop, clock, reported_names(loop, besides), key)
     return {m: np.asarray(v) for m, v in values.items()}
+
+
+class Deferred(Mapping[str, Any]):
+    """Measures of a run that is made when one is asked for that is not known yet.
+
+    A program with all that is reported takes as long to compile as the search's: the text of a
+    default answer needs only a few of them, its JSON and its report need all.
+
+    Parameters
+    ----------
+    names : of all measures.
+    known : {measure: value}, some of them.
+    make : returns {measure: value} of all.
+
+    Examples
+    --------
+    >>> found = Deferred(["b", "a"], {"a": 1.0}, lambda: {"b": 2.0, "a": 1.0})
+    >>> found["a"], list(found), found.made, found["b"], found.made
+    (1.0, ['b', 'a'], False, 2.0, True)
+    """
+
+    def __init__(
+        self, names: Iterable[str], known: Mapping[str, Any], make: Callable[[], Mapping[str, Any]]
+    ):
+        self.names, self.known, self.make = dict.fromkeys(names), dict(known), make
+        self.made = False
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.names and name not in self.known:
+            self.known, self.made = dict(self.make()), True
+        return self.known[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
 
 
 def margin_measures(loop: ClosedLoop, clock: Clock) -> dict[str, np.ndarray]:
@@ -49,14 +89,17 @@ def table_of(problem: Problem, values: dict[str, float]) -> list[dict[str, Any]]
     table: list[Any] = [None] * len(problem.runs)
     for group in problem.groups:
         loop = problem.runs[group.runs[0]].case.loop
-        measures, _ = sc.values_of(group, _names(loop, problem.needed), points)
+        measures, _ = sc.values_of(group, reported_names(loop, problem.needed), points)
         for j, i in enumerate(group.runs):
             table[i] = {m: np.asarray(v)[0, j] for m, v in measures.items()}
     return table
 
 
-def _names(loop: ClosedLoop, besides: Iterable[str]) -> tuple[str, ...]:
-    """Return the measures that are reported of a loop, and when levels were reached."""
+def reported_names(loop: ClosedLoop, besides: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the measures that are reported of a loop, and when levels were reached.
+
+    besides : as of `run_measures`.
+    """
     known = (m for m in ms.reported() if ms.serves(m, loop))
     besides = tuple(besides)
     linear = (m for m in besides if ms.MEASURES[m].linear)

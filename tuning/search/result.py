@@ -209,7 +209,7 @@ class TuningResult(Result):
     messages: tuple[Message, ...] = ()
     parameters: dict[str, dict[str, Any]]
     objective: dict[str, Any]
-    measures: dict[str, dict[str, Any]]
+    measures: dict[str, Mapping[str, Any]]
     tables: dict[str, list[Any]]
     constraints: list[ConstraintRow]
     evaluations: dict[str, int]

@@ -40,10 +40,19 @@ def delayed(A, B, C, dead):
 
 
 def of_all(systems, dead, dt):
-    """Margins of systems [(A, B, C), ...] of one size."""
+    """Margins of systems [(A, B, C), ...] of one size, the same with slopes and without."""
     stacked = [jnp.asarray(np.stack(part)) for part in zip(*systems)]
-    found = jax.jit(jax.vmap(lambda A, B, C: margins(OpenLoop(A, B, C, dead, dt))))(*stacked)
-    return jax.tree.map(np.asarray, found)
+
+    def found(slopes):
+        one = lambda A, B, C: margins(OpenLoop(A, B, C, dead, dt), slopes)
+        return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*stacked))
+
+    with_slopes, without = found(True), found(False)
+    np.testing.assert_array_equal(without.stable, with_slopes.stable)
+    for name in ("sensitivity_peak", "gain_margin", "phase_margin", "delay_margin"):
+        a, b = (getattr(one, name)[with_slopes.stable] for one in (without, with_slopes))
+        np.testing.assert_allclose(a, b, rtol=1e-7)
+    return with_slopes
 
 
 @pytest.mark.parametrize("dead", [0, 4])

@@ -164,6 +164,47 @@ def test_a_judged_plant_is_the_run_alone(case):
         assert cost == pytest.approx(judged.cost[i], rel=1e-9)
 
 
+def test_the_nominal_plant_runs_beside_the_judged_ones(case):
+    """Without noise, as the run alone; how many plants there are changes nothing."""
+    setting = setting_of(case)
+    few, many = judge(setting, 3, 5), judge(setting, 300, 5)
+    assert few.error == pytest.approx(many.error[:3], rel=1e-12)
+    names = ["rms_error_total", "rms_error", "settling_time"]
+    alone = jaxtank.evaluate(case.loop, case.clock, names)
+    for judged in (few, many):
+        for name in names:
+            np.testing.assert_allclose(judged.nominal[name], alone[name], rtol=1e-12)
+
+
+def test_noise_that_is_drawn_as_well_is_none_for_the_nominal_plant(case):
+    spread = {"plant.drain": 0.1, "sensor.noise": tuning.Uniform(low=0.0, high=0.01)}
+    judged = judge(setting_of(case, distributions=spread), 4, 0)
+    alone = jaxtank.evaluate(case.loop, case.clock, ["rms_error_total"])["rms_error_total"]
+    assert float(judged.nominal["rms_error_total"]) == pytest.approx(float(alone), rel=1e-12)
+
+
+def test_noise_that_a_case_states_is_in_its_own_run():
+    noisy = presets.find("gouta2015/ngpc-observer")
+    noisy = rig.set_values(noisy, {"sensor.noise": 0.02, "clock.dt": 1.0})
+    assert judge(setting_of(noisy), 2, 0).nominal is None
+
+
+def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
+    result = tuning.tune(case, validation=8, starts=1, iterations=2)
+    str(result)
+    before = result.measures["before"]
+    assert not before.made and "iae" in before and "nothing" not in before
+    with pytest.raises(KeyError):
+        before["nothing"]
+    assert not before.made
+    alone = jaxtank.evaluate(case.loop, case.clock, ["iae", "rms_error_total"])
+    np.testing.assert_allclose(before["iae"], alone["iae"], rtol=1e-12)
+    assert before.made and len(dict(before)) == len(before)
+    error = float(alone["rms_error_total"])
+    assert result.answer.nominal["before"] == pytest.approx(error, rel=1e-12)
+    assert result.to_json()["measures"]["before"]["rms_error_total"] == pytest.approx(error)
+
+
 def test_validate_gives_what_judged_the_answer(result, case):
     again = tuning.validate(result.tuned, 24)
     assert np.array_equal(again.error, result.answer.after.error)
