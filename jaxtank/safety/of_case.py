@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.sensors import LevelSensor
@@ -99,7 +99,7 @@ def _widths(case):
         names, matrix = case.covariance
         flows = [i for i, n in enumerate(names) if n.startswith("plant.")]
         sigma = np.sqrt(np.diag(np.asarray(matrix, dtype=float)))[flows]
-        reach = np.sqrt(2.0 * gammaincinv(0.5 * max(len(flows), 1), PROBABILITY))
+        reach = np.sqrt(2.0 * scipy.special.gammaincinv(0.5 * max(len(flows), 1), PROBABILITY))
         return {names[i]: reach * s for i, s in zip(flows, sigma)}
     shares = {n: s for n, s in case.uncertain.items() if n.startswith("plant.")}
     return widths_of(case.loop.plant, shares or dict.fromkeys(FLOWS, SPREAD))
