@@ -71,8 +71,7 @@ class Watch:
         from jaxtank.core.files import write_together
         from tuning.live.watch import PAGE, files
 
-        began = time.perf_counter()
-        self.last = self.state.now = self.clock()
+        began = self.last = self.state.now = self.clock()
         details = self.details() if self.details else {"parameters": [], "limits": []}
         self.state.parameters, self.state.limits = details["parameters"], details["limits"]
         with contextlib.suppress(OSError):
@@ -81,7 +80,7 @@ class Watch:
             if not self.there:
                 self.there = True
                 self.written(self.folder / PAGE)
-        self.took = time.perf_counter() - began
+        self.took = self.clock() - began
 
     def end(
         self,

@@ -169,7 +169,8 @@ class TuningResult(Result):
     messages : findings, most important first; `message` joins their texts.
     parameters : {name: the fields of ParameterChange}; `result[name]` is the ParameterChange.
     objective : {"before", "after": value, "terms": {measure: weight}}.
-    measures : {"before", "after": {measure: value}} of the case's own run.
+    measures : {"before", "after": {measure: value}} of the case's own run; those of a default
+        answer that its text does not need are computed when one of them is asked for.
     tables : {"before", "after": [{measure: value}]} of every scenario in the objective.
     constraints : a ConstraintRow for each limit and scenario.
     evaluations : numbers of simulations, gradients, non-finite points and repeated screenings.
