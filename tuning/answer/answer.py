@@ -97,7 +97,7 @@ class Answer(Shown):
                 "plants_stated": self.setting.stated,
                 "objective": dict(self.setting.objective),
                 "safety_filter": self.setting.filter,
-                "nominal_error": {
+                "nominal_error": {  # of the run whose measures the JSON has, to the last digit
                     side: float(dict(m)["rms_error_total"]) for side, m in self.measures.items()
                 },
                 "plants": {name: j.to_json() for name, j in sides.items() if j is not None},

@@ -23,7 +23,7 @@ LANES = 8
 NOISE = "sensor.noise"
 
 
-class Runs(NamedTuple):
+class PlantRuns(NamedTuple):
     """Measures of N drawn plants, and of the nominal one."""
 
     values: Mapping[str, Any]  # {parameter: (N, ...)} as drawn
@@ -40,7 +40,7 @@ def run_plants(
     seed: int,
     names: Sequence[str],
     quiet: bool = False,
-) -> Runs:
+) -> PlantRuns:
     """Run a case on `samples` drawn plants with the noise of its sensors.
 
     The same numbers as those of `tuning.ensemble` with that seed.
@@ -49,8 +49,22 @@ def run_plants(
     ----------
     case, distributions, samples : as in `tuning.ensemble`.
     seed : of the plants and the noise.
-    names : of the measures.
+    names : of the measures, each in the unit of `jaxtank.measures.unit`.
     quiet : run the nominal plant without noise too, where the noise can be set to 0 for one run.
+
+    Raises
+    ------
+    InputError : for a distribution or a loop that cannot be run.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> from tuning import Uniform
+    >>> found = run_plants(
+    ...     presets.find("cascaded/pi"), {"plant.area": Uniform(relative=0.05)}, 3, 0, ["iae"], True
+    ... )
+    >>> found.measures["iae"].shape, found.nominal["iae"].shape
+    ((3, 1), (1,))
     """
     space = Draws(case.loop, distributions)
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
@@ -70,15 +84,17 @@ def run_plants(
     failed, own = found.pop("failed") > 0, None
     if last is not None and not failed[samples]:
         own = {n: v[samples] for n, v in found.items()}
-    return Runs(drawn, {n: v[:samples] for n, v in found.items()}, failed[:samples], own)
+    return PlantRuns(drawn, {n: v[:samples] for n, v in found.items()}, failed[:samples], own)
 
 
 def _batch(most: int, count: int) -> int:
-    """Runs in a batch, about `most`: so many that the fewest are run in vain."""
-    if count <= most:
-        return -(-count // LANES) * LANES if count > LANES else count
-    sizes = range(max(LANES, most // 2 // LANES * LANES), most + LANES + 1, LANES)
-    return min(sizes, key=lambda size: (-(-count // size) * size, -size)) if most >= LANES else most
+    """Runs in a batch: the multiple of LANES with the fewest runs in vain, between a half of `most`
+    and an eighth above it.
+    """
+    if most < LANES:
+        return most
+    sizes = range(max(LANES, most // 2), most + most // 8 + 1, LANES)
+    return min(sizes, key=lambda size: (-(-count // size) * size, -size))
 
 
 def _nominal(case: Case, drawn: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -426,12 +426,16 @@ function refresh() {
 
 // --- buttons ----------------------------------------------------------------------------------
 
-function pin(name) {
-  if (!present()) return;
+function keep(name, found) {
   const old = pins.findIndex((other) => other.name === name);
   if (old >= 0) pins.splice(old, 1);
   if (pins.length === PINS) pins.shift();
-  pins.push({ name, run: current });
+  pins.push({ name, run: found });
+}
+
+function pin(name) {
+  if (!present()) return;
+  keep(name, current);
   makeLegend();
   show();
 }
@@ -754,9 +758,10 @@ function open() {
     for (const one of data.presets) {
       preset(one);
       if (one === data.presets[data.presets.length - 1]) break;
-      current = run();
-      pin(one.name);
+      const found = run(); // not drawn: it would stand as the last one until that is computed
+      if (found) keep(one.name, found);
     }
+    makeLegend();
   }
   refresh();
 }

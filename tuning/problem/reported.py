@@ -35,8 +35,9 @@ def run_measures(
 class Deferred(Mapping[str, Any]):
     """Measures of a run that is made when one is asked for that is not known yet.
 
-    A program with all that is reported takes as long to compile as the search's: the text of a
-    default answer needs only a few of them, its JSON and its report need all.
+    Two programs with all that is reported take as long to compile as those of the search: the text
+    of a default answer needs only a few measures, its JSON and its report need all. Printed, copied
+    and pickled it is the dict of all.
 
     Parameters
     ----------
@@ -58,9 +59,15 @@ class Deferred(Mapping[str, Any]):
         self.made = False
 
     def __getitem__(self, name: str) -> Any:
-        if name in self.names and name not in self.known:
+        if name in self.names and name not in self.known and not self.made:
             self.known, self.made = dict(self.make()), True
         return self.known[name]
+
+    def __repr__(self) -> str:
+        return repr(dict(self))
+
+    def __reduce__(self) -> Any:
+        return dict, (dict(self),)  # another process has no use for a run of this one
 
     def __contains__(self, name: object) -> bool:
         return name in self.names

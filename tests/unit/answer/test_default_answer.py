@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 
 import jax
 import numpy as np
@@ -200,6 +201,11 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     alone = jaxtank.evaluate(case.loop, case.clock, ["iae", "rms_error_total"])
     np.testing.assert_allclose(before["iae"], alone["iae"], rtol=1e-12)
     assert before.made and len(dict(before)) == len(before)
+    other = pickle.loads(pickle.dumps(result.measures))
+    assert type(other["after"]) is dict and sorted(other["after"]) == sorted(
+        result.measures["after"]
+    )
+    assert repr(result.measures["after"]).startswith("{'")
     error = float(alone["rms_error_total"])
     assert result.answer.nominal["before"] == pytest.approx(error, rel=1e-12)
     assert result.to_json()["measures"]["before"]["rms_error_total"] == pytest.approx(error)

@@ -232,6 +232,30 @@ def test_a_drag_over_a_chart_zooms_all_and_a_double_click_shows_the_whole_run(br
         assert live("jaxtank.state().shown") == [0, 2800]
 
 
+def test_what_a_page_says_first_is_of_the_last_state(browser, tmp_path):
+    """A result that keeps its limits never reads "exceeded", which the state before it does."""
+    case = presets.find("cascaded/pi").replace(limits={"max_level": 9.9})
+    states = [("before", {"controller.Kc": 3.0}, False), ("after", {"controller.Kc": 0.4}, False)]
+    shown.of_case(case, states).save(tmp_path / "page.html")
+    context = browser.new_context(offline=True)
+    try:
+        tab, said = context.new_page(), []
+        tab.expose_function("heard", lambda text: said.append(text))
+        tab.add_init_script(
+            "const text = () => document.getElementById('verdict')?.textContent ?? '';"
+            "new MutationObserver(() => heard(text())).observe("
+            "document, {subtree: true, childList: true, characterData: true})"
+        )
+        tab.goto((tmp_path / "page.html").as_uri())
+        tab.locator("#verdict", has_text="holds").wait_for(timeout=10_000)
+        assert not any("exceeded" in one for one in said)
+        tab.click("#presets >> text=before")
+        tab.locator("#verdict", has_text="exceeded").wait_for(timeout=10_000)
+        assert any("exceeded" in one for one in said)
+    finally:
+        context.close()
+
+
 def test_states_of_a_result_are_compared(browser, tmp_path):
     case = presets.find("cascaded/pi")
     states = [("before", {}, False), ("after", {"controller.Kc": 0.4}, False)]
