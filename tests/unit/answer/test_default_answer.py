@@ -2,7 +2,11 @@
 
 import dataclasses
 import json
+import os
 import pickle
+import subprocess
+import sys
+from collections import Counter
 
 import jax
 import numpy as np
@@ -14,6 +18,7 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.xla import executables
 from tuning.answer.judged import judge
 from tuning.answer.setting import input_range, setting_of
 from tuning.answer.stay_put import WORTH, Found, search_from
@@ -209,6 +214,24 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     error = float(alone["rms_error_total"])
     assert result.answer.nominal["before"] == pytest.approx(error, rel=1e-12)
     assert result.to_json()["measures"]["before"]["rms_error_total"] == pytest.approx(error)
+
+
+DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_compiled": 1}
+"""Programs of a default answer: judging without the safety filter and with it, derivatives and
+values of the search's plants, stability margins."""
+
+
+@pytest.mark.parametrize("words, more", [([], {}), (["--json"], {"evaluate_compiled": 2})])
+def test_a_default_answer_has_five_programs_and_the_json_two_more(path, tmp_path, words, more):
+    kept = tmp_path / "kept"
+    env = {n: v for n, v in os.environ.items() if not n.startswith("JAX_")}
+    line = [sys.executable, "-m", "jaxtank", "tune", path, "--validation", "16", "--safety-filter"]
+    done = subprocess.run(
+        [*line, *words], env=env | {"JAXTANK_CACHE": str(kept)}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    names = [p.name.rsplit("-", 3)[0] for p in kept.glob(f"*/*{executables.ENDING}")]
+    assert Counter(names) == DEFAULT_ANSWER | more
 
 
 def test_validate_gives_what_judged_the_answer(result, case):
