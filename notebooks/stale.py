@@ -2,8 +2,8 @@
 show. Imported by run.py of this folder and by the tests.
 
 Numbers agree within one per cent or one unit of their last digit: another processor rounds
-otherwise, and a search ends a little elsewhere. How long a command took is not compared, and in a
-cell with the tag "times" no number is.
+otherwise, and a search ends a little elsewhere. How long a command took, and how many
+simulations identify needed, is not compared, and in a cell with the tag "times" no number is.
 """
 
 import re
@@ -18,7 +18,8 @@ HIDDEN = (
     (re.compile(r"/tmp/[\w./-]+"), "/tmp"),
     (re.compile(r"(Run time: about )\d+ s"), r"\1# s"),
     (re.compile(r"\(\d+(\.\d+)? s\)"), "(# s)"),  # at the end of what tune prints
-    (re.compile(r"\b\d+\.\d s, (\d+ simulations)"), r"# s, \1"),  # and identify
+    # and identify, whose number of simulations follows from rounding
+    (re.compile(r"\b\d+\.\d s, \d+( simulations with)"), r"# s, #\1"),
 )
 
 

@@ -1,8 +1,9 @@
-"""Elimination for the small systems of `jaxtank.analysis.qp`, without LAPACK.
+"""Elimination for small systems: of `jaxtank.analysis.qp`, and of a steady state; without LAPACK.
 
 Its call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call divides
 its work among the threads on which it runs itself: as many such calls at once as there are threads
-wait for each other for ever. Imports jax only; imported by `qp`.
+wait for each other for ever. A kept program with LAPACK in it takes 0.1 s longer to load, for jax
+looks its functions up in scipy. Imports jax only; imported by `qp` and `steady_state`.
 """
 
 import contextlib
@@ -33,6 +34,27 @@ def rolled() -> Iterator[None]:
         yield
     finally:
         UNROLLED = before
+
+
+def solve(A, b):
+    """Return x (n,) of A x = b, for a small matrix A (n, n): Gauss-Jordan with row pivots.
+
+    Written out; where A is singular, entries are not finite.
+
+    Examples
+    --------
+    >>> solve(jnp.array([[0.0, 2.0], [1.0, 1.0]]), jnp.array([2.0, 3.0])).tolist()
+    [2.0, 1.0]
+    """
+    rows = jnp.concatenate([A, b[:, None]], axis=1)
+    index = np.arange(A.shape[0])[:, None]
+    for j in range(A.shape[0]):
+        best = index == j + jnp.argmax(jnp.abs(rows[j:, j]))
+        pivot = jnp.sum(jnp.where(best, rows, 0.0), axis=0)
+        rows = jnp.where(best, rows[j], rows)  # the row that it changes places with
+        pivot = pivot / pivot[j]
+        rows = jnp.where(index == j, pivot, rows - rows[:, j, None] * pivot)
+    return rows[:, -1]
 
 
 def normal_matrix(H, G, weight):

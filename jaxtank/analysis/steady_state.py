@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.analysis import elimination
 from jaxtank.analysis.sparse_balance import balanced, responses
 from jaxtank.core import vectors
 from jaxtank.core.errors import EquilibriumError, InputError
@@ -83,7 +84,8 @@ def _from_known_speeds(plant, known, xp=jnp):
         speeds, inputs = responses(plant, xp)
         return speeds @ known, inputs @ known
     eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
-    solution = xp.linalg.solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
+    solve = np.linalg.solve if xp is np else elimination.solve
+    solution = solve(columns, -efflux[:, np.array(plant.outputs)] @ known)
     speeds = xp.zeros(n)
     for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
         speeds = speeds + value * eye[i]

@@ -3,7 +3,9 @@ fourth-order Runge-Kutta, inputs held.
 
     pip install ".[bench]"
     python tests/benchmarks/rivals.py [rounds] [--markdown]
+    python tests/benchmarks/rivals.py --simulators [rounds] [--markdown]  # run and gradient
 
+With --simulators: jaxonomy and fugacio, two differentiable simulators (`simulators.py`).
 All of them do the same arithmetic on the same setpoints and are timed in turn within one process;
 medians, the ratio to ours in the same round with its range, time of the first call (compilation)
 apart, and how far the RMS error is from ours. Slow ones run a part of the samples, and are told per
@@ -319,6 +321,10 @@ WHOLE = (numba_loop, casadi_accumulated, plain_scan, jax_as_it_comes)
 
 
 def main(words):
+    if "--simulators" in words:
+        import simulators
+
+        return simulators.main(words)
     jax.config.update("jax_enable_x64", True)
     rounds = next((int(w) for w in words if w.isdigit()), 7)
     case = presets.find("gouta2015/backstepping")
@@ -387,6 +393,7 @@ def main(words):
         print(f"not here: {', '.join(missing)}")
     if "--markdown" in words:
         store(BEGIN, END, heads, rows)
+    return None
 
 
 def store(begin, end, heads, rows):

@@ -29,7 +29,7 @@ class Answer(Shown):
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
     idle : numbers of the tanks, from 1, whose limit no plant comes near.
     tightened : largest share by which a limit was tightened for the search [-].
-    coarse_dt : step of the search [s].
+    coarse_dt : step of the search [s]; integrator : of the search.
     measures : {"before", "after": {measure: value} of the case's own run}.
     feasibility : a `tuning.Feasibility`, None where it is not known; mended : the Mend that was
         applied first, None where none was asked for.
@@ -53,6 +53,7 @@ class Answer(Shown):
     idle: tuple[int, ...]
     tightened: float
     coarse_dt: float
+    integrator: str = "rk4"
     measures: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     feasibility: Any = None
     mended: Any = None
@@ -105,6 +106,7 @@ class Answer(Shown):
                 "idle_limits_of_tanks": list(self.idle),
                 "limits_tightened": self.tightened,
                 "search_dt_s": self.coarse_dt,
+                "search_integrator": self.integrator,
                 "mended": None if self.mended is None else dict(self.mended.set),
             }
         )

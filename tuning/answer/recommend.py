@@ -141,6 +141,7 @@ def _answer(made, before, values):
         idle=tuple(int(i) + 1 for i in _idle(setting, before, after)),
         tightened=made.tightened,
         coarse_dt=problem.case.clock.dt,
+        integrator=problem.case.clock.integrator,
         measures=nominal,
     )
 

@@ -1,10 +1,11 @@
 """What a result was made with: versions, settings and seed; imported by every command."""
 
-# optax and scipy have no type stubs
+# scipy has no type stubs
 # pyright: reportMissingTypeStubs=false
 
 import os
 import platform
+from importlib import metadata
 from typing import Any
 
 import jax
@@ -26,7 +27,6 @@ def provenance(case: Case, seed: int | None) -> dict[str, Any]:
     >>> provenance(presets.find("cascaded/pi"), seed=3)["seed"]
     3
     """
-    import optax
     import scipy
 
     return {
@@ -36,7 +36,7 @@ def provenance(case: Case, seed: int | None) -> dict[str, Any]:
         "jaxlib": jaxlib.version.__version__,
         "numpy": np.__version__,
         "scipy": scipy.__version__,
-        "optax": optax.__version__,
+        "optax": metadata.version("optax"),  # its import takes 0.07 s
         "backend": jax.default_backend(),
         "dtype": str(jax.numpy.result_type(float)),
         "xla_option": KEY in os.environ.get("XLA_FLAGS", ""),

@@ -1,4 +1,4 @@
-"""Riccati and Lyapunov equations against SciPy, their derivatives against central differences."""
+"""Riccati and Lyapunov equations, and small systems, against SciPy; derivatives by differences."""
 
 import jax
 import jax.numpy as jnp
@@ -7,6 +7,9 @@ import pytest
 from jax.test_util import check_grads
 from scipy import linalg
 
+import jaxtank
+from jaxtank import Clock, presets
+from jaxtank.analysis import elimination
 from jaxtank.analysis.riccati import (
     discrete_lyapunov,
     discrete_riccati,
@@ -135,3 +138,26 @@ def test_they_work_in_batches_and_on_a_scalar_by_hand():
     A, B, Q, R = system(8)
     batch = jax.jit(jax.vmap(lambda s: riccati(A, B, s * Q, R)))(np.array([0.5, 2.0]))
     np.testing.assert_allclose(batch[1], RICCATI(A, B, 2 * Q, R), rtol=1e-9, atol=1e-9)
+
+
+def test_small_systems_are_solved_as_lapack_does_with_their_slopes():
+    rng = np.random.default_rng(0)
+    for n in range(1, 10):
+        A, b, moved = rng.normal(size=(n, n)), rng.normal(size=n), rng.normal(size=(n, n))
+        A[np.arange(n), np.arange(n)] *= rng.integers(2, size=n)  # pivots that are 0
+        if np.linalg.cond(A) > 1e4:
+            A += np.roll(np.eye(n), 1, axis=0)
+        x = np.linalg.solve(A, b)
+        np.testing.assert_allclose(elimination.solve(A, b), x, rtol=1e-9, atol=1e-9)
+        _, slope = jax.jvp(lambda m, b=b: elimination.solve(m, b), (A,), (moved,))
+        np.testing.assert_allclose(slope, -np.linalg.solve(A, moved @ x), rtol=1e-7, atol=1e-7)
+    singular = elimination.solve(np.array([[1.0, 2.0], [2.0, 4.0]]), np.ones(2))
+    assert not np.isfinite(singular).any()
+
+
+def test_a_run_with_steady_inputs_has_no_lapack():
+    """A kept program would take longer to load: jax looks LAPACK up in scipy."""
+    case = presets.find("gouta2015/ngpc")
+    clock = Clock(dt=0.1, duration=10.0)
+    run = jax.jit(lambda loop: jaxtank.evaluate(loop, clock, ["input_deviation"]))
+    assert "lapack" not in run.lower(case.loop).as_text()

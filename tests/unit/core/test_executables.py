@@ -23,11 +23,11 @@ import jaxtank
 from jaxtank import presets
 if sys.argv[1] != "none":
     jaxtank.cache(sys.argv[1])
-case = presets.find("cascaded/pi")
-clock = jaxtank.Clock(dt=4.0, duration=400.0)
-names = ["rms_error_total", "input_deviation", "settling_time"]
+case = presets.find("khalid/laguerre")
+clock = jaxtank.Clock(dt=case.clock.dt, duration=100 * case.clock.dt)
+names = ["rms_error_total", "input_travel", "settling_time"]
 found = jaxtank.evaluate(case.loop, clock, names)
-slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.Kc": [1.0]})
+slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.r_w": [1.0]})
 flat = [v for part in (found, *slopes[:2]) for v in part.values()] + [slopes[2]]
 print(json.dumps([[float(x).hex() for x in jax.numpy.ravel(v)] for v in flat]))
 """

@@ -236,7 +236,7 @@ def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
         ),
         (
             f"--xla_backend_extra_options={_xla.KEY}=5",
-            f"--xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED}",
+            f"--xla_backend_extra_options={_xla.KEY}=5,{_xla.ROLLED},{_xla.PLAIN}",
         ),
         (
             f"--xla_backend_extra_options={_xla.OPTION}",
@@ -412,6 +412,25 @@ def test_compensated_sums_lose_nothing():
     assert abs(float(totals(kept)) - exact) < 1e-5
     assert abs(float(plain) - exact) > 0.1
     assert nothing(np.float64(0.0)) == 0.0
+
+
+def test_what_is_outside_the_loop_is_compiled_by_the_older_generator():
+    """The programs differ, and their numbers do not."""
+    code = (
+        "import jax, jaxtank, numpy as np; jax.config.update('jax_enable_x64', True); from jaxtank"
+        " import presets, Clock\nfrom jaxtank.loop import run as loop\ncase ="
+        " presets.find('cascaded/pi'); clock = Clock(dt=4.0, duration=400.0)\nrun ="
+        " jax.jit(lambda loop_: loop.simulate(loop_, clock).x).lower(case.loop).compile()\n"
+        "print(len(run.runtime_executable().serialize()))\nx = np.asarray(run(case.loop))\n"
+        "print(float(np.sum(x)).hex())"
+    )
+    both = f"{_xla.KEY}=100000000000,{_xla.ROLLED}"
+    without = f"--xla_backend_extra_options={both}"
+    new = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    ours = python(code, **new)[0].split()
+    theirs = python(code, XLA_FLAGS=without, JAXTANK_XLA_OPTION="0", **new)[0].split()
+    assert ours[0] != theirs[0]
+    np.testing.assert_allclose(float.fromhex(ours[1]), float.fromhex(theirs[1]), rtol=1e-12)
 
 
 def test_loops_over_batches_stay_loops():

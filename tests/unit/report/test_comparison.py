@@ -36,6 +36,12 @@ def test_rows_are_counted_by_verdict_and_found_by_quantity():
     assert "a <note>" in text[-1] and set(found.to_json()) == {"one", "two"}
 
 
+def test_entries_that_differ_by_rounding_alone_are_one_point():
+    """Their number would depend on the processor, and with it what a figure shows."""
+    found = papers._ratios(row("times", "fitted", measured=[2.0, 2.0 + 4e-16, 2.0 - 3e-16, 5.0]))
+    assert found.tolist() == [1.0, 2.5]
+
+
 def test_a_notebook_shows_every_row_with_its_texts_escaped():
     shown = made()._repr_html_()
     assert shown.count("<details>") == 3 and "one: 2 rows" in shown

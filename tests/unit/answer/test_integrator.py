@@ -1,0 +1,89 @@
+"""The midpoint rule in the search of a default answer: measured against RK4 before it is used."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxtank import Clock, presets, rig
+from jaxtank.loop.closed_loop import takes_arrays
+from tuning.answer.integrator import ENOUGH, midpoint_error
+from tuning.answer.setting import height, input_range, setting_of
+
+TANK = """
+name = "one tank"
+tank = [{ area = 20.0, rim = 3.0, drain = DRAIN, level = 1.0 }]
+pump = [{ gain = 5.0, to = 1, low = 0.0, high = 2.0, initial = 0.4 }]
+plant = { gravity = 0.5 }
+law = { kind = "pid", Kc = 1.0, Ti = 4.0, Tt = 5.0 }
+reference = { initial = [1.0], changes = [[1.0, 1, 2.6]], ramp = 0.0 }
+values = { "clock.dt" = 0.1, "clock.duration" = 1000.0 }
+limits = { max_level = 2.7 }
+"""
+
+
+def tank(drain=2.0):
+    return rig.loads(TANK.replace("DRAIN", str(drain)))
+
+
+def by_hand(dt, states=20_000):
+    """The same share for A dh/dt = 5 u - 2 sqrt(h), written out, at other random states."""
+    random = np.random.default_rng(7)
+    h, u = random.uniform(0.15, 3.0, states), 2.0 * random.uniform(size=states)
+    rate = lambda h: (5.0 * u - 2.0 * np.sqrt(np.maximum(h, 0.0))) / 20.0
+    k1 = rate(h)
+    k2 = rate(h + 0.5 * dt * k1)
+    k3 = rate(h + 0.5 * dt * k2)
+    k4 = rate(h + dt * k3)
+    rk4 = dt * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
+    return np.sqrt(np.sum((dt * k2 - rk4) ** 2) / np.sum(rk4**2))
+
+
+@pytest.mark.parametrize("dt", [0.5, 1.0])
+def test_the_error_is_that_of_the_rule_written_out(dt):
+    found = midpoint_error(tank(), Clock(dt=dt, duration=100.0), 3.0, np.array([2.0]))
+    assert found == pytest.approx(by_hand(dt), rel=0.3)
+
+
+def test_half_the_step_has_a_fourth_of_the_error():
+    case = presets.find("gouta2015/ngpc")
+    size, span = height(case), input_range(case)
+    errors = [midpoint_error(case, Clock(dt=dt), size, span) for dt in (0.1, 0.05)]
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.05)
+
+
+def test_searches_at_a_longer_step_use_it_where_its_error_is_small():
+    setting = setting_of(presets.find("gouta2015/backstepping"))
+    coarse = setting.coarse()
+    assert (coarse.clock.dt, coarse.clock.integrator) == (0.1, "midpoint")
+    long = Clock(dt=0.1, duration=1200.0)  # unstable at its longer step
+    assert midpoint_error(setting.case, Clock(dt=1.0), 30.0, setting.span) > ENOUGH
+    slow = dataclasses.replace(setting, searched=setting.searched.replace(clock=long))
+    assert (slow.coarse().clock.dt, slow.coarse().clock.integrator) == (1.0, "rk4")
+
+
+def test_a_tank_that_empties_too_fast_for_it_is_not_integrated_by_it():
+    """lambda h is 2.4: RK4 is stable below 2.785, the midpoint rule below 2."""
+    own = tank()
+    loop = own.loop
+    threshold = float(np.asarray(loop.plant.knee))
+    rate = 1.5 * 2.0 / (20.0 * np.sqrt(threshold))  # of laminar flow at 2 cm^2 [1/s]
+    clock = Clock(dt=2.4 / rate, duration=100.0)
+    assert midpoint_error(own, clock, 3.0, np.array([2.0])) == np.inf
+    clock = Clock(dt=1.9 / rate, duration=100.0)
+    assert midpoint_error(own, clock, 3.0, np.array([2.0])) < np.inf
+
+
+def row(tanks):
+    """Tanks side by side, all drained alike, the first one with the pump."""
+    one = "{ area = 20.0, rim = 20.0, drain = 2.0, level = 1.0 }"
+    head, _, tail = TANK.replace("DRAIN", "2.0").partition("tank = ")
+    return rig.loads(f"{head}tank = [{', '.join([one] * tanks)}]\n{tail.partition(chr(10))[2]}")
+
+
+def test_a_rig_on_arrays_has_the_error_of_one_on_scalars():
+    clock, span = Clock(dt=1.0, duration=100.0), np.array([2.0])
+    nine, ten = row(9), row(10)
+    assert [takes_arrays(case.loop) for case in (nine, ten)] == [False, True]
+    errors = [midpoint_error(case, clock, 20.0, span) for case in (nine, ten)]
+    assert errors[0] == pytest.approx(errors[1], rel=0.3)
