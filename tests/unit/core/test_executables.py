@@ -27,7 +27,7 @@ case = presets.find("khalid/laguerre")
 clock = jaxtank.Clock(dt=case.clock.dt, duration=100 * case.clock.dt)
 names = ["rms_error_total", "input_travel", "settling_time"]
 found = jaxtank.evaluate(case.loop, clock, names)
-slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.r_w": [1.0]})
+slopes = jaxtank.sensitivities(case.loop, clock, names[:1], {"controller.r_w": 0.02})
 flat = [v for part in (found, *slopes[:2]) for v in part.values()] + [slopes[2]]
 print(json.dumps([[float(x).hex() for x in jax.numpy.ravel(v)] for v in flat]))
 """
