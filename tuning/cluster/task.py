@@ -1,7 +1,7 @@
 """What a Dask worker runs."""
 
 TASKS = {
-    "batch": ("tuning.uncertainty.remote", "batch"),
+    "batches": ("tuning.uncertainty.remote", "batches"),
     "points": ("tuning.uncertainty.remote", "points"),
     "search": ("tuning.search.methods", "search_task"),
 }

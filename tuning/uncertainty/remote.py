@@ -10,15 +10,26 @@ import jax
 from tuning.cluster.sent import received, sent
 from tuning.uncertainty.batches import group_of, run_batch, run_points
 
+WORK = 1 << 24
+"""Samples of all runs from which a task has one batch [-]: .2 s or so, beside the 5 ms that the
+command and the scheduler need for a task, on this machine perhaps.
+"""
 
-def batch(text, names, seed, rows, indices):
-    """Return what `run_batch` gives for the case of `sent`; a task."""
-    return run_batch(received(text), names, seed, rows, indices)
+SHARES = 16
+"""Tasks at least, where there are so many batches: no worker waits long for the last one."""
 
 
-def points(text, names, seed, values):
-    """Return what `run_points` gives for the case of `sent`; a task. seed: None without noise."""
-    return run_points(_group(text, seed), names, values)
+def batches(text, names, seed, parts):
+    """Return what `run_batch` gives for the case of `sent` and each (values, indices); a task."""
+    return [run_batch(received(text), names, seed, *part) for part in parts]
+
+
+def points(text, names, seed, parts):
+    """Return what `run_points` gives for the case of `sent` and each values; a task.
+
+    seed : None without noise.
+    """
+    return [run_points(_group(text, seed), names, values) for values in parts]
 
 
 @functools.lru_cache(maxsize=8)
@@ -26,18 +37,50 @@ def _group(text, seed):
     return group_of(received(text), None if seed is None else jax.random.key(seed))
 
 
+def grouped(numbers, samples):
+    """Return `numbers` of batches in groups, one for each task.
+
+    samples : of all runs of a batch.
+
+    Examples
+    --------
+    >>> [len(group) for group in grouped(range(40), 1 << 23)]
+    [2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2, 2]
+    >>> len(grouped(range(40), 1 << 30))
+    40
+    """
+    size = max(1, min(WORK // max(1, samples), len(numbers) // SHARES))
+    return [tuple(numbers[i : i + size]) for i in range(0, len(numbers), size)]
+
+
 class RemoteRunner:
     """Runs batches of an ensemble on the workers of an Engine; used as `batches.Runner` is."""
 
     def __init__(self, case, names, seed, engine):
         self.engine, self.given = engine, (sent(case, names), names, seed)
+        self.samples = case.clock.samples
 
     def each(self, numbers, rows_of):
         """Yield (number, batch) as they come; rows_of(number): (values, numbers of the draws)."""
-        return self.engine.run("batch", ((k, (*self.given, *rows_of(k))) for k in numbers))
+        runs = len(rows_of(numbers[0])[1]) if numbers else 1
+        groups = grouped(numbers, runs * self.samples)
+        yield from _each(self.engine, "batches", self.given, groups, rows_of)
 
 
 def points_on(case, names, seed, engine):
     """Return what takes the place of `batches.Runs._each` on the workers of an Engine."""
     given = sent(case, names), names, seed
-    return lambda starts, rows_of: engine.run("points", ((s, (*given, rows_of(s))) for s in starts))
+
+    def each(starts, rows_of):
+        runs = starts[1] - starts[0] if len(starts) > 1 else 1
+        groups = grouped(starts, runs * case.clock.samples)
+        yield from _each(engine, "points", given, groups, rows_of)
+
+    return each
+
+
+def _each(engine, task, given, groups, rows_of):
+    """Yield (number, result) of the batches of all groups, a group at a time."""
+    tasks = ((group, (*given, [rows_of(k) for k in group])) for group in groups)
+    for group, found in engine.run(task, tasks):
+        yield from zip(group, found, strict=True)

@@ -26,6 +26,7 @@ from tuning.cluster.local import local_workers
 from tuning.cluster.sent import received, sent
 from tuning.problem.functions import as_measures
 from tuning.problem.problem import Problem
+from tuning.uncertainty import remote
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 
@@ -95,6 +96,19 @@ def test_a_worker_killed_and_one_added_in_mid_run_change_no_bit(case, whole, cli
         for process in added:
             process.kill()
             process.wait()
+
+
+def test_short_batches_share_a_task_and_change_no_bit(case, whole, client, monkeypatch):
+    sent_tasks, submit = [], Engine._submit
+    monkeypatch.setattr(
+        Engine, "_submit", lambda *a: sent_tasks.append(len(a[-1][-1])) or submit(*a)
+    )
+    monkeypatch.setattr(remote, "SHARES", 6)
+    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
+    assert sent_tasks == [4] * 6 + [1]
+    monkeypatch.setattr(remote, "WORK", 2 * 16 * case.clock.samples)
+    assert same(tuning.ensemble(case, SPREAD, **OPTIONS, cluster=client), whole)
+    assert sent_tasks[7:] == [2] * 12 + [1]
 
 
 def test_sensitivity_on_workers_is_that_of_one_process(case, client):
@@ -181,7 +195,7 @@ def test_a_result_that_is_lost_before_it_is_fetched_is_computed_again():
     client = Losing()
     client.scheduler = type("Scheduler", (), {"address": "nowhere"})
     given = ((n, (n,)) for n in range(5))
-    assert sorted(Engine(client).run("batch", given)) == [(n, 10 * n) for n in range(5)]
+    assert sorted(Engine(client).run("batches", given)) == [(n, 10 * n) for n in range(5)]
 
 
 def test_a_lost_scheduler_is_one_line_and_the_run_goes_on_from_its_folder(case, whole, tmp_path):
