@@ -149,3 +149,14 @@ def node(script, given=None):
     done = subprocess.run([NODE, "-"], input=text, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+def programs_in(jaxpr):
+    """A program and all those that it calls."""
+    yield jaxpr
+    for equation in jaxpr.eqns:
+        for value in equation.params.values():
+            for inner in value if isinstance(value, tuple | list) else [value]:
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from programs_in(inner)

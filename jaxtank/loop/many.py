@@ -22,17 +22,12 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, with_values
 from jaxtank.loop.closed_loop import ClosedLoop, initial, inputs, is_broken, run_of, takes_arrays
-from jaxtank.loop.run import evaluate_and_flag
+from jaxtank.loop.run import BATCH, evaluate_and_flag
 from jaxtank.loop.step import step
 from jaxtank.loop.validation import check
 from jaxtank.xla.jit import compiled
 from jaxtank.xla.kernel import Unfit, looped
 from jaxtank.xla.reachability import reached
-
-BATCH = 256
-"""Runs side by side: enough to fill the vector units, few enough for the cache. 65,536 lanes of one
-`jax.vmap` take three times as long each (45 against 15 ns per step).
-"""
 
 
 def evaluate_many(
@@ -47,8 +42,8 @@ def evaluate_many(
 ) -> dict[str, jax.Array]:
     """Run the loop at N sets of values and keep only running measures.
 
-    What `jax.vmap` of `evaluate` gives, some runs at a time, so that neither the memory of the
-    runs nor the time of each depends on N. It can be differentiated, and called inside `jax.jit`.
+    What `jax.vmap` of `evaluate` gives, some runs at a time: neither the memory of the runs nor the
+    time of each depends on N, and so it is with derivatives. It can be called inside `jax.jit`.
 
     Parameters
     ----------

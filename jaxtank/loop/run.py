@@ -7,6 +7,7 @@ other modules of `loop` and the folders below.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -37,8 +38,14 @@ from jaxtank.loop.saved_rows import simulate_compiled
 from jaxtank.loop.step import step
 from jaxtank.loop.trajectory import Trajectory
 from jaxtank.loop.validation import check
+from jaxtank.xla.batching import in_batches
 from jaxtank.xla.hoist import checkpointed_scan, scan
 from jaxtank.xla.jit import compiled
+
+BATCH = 256
+"""Runs side by side: enough to fill the vector units, few enough for the cache. 65,536 of them at
+once take three times as long each (45 against 15 ns per step).
+"""
 
 
 def simulate(
@@ -105,7 +112,7 @@ def evaluate(
     -------
     {name: scalar, or array with one entry per output, tank or pump}
         In the units of `jaxtank.measures.unit`. Inside a trace, those of a run that diverges are
-        NaN, and so are those of a run with noise and no key.
+        NaN, and so are those of a run with noise and no key. `jax.vmap` runs 256 at a time.
 
     Raises
     ------
@@ -126,9 +133,23 @@ def evaluate(
     """
     names = _names(measures)
     check(loop, clock, key)
+    leaves, tree = cast(tuple[list[Any], Any], jax.tree.flatten((loop, key)))
+    if any(isinstance(v, Tracer) for v in leaves):
+        return _in_batches(tree, clock, names)(*leaves)
     values, broken = evaluate_compiled(loop, clock, names, key, False)
     _report_broken(broken, loop, clock, key)
     return values
+
+
+@functools.lru_cache(maxsize=64)
+def _in_batches(tree: Any, clock: Clock, names: tuple[str, ...]) -> Any:
+    """The values of `evaluate` as a function of the leaves of (loop, key)."""
+
+    def values(*leaves: Any) -> dict[str, jax.Array]:
+        loop, key = jax.tree.unflatten(tree, leaves)
+        return evaluate_compiled(loop, clock, names, key, False)[0]
+
+    return in_batches(values, BATCH)
 
 
 def evaluate_and_flag(

@@ -5,6 +5,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from helpers import programs_in
 
 from jaxtank import measures as ms
 from jaxtank.controllers import PID
@@ -180,17 +181,6 @@ def row(tanks):
         faults=faults(plant, [("drain[1]", 25.0, 50.0, 1.0, 0.1)]),
         x0=np.full(tanks, 5.0),
     )
-
-
-def programs_in(jaxpr):
-    """A program and all those that it calls."""
-    yield jaxpr
-    for equation in jaxpr.eqns:
-        for value in equation.params.values():
-            for inner in value if isinstance(value, tuple | list) else [value]:
-                inner = getattr(inner, "jaxpr", inner)
-                if hasattr(inner, "eqns"):
-                    yield from programs_in(inner)
 
 
 def loop_of(tanks):

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import programs_in
 
 import jaxtank
 from jaxtank import presets
 from jaxtank.core.errors import InputError
 from jaxtank.loop.many import _mapped
+from jaxtank.loop.run import evaluate_and_flag
 
 NAMES = ("rms_error_total", "max_level", "iae")
 
@@ -170,3 +172,65 @@ def test_the_program_of_batches_does_not_grow_with_their_number():
         return len(lowered.as_text().splitlines())
 
     assert lines(8) == lines(8000)
+
+
+def batched_and_direct(samples=40):
+    """(evaluate, what it calls) as functions of two gains, and points at which to compare them."""
+    loop, clock = short("gouta2015/backstepping", samples)
+    loop = jaxtank.with_values(loop, {"x0": 0.8 * np.asarray(loop.x0)})
+
+    def of(call):
+        def value(gains):
+            k, k1 = gains
+            here = jaxtank.with_values(loop, {"controller.k": k, "controller.k1": k1})
+            return call(here, clock, NAMES[:1])["rms_error_total"]
+
+        return value
+
+    direct = of(lambda *a: evaluate_and_flag(*a)[0])
+    points = np.array([0.1, 0.08]) * np.linspace(0.9, 1.1, 300)[:, None]
+    return of(jaxtank.evaluate), direct, jnp.asarray(points)
+
+
+def test_a_large_vmap_of_evaluate_runs_in_batches():
+    value, direct, points = batched_and_direct()
+    np.testing.assert_allclose(
+        jax.vmap(value)(points), [direct(p) for p in points], rtol=1e-12, atol=1e-12
+    )
+
+    def widths(call, count):
+        """Numbers of runs side by side in the loops over the samples."""
+        traced = jax.make_jaxpr(jax.vmap(call))(jnp.resize(points, (count, 2)))
+        scans = [e for p in programs_in(traced.jaxpr) for e in p.eqns if e.primitive.name == "scan"]
+        samples = [e for e in scans if e.params["length"] == 40]
+        return {v.aval.shape[0] for e in samples for v in e.outvars if v.aval.shape}
+
+    assert widths(value, 256) == {256} and widths(value, 700) == {256, 700 % 256}
+    assert widths(direct, 700) == {700}
+
+
+def test_derivatives_of_evaluate_are_those_of_the_run_in_every_order_with_vmap():
+    value, direct, points = batched_and_direct()
+    for of in (
+        lambda f: jax.jacfwd(f)(points[0]),
+        lambda f: jax.grad(f)(points[0]),
+        lambda f: jax.hessian(f)(points[0]),
+        lambda f: jax.vmap(jax.grad(f))(points[:3]),
+        lambda f: jax.grad(lambda s: jnp.sum(jax.vmap(f)(s * points)))(1.0),
+        lambda f: jax.vmap(jax.vmap(f))(points.reshape(10, 30, 2)),
+    ):
+        np.testing.assert_allclose(of(value), of(direct), rtol=1e-9, atol=1e-12)
+    step = 1e-6 * np.eye(2)
+    differences = [(value(points[0] + s) - value(points[0] - s)) / 2e-6 for s in step]
+    np.testing.assert_allclose(jax.grad(value)(points[0]), differences, rtol=1e-6)
+
+
+def test_no_derivatives_are_computed_by_what_does_not_move():
+    """The derivative by two gains of sixty numbers takes the operations that it took."""
+    value, direct, points = batched_and_direct()
+
+    def operations(call):
+        traced = jax.make_jaxpr(jax.jacfwd(call))(points[0])
+        return sum(len(p.eqns) for p in programs_in(traced.jaxpr))
+
+    assert operations(value) <= operations(direct) + 5
