@@ -7,14 +7,15 @@
     trajectory = jaxtank.simulate(case.loop, case.clock, save_every=10)
     values = jaxtank.evaluate(case.loop, case.clock, ["rms_error_total", "max_level"])
 
-Importing this package sets three XLA options, and does nothing else. A closed loop is a scan over
+Importing this package sets four XLA options, and does nothing else. A closed loop is a scan over
 a handful of numbers, and XLA's CPU runtime dispatches every operation of such a loop by itself
 unless the loop counts as small; the option ``xla_cpu_small_while_loop_byte_threshold`` lets any
 loop count as small, so that it is compiled to one function (about sixteen times faster in float64).
 ``xla_cpu_disable_loop_unrolling`` keeps short loops over lanes loops, which become vector
 instructions. ``xla_cpu_disable_new_fusion_emitters`` compiles what is outside the loop in less
-time. They are appended to ``XLA_FLAGS`` and leave what is there alone. Set ``JAXTANK_XLA_OPTION=0``
-before the import to leave XLA as it is.
+time, and ``xla_cpu_prefer_vector_width`` uses all of an AVX-512 unit. They are added to
+``XLA_FLAGS`` and leave what is there alone. Set ``JAXTANK_XLA_OPTION=0`` before the import to leave
+XLA as it is.
 """
 
 import importlib

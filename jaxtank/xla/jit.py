@@ -1,6 +1,6 @@
 """`jax.jit` with the type of the function that it compiles kept. Imports `xla` only."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import jax
@@ -10,15 +10,12 @@ from jaxtank.xla.executables import Kept
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(
-    *static: str, options: Mapping[str, Any] | None = None, keep: bool = False
-) -> Callable[[F], F]:
+def compiled(*static: str, keep: bool = False) -> Callable[[F], F]:
     """Return `jax.jit` as a decorator.
 
     Parameters
     ----------
     static : names of the arguments that are part of the program.
-    options : of the compiler.
     keep : whether programs are kept between processes, where the user keeps any (`jaxtank.cache`):
         for those that take long to trace.
 
@@ -33,7 +30,7 @@ def compiled(
 
     def decorate(function: F) -> F:
         jit: Any = jax.jit
-        made = jit(function, static_argnames=static, compiler_options=options)
+        made = jit(function, static_argnames=static)
         return cast(F, Kept(function, made, static) if keep else made)
 
     return decorate

@@ -28,7 +28,6 @@ from jaxtank.core.files import write_atomic
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import sensitivities_compiled
-from jaxtank.xla import flags
 from tuning.bench import bench
 from tuning.problem.scenarios import noisy
 from tuning.report import tables
@@ -235,7 +234,7 @@ def gauss_newton(rounds):
     names, point = tuple(values), tuple(values.values())
 
     def compiled(one):
-        call = jax.jit(jax.vmap(one), compiler_options=flags.WIDE).lower(orifice).compile()
+        call = jax.jit(jax.vmap(one)).lower(orifice).compile()
         return lambda: call(orifice)
 
     at = lambda o: with_values(case.loop, {"plant.orifice": o})

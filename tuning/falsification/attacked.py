@@ -21,7 +21,6 @@ from jaxtank.loop.step import step
 from jaxtank.safety.box import band_of, top_of
 from jaxtank.safety.filter import FLOOR
 from jaxtank.safety.worst_case import rates_of
-from jaxtank.xla.flags import WIDE
 from jaxtank.xla.hoist import scan
 from tuning.falsification.coefficients import Coefficient
 from tuning.falsification.components import Course, GivenErrors, PumpPlan
@@ -311,8 +310,8 @@ def programs(attacked: Attacked) -> tuple[Any, Any]:
     ((level of each one's tank, Levels), its slopes by the variables).
     """
     slopes = jax.value_and_grad(attacked.objective, has_aux=True)
-    run = jax.jit(jax.vmap(attacked.levels), compiler_options=WIDE)
-    return run, jax.jit(jax.vmap(slopes), compiler_options=WIDE)
+    run = jax.jit(jax.vmap(attacked.levels))
+    return run, jax.jit(jax.vmap(slopes))
 
 
 def batch_size(attacked: Attacked, runs: int) -> int:

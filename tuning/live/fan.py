@@ -17,7 +17,6 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.rows_and_measures import rows_and_measures
-from jaxtank.xla import flags
 from tuning.answer.setting import plants_of
 from tuning.problem.bounds import Bound, bounds
 from tuning.problem.scenarios import COARSE, noisy
@@ -119,7 +118,7 @@ class Fan:
             self.keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(seed), i))(numbers)
         self.measured = tuple(m for m in MEASURED if ms.serves(m, case.loop))
         self.every = max(1, (self.case.clock.samples - 1) // ROWS)
-        self.program = jax.jit(self._program, compiler_options=flags.WIDE)
+        self.program = jax.jit(self._program)
 
     @property
     def start(self) -> dict[str, float]:

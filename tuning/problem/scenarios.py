@@ -25,7 +25,6 @@ from jaxtank.core.tree import split_index, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.derivatives import sensitivities_compiled
-from jaxtank.xla import flags
 from jaxtank.xla.jit import compiled
 
 MANY = 1024
@@ -274,7 +273,7 @@ def _first_axis(value: Any) -> Any:
     return value[None]
 
 
-@compiled("shape", "clock", "names", options=flags.WIDE, keep=True)
+@compiled("shape", "clock", "names", keep=True)
 def _values(
     leaves: Any, keys: Any, shape: Shape, clock: Clock, names: tuple[str, ...], points: Any
 ) -> Any:
@@ -287,7 +286,7 @@ def _values(
     return jax.vmap(at)(points)
 
 
-@compiled("shape", "clock", "names", "order", "squares", options=flags.WIDE, keep=True)
+@compiled("shape", "clock", "names", "order", "squares", keep=True)
 def _slopes(
     leaves: Any,
     keys: Any,

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.loop import run as lp
-from jaxtank.xla.flags import WIDE
 from jaxtank.xla.jit import compiled
 from tuning.problem import scenarios as sc
 from tuning.uncertainty.sampling import check_whole
@@ -84,7 +83,7 @@ def run_batch(case, names, seed, rows, indices, device=None):
     return {n: np.asarray(v) for n, v in found.items()}
 
 
-@compiled("clock", "names", "seed", options=WIDE, keep=True)
+@compiled("clock", "names", "seed", keep=True)
 def _run(loop, values, indices, seed, clock, names):
     def one(values, index):
         noise = None if seed is None else jax.random.fold_in(jax.random.key(seed), index)
