@@ -135,21 +135,22 @@ def evaluate(
     check(loop, clock, key)
     leaves, tree = cast(tuple[list[Any], Any], jax.tree.flatten((loop, key)))
     if any(isinstance(v, Tracer) for v in leaves):
-        return _in_batches(tree, clock, names)(*leaves)
-    values, broken = evaluate_compiled(loop, clock, names, key, False)
+        values, broken = _in_batches(tree, clock, names)(*leaves)
+    else:
+        values, broken = evaluate_compiled(loop, clock, names, key, False)
     _report_broken(broken, loop, clock, key)
     return values
 
 
 @functools.lru_cache(maxsize=64)
 def _in_batches(tree: Any, clock: Clock, names: tuple[str, ...]) -> Any:
-    """The values of `evaluate` as a function of the leaves of (loop, key)."""
+    """`evaluate_compiled` as a function of the leaves of (loop, key)."""
 
-    def values(*leaves: Any) -> dict[str, jax.Array]:
+    def run(*leaves: Any) -> tuple[dict[str, jax.Array], jax.Array]:
         loop, key = jax.tree.unflatten(tree, leaves)
-        return evaluate_compiled(loop, clock, names, key, False)[0]
+        return evaluate_compiled(loop, clock, names, key, False)
 
-    return in_batches(values, BATCH)
+    return in_batches(run, BATCH)
 
 
 def evaluate_and_flag(

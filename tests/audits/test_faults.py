@@ -528,8 +528,9 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     once after it, as of `timeout`, which signals a program and its group, is the same.
     """
     code = (
-        "import os, signal, sys, time; from tuning.cli import interrupts; interrupts.listen();"
-        " search = interrupts.Interrupts()\nsearch.check(); os.kill(os.getpid(),"
+        "import os, signal, sys, time; from tuning.cli import interrupts;"
+        " signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a script's & ignores it
+        "interrupts.listen(); search = interrupts.Interrupts()\nsearch.check(); os.kill(os.getpid(),"
         " signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\nos.kill(os.getpid(),"
         " signal.SIGINT); time.sleep(1); print('went on', flush=True); os.kill(os.getpid(),"
         " signal.SIGINT); time.sleep(60); print('for ever')"

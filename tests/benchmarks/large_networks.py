@@ -5,10 +5,13 @@ python tests/benchmarks/large_networks.py [rounds]
 For each number of tanks: core time to trace and compile a run and its gradient by two gains, both
 without a cache; time of a step for each tank, beside a C loop of the same arithmetic (chain.c) in
 the same interleaved rounds; the gradient as a multiple of the run. Then the exponents of growth
-from the smallest rig on arrays to the largest.
+from the smallest rig on arrays to the largest, and the command line on a rig file of the largest,
+with no kept programs: 2,001 samples, to JSON, and with trajectory, pictures and report.
 """
 
 import ctypes
+import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -19,6 +22,8 @@ import jax
 import numpy as np
 
 import jaxtank
+from jaxtank import rig
+from jaxtank.case import Case
 from jaxtank.controllers import PID
 from jaxtank.core.tree import with_values
 from jaxtank.instruments import LevelSensor, PumpBank
@@ -151,11 +156,35 @@ def built(folder):
     return found
 
 
+def from_file(tanks, folder):
+    """{options: (core time, wall time) of `jaxtank simulate` of a rig file of so many tanks}."""
+    clock = jaxtank.Clock(dt=0.1, duration=200.0)
+    names = {"name": "chain", "title": "a chain of tanks"}
+    case = Case(**names, loop=chain(tanks), clock=clock, limits={}, free={}, objective={})
+    Path(folder, "chain.toml").write_text(rig.dump(case))
+    found = {}
+    for options in ("--json", "--out run"):
+        used, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "jaxtank", "simulate", "chain.toml", *options.split()],
+            cwd=folder,
+            env=os.environ | {"JAXTANK_CACHE": "0"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=True,
+        )
+        now = resource.getrusage(resource.RUSAGE_CHILDREN)
+        core = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+        found[options] = core, time.perf_counter() - began
+    return found
+
+
 def main(rounds=9):
     """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         libraries = built(folder)
         rows = {n: row(n, libraries, rounds) for n in SIZES}
+        commands = from_file(SIZES[-1], folder)
     names = ["compile run", "compile gradient", "ns", *libraries, "times C", "times the run"]
     units = ["s", "s", *["ns"] * (1 + len(libraries)), "", ""]
     print("| tanks | form |", " | ".join(names), "|")
@@ -175,6 +204,8 @@ def main(rounds=9):
     print(f"\nexponents of growth from {first} to {last} tanks:", end=" ")
     print(", ".join(f"{name} {value:.2f}" for name, value in grown.items()))
     print(f"largest difference to C: {max(r['difference'] for r in rows.values()):.1e} cm")
+    for options, (core, wall) in commands.items():
+        print(f"simulate {SIZES[-1]} tanks {options}: {core:.1f} core-seconds, {wall:.1f} s")
 
 
 if __name__ == "__main__":
