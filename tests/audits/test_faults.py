@@ -530,10 +530,10 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     code = (
         "import os, signal, sys, time; from tuning.cli import interrupts;"
         " signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a script's & ignores it
-        "interrupts.listen(); search = interrupts.Interrupts()\nsearch.check(); os.kill(os.getpid(),"
-        " signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\nos.kill(os.getpid(),"
-        " signal.SIGINT); time.sleep(1); print('went on', flush=True); os.kill(os.getpid(),"
-        " signal.SIGINT); time.sleep(60); print('for ever')"
+        "interrupts.listen(); search = interrupts.Interrupts()\nsearch.check()\n"
+        "os.kill(os.getpid(), signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\n"
+        "os.kill(os.getpid(), signal.SIGINT); time.sleep(1); print('went on', flush=True);"
+        " os.kill(os.getpid(), signal.SIGINT); time.sleep(60); print('for ever')"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     first, second = done.stderr.splitlines()

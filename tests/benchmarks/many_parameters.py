@@ -2,27 +2,32 @@
 
     python tests/benchmarks/many_parameters.py [rounds]
 
-Core time of second calls over that of a run, the least of `rounds` (3): the four-tank under
-backstepping with samples of 0.1 s, with respect to its two gains, then to the parameters of its
-plant, then to all others.
+Core time of second calls over that of a run, the least of `rounds` (3): five measures of the
+four-tank under backstepping with samples of 0.1 s, with respect to its two gains, then to the
+parameters of its plant, then to all others. Then a search of a gain scheduled at sixty knots, with
+the Gauss-Newton matrix and by reverse mode (`pip install ".[bench]"`).
 """
 
 import dataclasses
 import sys
+import time
 
 import jax
 import numpy as np
-from many_runs import NAMES, least
+from many_runs import least
 
 import jaxtank
+import tuning
 from jaxtank import presets
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_for_reverse
+from tuning.problem import problem
 from tuning.report import tables
 
+NAMES = ("rms_error_total", "max_level", "min_level", "rms_input", "input_travel")
 SQUARES = (("mean_square_error", 1.0),)
-COUNTS = (8, 24, 30, 40, 60)
+COUNTS = (8, 24, 30, 40, 50, 60, 70)
 
 
 def chosen(loop, count):
@@ -61,11 +66,29 @@ def rows(rounds):
     return found
 
 
+def searches(knots=60):
+    """Rows of two searches of a schedule: method, passes with derivatives, cost, core time [s]."""
+    from optimisers import twenty_values
+
+    asked = twenty_values(knots)
+    options = {"objective": dict(asked.objective), "limits": {}, "validation": 0}
+    found = []
+    for limit in (knots, knots - 1):
+        jax.clear_caches()
+        problem.FORWARD_LIMIT, began = limit, time.process_time()
+        result = tuning.tune(asked.case, nominal=True, starts=1, seed=0, **options)
+        took = time.process_time() - began
+        counts, cost = result.evaluations, result.objective["after"]
+        found.append([result.method, f"{counts['gradients']}", f"{cost:.6g}", f"{took:.0f} s"])
+    return found
+
+
 def main(words):
     jax.config.update("jax_enable_x64", True)
     rounds = next((int(w) for w in words if w.isdigit()), 3)
     heads = ["parameters", "forward, runs", "Gauss-Newton pass, runs", "reverse, runs"]
     print(tables.table(rows(rounds), heads))
+    print(tables.table(searches(), ["60 gains", "passes", "cost", "core time"]))
 
 
 if __name__ == "__main__":

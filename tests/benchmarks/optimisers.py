@@ -83,7 +83,7 @@ def eight_gains():
     )
 
 
-def twenty_values():
+def twenty_values(knots=20):
     """gouta2015 backstepping with k1 scheduled on the setpoint of tank 1 at twenty knots, over a
     staircase through all of them.
 
@@ -102,7 +102,7 @@ def twenty_values():
         clock=dataclasses.replace(case.clock, dt=0.1, duration=1300.0),
         free={"controller.k1": Free(1e-3, 1.0)},
     )
-    case = schedule(case, {"controller.k1": "r1"}, np.linspace(3.0, 16.0, 20))
+    case = schedule(case, {"controller.k1": "r1"}, np.linspace(3.0, 16.0, knots))
     return Problem(
         case, objective={"mean_square_error": 1.0, "mean_square_travel": 100.0}, limits={}
     )
