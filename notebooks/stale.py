@@ -2,8 +2,8 @@
 show. Imported by run.py of this folder and by the tests.
 
 Numbers agree within one per cent or one unit of their last digit: another processor rounds
-otherwise, and a search ends a little elsewhere. How long a command took, and how many
-simulations identify needed, is not compared, and in a cell with the tag "times" no number is.
+otherwise, and a search ends a little elsewhere. The time of a command and the number of simulations
+of identify are not compared, nor is any number in a cell with the tag "times".
 """
 
 import re

@@ -1,9 +1,9 @@
 """Elimination for small systems: of `jaxtank.analysis.qp`, and of a steady state; without LAPACK.
 
-Its call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call divides
-its work among the threads on which it runs itself: as many such calls at once as there are threads
-wait for each other for ever. A kept program with LAPACK in it takes 0.1 s longer to load, for jax
-looks its functions up in scipy. Imports jax only; imported by `qp` and `steady_state`.
+A LAPACK call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call
+divides its work among the threads on which it runs itself: as many such calls at once as there are
+threads wait for each other for ever. A kept program with LAPACK in it takes 0.1 s longer to load,
+for jax looks its functions up in scipy. Imports jax only; imported by `qp` and `steady_state`.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ def rolled() -> Iterator[None]:
 def solve(A, b):
     """Return x (n,) of A x = b, for a small matrix A (n, n): Gauss-Jordan with row pivots.
 
-    Written out; where A is singular, entries are not finite.
+    Unrolled. Entries are not finite where a pivot is exactly 0.
 
     Examples
     --------

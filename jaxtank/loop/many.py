@@ -42,8 +42,8 @@ def evaluate_many(
 ) -> dict[str, jax.Array]:
     """Run the loop at N sets of values and keep only running measures.
 
-    What `jax.vmap` of `evaluate` gives, some runs at a time: neither the memory of the runs nor the
-    time of each depends on N, and so it is with derivatives. It can be called inside `jax.jit`.
+    The values of `jax.vmap` of `evaluate`, in batches: memory and the time of each run do not
+    depend on N, with derivatives too. It can be differentiated, and called inside `jax.jit`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Functions that a user's own `jax.vmap` runs some elements at a time. Imports jax only."""
+"""Functions of which `jax.vmap` runs a limited number of elements at a time. Imports jax only."""
 # jax leaves the types of custom_vmap and custom_jvp partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false, reportUntypedFunctionDecorator=false
@@ -12,11 +12,11 @@ from jax.custom_derivatives import SymbolicZero
 
 
 def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
-    """Return `function` of arrays, of which `jax.vmap` runs at most `batch` elements at once.
+    """Return `function` of arrays; on a CPU `jax.vmap` of it runs at most `batch` elements at once.
 
-    What is computed side by side then stays in the cache of a processor; on a GPU, and in a vmap of
-    derivatives, all elements are. Derivatives are those of `function`, in both modes, and none are
-    computed by arguments that have none.
+    What is computed side by side then fits the cache. On a GPU, and wherever derivatives are taken,
+    all elements run at once. Both modes of differentiation work; arguments with a tangent of zero
+    are not differentiated.
 
     Examples
     --------

@@ -17,22 +17,22 @@ ROLLED = "xla_cpu_disable_loop_unrolling"
 single ones (36 against 11 ns per step and plant), and derivatives compile twice as long. A compiler
 that does not know the option ignores it.
 """
-PLAIN = "xla_cpu_disable_new_fusion_emitters"
-"""What is computed outside the loop is compiled by XLA's older generator: a first `tune` takes 24.5
-core-seconds for 30, and runs take as long. A compiler that does not know the option ignores it.
+OLD_EMITTERS = "xla_cpu_disable_new_fusion_emitters"
+"""What is computed outside the loop is compiled by XLA's older code generator, in less time; runs
+take as long. A compiler that does not know the option ignores it.
 """
-OPTION = f"{KEY}=100000000000,{ROLLED},{PLAIN}"
+OPTION = f"{KEY}=100000000000,{ROLLED},{OLD_EMITTERS}"
 _FLAG = "--xla_backend_extra_options="
 
-WIDE = "--xla_cpu_prefer_vector_width=512"
-"""XLA's own 256 bits leave half of an AVX-512 unit idle: with 512, a plant of a large batch takes
-5.5 ns a step for 10.6, a chain of 100 tanks 5.9 ns per tank for 8.6, derivatives by 24 parameters a
-quarter less, a single run as long. A processor without such a unit uses what it has.
+VECTOR_WIDTH = "--xla_cpu_prefer_vector_width=512"
+"""XLA's own 256 bits leave half of an AVX-512 unit idle. With 512, batches of plants take half the
+time, networks of 100 tanks three quarters, a single run as long (tests/benchmarks/README.md). A
+processor without such a unit uses what it has.
 """
 
-TRIED = (0, 12)
-"""First version of jaxlib that may not know WIDE: XLA ends the process at a flag of XLA_FLAGS that
-it does not know, and ignores an unknown one among the extra options.
+UNTRIED = (0, 12)
+"""From this version of jaxlib on VECTOR_WIDTH is not set: XLA ends the process at an unknown flag
+in XLA_FLAGS. Unknown extra options are ignored.
 """
 
 
@@ -51,8 +51,8 @@ def append_option(flags):
     """
     if flags.strip() and not flags.lstrip().startswith("--"):
         return flags
-    if WIDE.split("=")[0] not in flags and jaxlib.version.__version_info__ < TRIED:
-        flags = f"{WIDE} {flags}".strip()
+    if VECTOR_WIDTH.split("=")[0] not in flags and jaxlib.version.__version_info__ < UNTRIED:
+        flags = f"{VECTOR_WIDTH} {flags}".strip()
     wanted = ",".join(option for option in OPTION.split(",") if option.split("=")[0] not in flags)
     if not wanted:
         return flags
@@ -79,7 +79,7 @@ def backend_started():
 
 
 def enable_small_loop_compilation():
-    """Append the option to XLA_FLAGS; warn once if jax has already started and cannot see it."""
+    """Add the options to XLA_FLAGS; warn once if jax has already started and cannot see it."""
     if os.environ.get(SWITCH, "1").lower() in OFF:
         return
     before = os.environ.get("XLA_FLAGS", "")
@@ -89,7 +89,7 @@ def enable_small_loop_compilation():
             warnings.warn(
                 f"XLA_FLAGS names a file ({before!r}), to which the options for fast loops cannot"
                 " be appended: runs are correct but about 16 times slower. Add"
-                f" {WIDE} {_FLAG}{OPTION} to it, or set {SWITCH}=0 to silence this.",
+                f" {VECTOR_WIDTH} {_FLAG}{OPTION} to it, or set {SWITCH}=0 to silence this.",
                 stacklevel=3,
             )
         return

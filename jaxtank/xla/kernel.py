@@ -6,8 +6,8 @@ What it is for, estimated for an H100 in float64, 1e6 plants of 120,001 steps: a
 a step and plant are 7e13, 2 s at the 34e12 a second of its data sheet; with square roots and
 divisions 5 to 7 s in a loop that keeps levels and sums in registers. As `jax.lax.scan` each step is
 a launch of one fused kernel that reads and writes 100 bytes a plant: 15 to 25 s. It has been run by
-Pallas's interpreter, and lowered to Triton; no GPU was at hand to run it on, which
-`tests/benchmarks/accelerator.py` does.
+Pallas's interpreter, and lowered to Triton, and not on a GPU yet: `tests/benchmarks/accelerator.py`
+measures it there.
 """
 # jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false

@@ -27,8 +27,8 @@ POINTS = 12
 
 
 def machine():
-    """What decides the last bits of a run. Virtual machines give processors with and without the
-    wider vector instructions the same name: `processor` knows their instructions.
+    """Return what decides the last bits of a run: versions, and the processor by its instructions,
+    for its name on a virtual machine does not include them.
     """
     return {"processor": processor(), "jax": jax.__version__, "jaxlib": jax.lib.__version__}
 

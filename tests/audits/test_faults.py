@@ -529,7 +529,8 @@ def test_a_second_ctrl_c_ends_a_search_at_once(tmp_path):
     """
     code = (
         "import os, signal, sys, time; from tuning.cli import interrupts;"
-        " signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a script's & ignores it
+        # a shell starts a background job with SIGINT ignored
+        " signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "interrupts.listen(); search = interrupts.Interrupts()\nsearch.check()\n"
         "os.kill(os.getpid(), signal.SIGINT)\nwhile not search.stop: time.sleep(0.01)\n"
         "os.kill(os.getpid(), signal.SIGINT); time.sleep(1); print('went on', flush=True);"

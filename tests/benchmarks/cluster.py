@@ -111,10 +111,10 @@ def main():
     jax.config.update("jax_enable_x64", True)
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # killed on purpose
     if asked.rounds:
-        case = presets.find("gouta2015/backstepping")
-        for short in (case, rig.set_values(case, {"clock.dt": 0.1})):
-            print(f"{asked.samples:,} plants of {short.clock.samples:,} samples")
-            times(short, asked.samples, asked.rounds)
+        whole = presets.find("gouta2015/backstepping")
+        for case in (whole, rig.set_values(whole, {"clock.dt": 0.1})):
+            print(f"{asked.samples:,} plants of {case.clock.samples:,} samples")
+            times(case, asked.samples, asked.rounds)
     chance, survived = random.Random(0), 0
     with tempfile.TemporaryDirectory() as top:
         if asked.kills:

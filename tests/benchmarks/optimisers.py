@@ -84,8 +84,8 @@ def eight_gains():
 
 
 def twenty_values(knots=20):
-    """gouta2015 backstepping with k1 scheduled on the setpoint of tank 1 at twenty knots, over a
-    staircase through all of them.
+    """gouta2015 backstepping with k1 scheduled at `knots` values of the setpoint of tank 1, over
+    a staircase through all of them.
 
     k keeps its printed value: at such a price of travel it would end at its lower bound at every
         knot, ten parameters that are none.

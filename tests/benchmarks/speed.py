@@ -360,7 +360,7 @@ def cold():
     run, slope = (f"{statistics.median(v):.2f} s" for v in zip(*first))
     return [
         [
-            "`jaxtank simulate gouta2015/ngpc --json`, cold",
+            "`jaxtank simulate gouta2015/ngpc --json`, a new process, wall time",
             wall("jaxtank", "simulate", "gouta2015/ngpc", "--json"),
             "",
             "",

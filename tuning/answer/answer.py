@@ -29,7 +29,7 @@ class Answer(Shown):
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
     idle : numbers of the tanks, from 1, whose limit no plant comes near.
     tightened : largest share by which a limit was tightened for the search [-].
-    coarse_dt : step of the search [s]; integrator : of the search.
+    coarse_dt : step of the search [s]; integrator : its integrator.
     measures : {"before", "after": {measure: value} of the case's own run}.
     feasibility : a `tuning.Feasibility`, None where it is not known; mended : the Mend that was
         applied first, None where none was asked for.

@@ -1,6 +1,6 @@
 """Whether the midpoint rule follows a plant closely enough for a search.
 
-Imported by `setting`. What a search finds is judged by RK4 at the case's own step.
+Imported by `setting`. What a search finds is judged at the case's own step and integrator.
 """
 
 import dataclasses
@@ -16,19 +16,20 @@ from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
 
-ENOUGH = 1e-3
-"""Difference of the changes of level by midpoint and by RK4, as a share of them, up to which the
-midpoint rule is used [-]: a fiftieth of the 5 % by which flows differ from plant to plant."""
+LARGEST_ERROR = 1e-3
+"""Largest `midpoint_error` with which the midpoint rule is used [-]: a fiftieth of the 5 % by which
+flows differ from plant to plant."""
 
 STATES = 256
 """States and inputs at which both are compared."""
 
 LOWEST = 0.05
-"""Least level of these states, as a share of the height [-]: nearer to empty stability counts."""
+"""Least level of these states, as a share of the height [-]: closer to empty, stability limits the
+step, which is checked separately."""
 
 
 def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) -> float:
-    """Return how far the midpoint rule is from RK4 over one sample, as a share of the change.
+    """Return the relative difference of the midpoint rule and RK4 over one sample.
 
     The root of the mean square of the differences of all levels after one sample, over that of
     their changes by RK4, at random levels and inputs.
@@ -37,13 +38,13 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
     ----------
     case : the plant and its limits of the inputs.
     clock : step and substeps.
-    height : of the levels, drawn between a twentieth of it and all of it [unit of length].
+    height : largest level; levels are drawn from 5 % to 100 % of it [unit of length].
     span : (pumps,) range of the inputs above their lower limit [unit of the inputs].
 
     Returns
     -------
-    Share [-]; inf where a number is not finite, or where the midpoint rule is unstable in a tank
-    that runs empty.
+    Share [-]; inf where no level changes, where a number is not finite, and where the midpoint rule
+    is unstable in a tank that runs empty.
 
     Examples
     --------
@@ -51,7 +52,7 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
     >>> case = presets.find("gouta2015/backstepping")
     >>> short = midpoint_error(case, Clock(dt=0.05), 30.0, np.full(2, 12.0))
     >>> long = midpoint_error(case, Clock(dt=0.1), 30.0, np.full(2, 12.0))
-    >>> bool(short < long < ENOUGH)
+    >>> bool(short < long < LARGEST_ERROR)
     True
     """
     loop, plant = case.loop, case.loop.plant

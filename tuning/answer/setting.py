@@ -17,7 +17,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop import run as lp
 from jaxtank.presets import find
-from tuning.answer.integrator import ENOUGH, midpoint_error
+from tuning.answer.integrator import LARGEST_ERROR, midpoint_error
 from tuning.problem.scenarios import screening_clock
 from tuning.search.robust import scenarios_of
 from tuning.uncertainty.distributions import Uniform
@@ -93,14 +93,14 @@ class Setting:
         return None if self.own_objective else f"{self.case.loop.units[0]}^2"
 
     def coarse(self) -> Case:
-        """Return the searched case at ten times its step, or itself where that cannot be.
-
-        By the midpoint rule where its measured error is small enough.
+        """Return the searched case at ten times its step, integrated by the midpoint rule where the
+        error of that is small enough; the case as it is where too few samples would remain, or
+        where it cannot run at that step.
         """
         clock = screening_clock(self.searched.clock)
         if clock == self.searched.clock:
             return self.searched
-        if midpoint_error(self.searched, clock, height(self.case), self.span) <= ENOUGH:
+        if midpoint_error(self.searched, clock, height(self.case), self.span) <= LARGEST_ERROR:
             clock = dataclasses.replace(clock, integrator="midpoint")
         try:
             found = self.searched.replace(clock=clock)

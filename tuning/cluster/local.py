@@ -16,12 +16,12 @@ from typing import Any
 from jaxtank.core.errors import InputError
 from tuning.cluster.parent import FOLDER
 
-LEAN = {
+DASK_SETTINGS = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
 }
-"""Settings of Dask for these processes: its profile of a worker, 100 samples a second, takes 5 % of
-the core time. What the user has set stays.
+"""Settings of Dask for these processes: its profiler of a worker and the watch on its event loops
+take 5 % of the core time. What the user has set stays.
 """
 
 PATIENCE = 60.0
@@ -67,7 +67,7 @@ def _process(words, folder, more=None):
             stdout=log,
             stderr=log,
             start_new_session=True,
-            env={**LEAN, **os.environ, **_programs(), **own, **(more or {})},
+            env={**DASK_SETTINGS, **os.environ, **_programs(), **own, **(more or {})},
         )
     try:
         yield found

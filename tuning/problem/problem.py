@@ -28,9 +28,9 @@ from tuning.storage.evaluation_log import EvaluationCache
 
 FORWARD_LIMIT = 60
 """Number of free parameters up to which derivatives run forward with the simulation; above,
-checkpointed reverse, without a Gauss-Newton matrix. A pass with the matrix costs 5.4, 9.6 and 16
-runs with 40, 60 and 67 parameters (four-tank, derivatives of five measures), reverse 7 to 9; with
-the matrix a search of 60 gains took 44 passes instead of 230 gradients, and .7 of the time.
+checkpointed reverse, without a Gauss-Newton matrix. With 60 a pass with the matrix costs half as
+much again as reverse mode, and a search needs fewer of them: 44 instead of 230
+(tests/benchmarks/README.md, Many parameters).
 """
 
 ROOT = "rms_error_total"

@@ -11,25 +11,28 @@ from tuning.cluster.sent import received, sent
 from tuning.uncertainty.batches import group_of, run_batch, run_points
 
 WORK = 1 << 24
-"""Samples of all runs from which a task has one batch [-]: .2 s or so, beside the 5 ms that the
-command and the scheduler need for a task, on this machine perhaps.
+"""Samples of all runs of a batch from which it is a task of its own [-]: 0.1 s of work, while the
+command and the scheduler need 5 ms for a task.
 """
 
 SHARES = 16
-"""Tasks at least, where there are so many batches: no worker waits long for the last one."""
+"""Least number of tasks, where there are as many batches: workers end at about the same time."""
 
 
-def batches(text, names, seed, parts):
-    """Return what `run_batch` gives for the case of `sent` and each (values, indices); a task."""
-    return [run_batch(received(text), names, seed, *part) for part in parts]
+def batches(text, names, seed, chunks):
+    """Return what `run_batch` gives for the case of `sent` and each (values, indices) of `chunks`;
+    a task.
+    """
+    return [run_batch(received(text), names, seed, *chunk) for chunk in chunks]
 
 
-def points(text, names, seed, parts):
-    """Return what `run_points` gives for the case of `sent` and each values; a task.
+def points(text, names, seed, chunks):
+    """Return what `run_points` gives for the case of `sent` and each array of values of `chunks`; a
+    task.
 
     seed : None without noise.
     """
-    return [run_points(_group(text, seed), names, values) for values in parts]
+    return [run_points(_group(text, seed), names, values) for values in chunks]
 
 
 @functools.lru_cache(maxsize=8)
@@ -40,7 +43,7 @@ def _group(text, seed):
 def grouped(numbers, samples):
     """Return `numbers` of batches in groups, one for each task.
 
-    samples : of all runs of a batch.
+    samples : number of samples of all runs of one batch [-].
 
     Examples
     --------

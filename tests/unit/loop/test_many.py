@@ -175,7 +175,7 @@ def test_the_program_of_batches_does_not_grow_with_their_number():
 
 
 def batched_and_direct(samples=40):
-    """(evaluate, what it calls) as functions of two gains, and points at which to compare them."""
+    """(evaluate, the run without batching) as functions of two gains, and points to compare at."""
     loop, clock = short("gouta2015/backstepping", samples)
     loop = jaxtank.with_values(loop, {"x0": 0.8 * np.asarray(loop.x0)})
 
@@ -226,7 +226,7 @@ def test_derivatives_of_evaluate_are_those_of_the_run_in_every_order_with_vmap()
 
 
 def test_no_derivatives_are_computed_by_what_does_not_move():
-    """The derivative by two gains of sixty numbers takes the operations that it took."""
+    """Derivatives by two of sixty numbers take no more operations than without batching."""
     value, direct, points = batched_and_direct()
 
     def operations(call):
