@@ -7,7 +7,6 @@ other modules of `loop` and the folders below.
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -144,7 +143,6 @@ def evaluate(
     return values
 
 
-@functools.lru_cache(maxsize=64)
 def _in_batches(tree: Any, clock: Clock, names: tuple[str, ...]) -> Any:
     """`evaluate_compiled` as a function of the leaves of (loop, key)."""
 

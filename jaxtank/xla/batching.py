@@ -1,22 +1,29 @@
 """Functions of which `jax.vmap` runs a limited number of elements at a time. Imports jax only."""
-# jax leaves the types of custom_vmap and custom_jvp partly open.
+# jax leaves the types of primitives and their rules partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUntypedFunctionDecorator=false
-# pyright: reportUnknownParameterType=false, reportUnknownLambdaType=false
+# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+_call = Primitive("in_batches")
+"""A traced function as one operation, until it is mapped, differentiated or compiled: then its own
+operations stand there. Not custom_vmap in custom_jvp: jax then takes the axes of one for results of
+the other, where the derivative is taken of a vmap that is staged, and neither may hold tracers.
+"""
+_call.multiple_results = True
 
 
 def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
     """Return `function` of arrays; on a CPU `jax.vmap` of it runs at most `batch` elements at once.
 
     What is computed side by side then fits the cache. On a GPU, and wherever derivatives are taken,
-    all elements run at once. Both modes of differentiation work; arguments with a tangent of zero
-    are not differentiated.
+    all elements run at once; of nested vmaps the innermost is divided.
 
     Examples
     --------
@@ -27,33 +34,60 @@ def in_batches(function: Callable[..., Any], batch: int) -> Callable[..., Any]:
     >>> jax.vmap(jax.grad(square))(jnp.arange(3.0)).tolist()
     [0.0, 2.0, 4.0]
     """
-    alone = jax.custom_batching.custom_vmap(function)
 
-    @alone.def_vmap
-    def several(size: int, mapped: Any, *arguments: Any) -> Any:
-        axes = tuple(0 if here else None for here in mapped)
-        if size <= batch or jax.default_backend() != "cpu":
-            found = jax.vmap(function, in_axes=axes)(*arguments)
-        else:
-            own = [v for v, here in zip(arguments, mapped) if here]
+    def whole(*arguments: Any) -> Any:
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+        if closed.effects:
+            return function(*arguments)
+        constants = closed.consts  # also what the function closes over, traced or not
+        found = _call.bind(*constants, *arguments, jaxpr=closed.jaxpr, batch=batch)
+        return jax.tree.unflatten(jax.tree.structure(shapes), found)
 
-            def one(row: Any) -> Any:
-                moving = iter(row)
-                return function(*(next(moving) if h else v for v, h in zip(arguments, mapped)))
-
-            found = jax.lax.map(one, own, batch_size=batch)
-        return found, jax.tree.map(lambda _: True, found)
-
-    whole = jax.custom_jvp(alone)
-
-    def derivative(primals: Any, tangents: Any) -> Any:
-        moving = [i for i, v in enumerate(tangents) if not isinstance(v, SymbolicZero)]
-
-        def of(*own: Any) -> Any:
-            here = dict(zip(moving, own))
-            return function(*(here.get(i, v) for i, v in enumerate(primals)))
-
-        return jax.jvp(of, [primals[i] for i in moving], [tangents[i] for i in moving])
-
-    whole.defjvp(derivative, symbolic_zeros=True)
     return whole
+
+
+def _inlined(*operands: Any, jaxpr: Any, batch: int) -> list[Any]:
+    """The operations of the traced function."""
+    count = len(jaxpr.constvars)
+    return jaxpr_as_fun(ClosedJaxpr(jaxpr, operands[:count]))(*operands[count:])
+
+
+def _mapped(operands: Any, axes: Any, *, jaxpr: Any, batch: int) -> Any:
+    """Rule of `jax.vmap`: all results have their axis in front."""
+    mapped = [axis is not None for axis in axes]
+
+    def one(*given: Any) -> list[Any]:
+        return _inlined(*given, jaxpr=jaxpr, batch=batch)
+
+    size = next(v.shape[axis] for v, axis in zip(operands, axes) if axis is not None)
+    if size <= batch or jax.default_backend() != "cpu":
+        found = jax.vmap(one, in_axes=axes)(*operands)
+    else:
+        moving = [jax.numpy.moveaxis(v, a, 0) for v, a in zip(operands, axes) if a is not None]
+
+        def of(row: Any) -> list[Any]:
+            own = iter(row)
+            return one(*(next(own) if m else v for v, m in zip(operands, mapped)))
+
+        found = jax.lax.map(of, moving, batch_size=batch)
+    return found, [0] * len(found)
+
+
+def _derived(primals: Any, tangents: Any, *, jaxpr: Any, batch: int) -> Any:
+    """Rule of derivatives: those of the operations, by the operands that have a tangent."""
+    moving = [not isinstance(v, ad.Zero) for v in tangents]
+
+    def of(*own: Any) -> list[Any]:
+        given = iter(own)
+        here = (next(given) if m else v for v, m in zip(primals, moving))
+        return _inlined(*here, jaxpr=jaxpr, batch=batch)
+
+    own, theirs = (tuple(itertools.compress(v, moving)) for v in (primals, tangents))
+    return jax.jvp(of, own, theirs)
+
+
+_call.def_impl(_inlined)
+_call.def_abstract_eval(lambda *_, jaxpr, batch: [v.aval for v in jaxpr.outvars])
+batching.primitive_batchers[_call] = _mapped
+ad.primitive_jvps[_call] = _derived
+mlir.register_lowering(_call, mlir.lower_fun(_inlined, multiple_results=True))

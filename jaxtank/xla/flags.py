@@ -4,6 +4,7 @@ Imports nothing of ours; read by `jaxtank/__init__.py` before jax starts.
 """
 
 import os
+import re
 import sys
 import warnings
 
@@ -60,8 +61,11 @@ def append_option(flags):
     head, found, tail = flags.rpartition(_FLAG)
     if not found:
         return f"{flags} {_FLAG}{wanted}".strip()
-    theirs = tail.split(maxsplit=1)[0] if tail and not tail[0].isspace() else ""
-    return head + _FLAG + ",".join(filter(None, (theirs, wanted))) + tail[len(theirs) :]
+    quote = tail[:1] if tail[:1] in ("'", '"') else ""
+    tail = tail[len(quote) :]  # the options join inside of the user's quotes
+    theirs = re.split(quote or r"\s", tail, maxsplit=1)[0]
+    joined = ",".join(filter(None, (theirs, wanted)))
+    return head + _FLAG + quote + joined + tail[len(theirs) :]
 
 
 def backend_started():
@@ -78,6 +82,15 @@ def backend_started():
         return False
 
 
+def _text_of(file):
+    """What a file holds; nothing where it cannot be read."""
+    try:
+        with open(file) as found:
+            return found.read()
+    except (OSError, ValueError):
+        return ""
+
+
 def enable_small_loop_compilation():
     """Add the options to XLA_FLAGS; warn once if jax has already started and cannot see it."""
     if os.environ.get(SWITCH, "1").lower() in OFF:
@@ -85,7 +98,7 @@ def enable_small_loop_compilation():
     before = os.environ.get("XLA_FLAGS", "")
     after = append_option(before)
     if after == before:
-        if KEY not in before:
+        if KEY not in before and KEY not in _text_of(before.strip()):
             warnings.warn(
                 f"XLA_FLAGS names a file ({before!r}), to which the options for fast loops cannot"
                 " be appended: runs are correct but about 16 times slower. Add"

@@ -249,6 +249,14 @@ WIDTH = _xla.VECTOR_WIDTH
             '--xla_dump_to="/a  b" --xla_backend_extra_options=a',
             f'{WIDTH} --xla_dump_to="/a  b" --xla_backend_extra_options=a,{_xla.OPTION}',
         ),
+        (
+            "--xla_backend_extra_options='a=1,b' --c",
+            f"{WIDTH} --xla_backend_extra_options='a=1,b,{_xla.OPTION}' --c",
+        ),
+        (
+            '--xla_backend_extra_options="a"',
+            f'{WIDTH} --xla_backend_extra_options="a,{_xla.OPTION}"',
+        ),
         ("/a/file/of/flags", "/a/file/of/flags"),
     ],
 )
@@ -279,6 +287,14 @@ def test_the_option_is_set_on_import_and_can_be_switched_off():
     show = "import jaxtank, os; print(os.environ.get('XLA_FLAGS', ''))"
     assert python(show)[0] == f"{_xla.VECTOR_WIDTH} --xla_backend_extra_options={_xla.OPTION}"
     assert python(show, JAXTANK_XLA_OPTION="0")[0] == ""
+
+
+def test_a_file_of_flags_is_reported_unless_the_options_are_in_it(tmp_path):
+    file = tmp_path / "flags.txt"
+    file.write_text("--xla_cpu_enable_fast_math=false")
+    assert "names a file" in python("import jaxtank", XLA_FLAGS=str(file))[1]
+    file.write_text(f"{_xla.VECTOR_WIDTH} --xla_backend_extra_options={_xla.OPTION}")
+    assert "names a file" not in python("import jaxtank", XLA_FLAGS=str(file))[1]
 
 
 def test_a_late_import_warns_once():

@@ -12,6 +12,7 @@ from helpers import programs_in
 
 import jaxtank
 from jaxtank import presets
+from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.loop.many import _mapped
 from jaxtank.loop.run import evaluate_and_flag
@@ -223,6 +224,82 @@ def test_derivatives_of_evaluate_are_those_of_the_run_in_every_order_with_vmap()
     step = 1e-6 * np.eye(2)
     differences = [(value(points[0] + s) - value(points[0] - s)) / 2e-6 for s in step]
     np.testing.assert_allclose(jax.grad(value)(points[0]), differences, rtol=1e-6)
+
+
+STAGED = {
+    "grad of jit of vmap": lambda f, x: jax.jacrev(jax.jit(jax.vmap(f)))(x),
+    "jacfwd of jit of vmap": lambda f, x: jax.jacfwd(jax.jit(jax.vmap(f)))(x),
+    "jvp of vmap of jit": lambda f, x: jax.jvp(jax.vmap(jax.jit(f)), (x,), (jnp.ones_like(x),)),
+    "jit of vmap of grad": lambda f, x: jax.jit(jax.vmap(jax.jacfwd(f)))(x),
+    "vmap of checkpoint": lambda f, x: jax.jacrev(jax.vmap(jax.checkpoint(f)))(x),
+    "vmap of scan": lambda f, x: jax.jacfwd(
+        jax.vmap(lambda v: jax.lax.scan(lambda c, _: (c, f(c)), v, None, length=2)[1])
+    )(x),
+    "vmap of vmap": lambda f, x: jax.jacfwd(jax.jit(jax.vmap(jax.vmap(f))))(jnp.stack([x, x + 1])),
+    "linearize": lambda f, x: jax.linearize(jax.jit(jax.vmap(f)), x)[1](jnp.ones_like(x)),
+}
+
+
+@pytest.mark.parametrize("form", STAGED)
+@pytest.mark.parametrize("count", [2, 4])  # as there are outputs, and tanks: axes could be confused
+def test_derivatives_of_a_staged_vmap_have_the_right_numbers_and_axes(form, count):
+    loop, clock = short("gouta2015/backstepping", 40)
+    loop = jaxtank.with_values(loop, {"x0": 0.8 * np.asarray(loop.x0)})
+
+    def of(call):
+        def values(k1):
+            here = jaxtank.with_values(loop, {"controller.k1": k1})
+            found = call(here, clock, ("max_level", "rms_error", "iae"))
+            return found["max_level"], found["rms_error"], jnp.sum(found["iae"] ** 2)
+
+        return values
+
+    points = jnp.linspace(0.07, 0.1, count)
+    found = STAGED[form](of(jaxtank.evaluate), points)
+    expected = STAGED[form](of(lambda *a: evaluate_and_flag(*a)[0]), points)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12, strict=True),
+        found,
+        expected,
+    )
+
+
+def test_results_that_do_not_depend_on_what_is_mapped_have_its_axis():
+    loop, clock = short("gouta2015/backstepping")
+
+    def error(k, rim):
+        here = jaxtank.with_values(loop, {"controller.k": k, "plant.rim": rim})
+        return jaxtank.evaluate(here, clock, NAMES[:1])["rms_error_total"]
+
+    rims = jnp.stack([jnp.full(4, 30.0 + i) for i in range(3)])
+    run = jax.jit(lambda k: jax.vmap(error, (None, 0))(k, rims))
+    value, slope = jax.jvp(run, (0.03,), (1.0,))
+    assert value.shape == slope.shape == (3,)
+    assert jnp.shape(jax.grad(lambda k: jnp.sum(run(k)))(0.03)) == ()
+
+
+def test_a_controller_may_close_over_what_is_traced():
+    loop, clock = short("cascaded/pi")
+
+    def error(bias, gain):
+        @jaxtank.component
+        class Own(Controller):
+            Kc: float = jaxtank.leaf("-", "gain")
+
+            def step(self, state, tick, estimate):
+                return (bias + self.Kc * (tick.r[0] - estimate.x[1]),), state
+
+        here = dataclasses.replace(loop, controller=Own(Kc=gain))
+        return jaxtank.evaluate(here, clock, ["iae"])["iae"].sum()
+
+    x = jnp.array([1.0, 2.0, 3.0])
+    alone = [float(error(v, v)) for v in x]
+    for mapped in (jax.vmap(error), jax.jit(jax.vmap(error))):
+        np.testing.assert_allclose(mapped(x, x), alone, rtol=1e-12)
+    slopes = jax.jit(jax.vmap(jax.grad(error, (0, 1))))(x, x)
+    for i, moved in enumerate((np.array([1e-5, 0.0]), np.array([0.0, 1e-5]))):
+        differences = [(error(*(v + moved)) - error(*(v - moved))) / 2e-5 for v in x]
+        np.testing.assert_allclose(slopes[i], differences, rtol=1e-5)
 
 
 def test_no_derivatives_are_computed_by_what_does_not_move():
