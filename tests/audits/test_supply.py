@@ -108,6 +108,7 @@ READ = {
     ("jaxtank.xla.executables", "_read", "read_bytes"): "an entry of that folder, checked by its"
     " digest when the process began; jax unpickles it, as it loads native code",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
+    ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
     ("tuning.identification.csv_log", "_text", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "_data", "read_bytes"): "after `refusal`",
     ("tuning.storage.evaluation_log", "__init__", "open"): "to write",
