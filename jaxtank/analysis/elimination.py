@@ -51,7 +51,7 @@ def solve(A, b):
     for j in range(A.shape[0]):
         best = index == j + jnp.argmax(jnp.abs(rows[j:, j]))
         pivot = jnp.sum(jnp.where(best, rows, 0.0), axis=0)
-        rows = jnp.where(best, rows[j], rows)  # the row that it changes places with
+        rows = jnp.where(best, rows[j], rows)  # rows j and that of the pivot are exchanged
         pivot = pivot / pivot[j]
         rows = jnp.where(index == j, pivot, rows - rows[:, j, None] * pivot)
     return rows[:, -1]
