@@ -102,9 +102,8 @@ READ = {
     ("tuning.live.engine", "engine", "read_text"): "engine.js of the package",
     ("jaxtank.export.whole.array_values", "library", "read_text"): "arrays.js of the package",
     ("tuning.cli.completion", "words", "read_text"): "names.txt of the package",
-    ("jaxtank.xla.program_cache", "seal", "read_bytes"): "an entry that jax has just written",
-    ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "in a folder of mode 700 and"
-    " the user's own, to compare its digest",
+    ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
+    " one of a folder of mode 700 and the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
     ("jaxtank.xla.executables", "_read", "read_bytes"): "an entry of that folder, checked by its"
     " owner, mode and digest when the process began, and by the name and processor it holds",
