@@ -212,15 +212,16 @@ def connect(cluster):
             count = int(cluster.removeprefix("local:"))
             cluster, check, security, _ = stack.enter_context(local_workers(count))
         client = stack.enter_context(_client(cluster, security))
-        if not client.scheduler.address.startswith(ENCRYPTED):
+        engine = Engine(client, check)
+        if not engine.address.startswith(ENCRYPTED):
             warnings.warn(
-                f"cluster {client.scheduler.address}: without TLS anybody who reaches this address"
+                f"cluster {engine.address}: without TLS anybody who reaches this address"
                 " can run code as the user of its workers, and of this command: give all of them"
                 " certificates and the address as tls://HOST:PORT",
                 ClusterWarning,
                 stacklevel=3,
             )
-        yield Engine(client, check)
+        yield engine
 
 
 def check_cluster(cluster):
