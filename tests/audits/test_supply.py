@@ -1,6 +1,6 @@
-"""What is shipped, and what it never does: unpickle a user's file, evaluate text, talk to a network,
-or read a file of any size. Compiled programs alone are unpickled, by jax, from a folder that is
-checked (`jaxtank.xla.program_cache`), and tasks between this process and Dask workers by Dask.
+"""What is shipped, and what it never does: unpickle a user's file, evaluate text, talk to a
+network, or read a file of any size. Compiled programs alone are unpickled, by jax, from a folder
+that is checked (`jaxtank.xla.program_cache`), and tasks of Dask workers by Dask.
 """
 
 import ast

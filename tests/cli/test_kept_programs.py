@@ -160,7 +160,7 @@ def test_an_entry_that_others_can_write_to_is_removed(entry):
 
 
 def test_an_entry_under_another_name_is_removed(entry):
-    """Two programs of equal shapes, exchanged with their digests, would give each other's numbers."""
+    """Two programs of equal shapes, exchanged with their digests, give each other's numbers."""
     base, path = entry
     other = path.with_name(f"jit_g-00{kept.ENTRY}")
     for suffix in ("", kept.DIGEST):
