@@ -46,7 +46,11 @@ class _Column(NamedTuple):
 
 
 def read_log(
-    path: str | Path, loop: ClosedLoop, columns: Mapping[str, Any] | None = None, decimal: str = "."
+    path: str | Path,
+    loop: ClosedLoop,
+    columns: Mapping[str, Any] | None = None,
+    decimal: str = ".",
+    hold: str = "",
 ) -> Log:
     """Read experiment data from a CSV file.
 
@@ -65,6 +69,8 @@ def read_log(
         is in other words; "none" leaves a level out.
     decimal : str
         Decimal sign, "." or ",".
+    hold : {"", "zero-order", "first-order"}
+        What inputs do between samples, as in `tuning.log`.
 
     Returns
     -------
@@ -75,7 +81,7 @@ def read_log(
     DataError
         For a file that cannot be read so, naming line and column.
     InputError
-        For `columns` or `decimal` that do not exist.
+        For `columns`, `decimal` or `hold` that do not exist.
 
     Examples
     --------
@@ -113,6 +119,7 @@ def read_log(
         lines=lines,
         headers=tuple(c.header for c in used),
         units=tuple(c.unit for c in used),
+        hold=hold,
     )
 
 

@@ -15,6 +15,9 @@ DRIVE_MARGIN = 2.0
 """The same of a pump's input, in its upper limits."""
 FAINT = 0.015
 """Share of its range below which a pump's input, or every level, is taken to be in another unit."""
+IRREGULAR = 1.25
+"""Ratio of a long to a short step between samples (90th and 10th percentile) above which they are
+no longer those of a controller's own clock, at which its outputs change."""
 FEWEST = 3
 """Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
 
@@ -44,6 +47,7 @@ def check_data(logs, loop, gap):
         raise InputError("no log is given: identification needs experiment data")
     for one in logs:
         check_gaps(one, gap)
+        check_changes(one)
         check_fits(one, loop)
 
 
@@ -89,6 +93,27 @@ def check_gaps(found, most=1.5):
             f" samples come every {usual:g} s: what the pumps did there is not known; cut the file"
             f" in two (give both with --data), or hold the input over it with --gap {enough:g}"
         )
+
+
+def check_changes(found):
+    """Raise DataError where nothing says when inputs changed between readings at irregular times.
+
+    Inputs of such a log are mostly older than their row: taken from its time on, they act as a dead
+    time of the pumps and bias every coefficient.
+    """
+    low, high = np.quantile(np.diff(found.t), [0.1, 0.9])
+    changed = 1 + np.flatnonzero(np.any(np.diff(found.u, axis=0) != 0.0, axis=1))
+    unsure = changed[np.isfinite(found.y[changed]).any(axis=1)]
+    if found.hold or high <= IRREGULAR * low or 2 * len(unsure) <= len(changed):
+        return
+    k = unsure[0]
+    raise DataError(
+        f"{found.where(k)}: an input changed in the {found.t[k] - found.t[k - 1]:g} s before"
+        f" {found.t[k]:g} s, and samples come irregularly, every {low:g} to {high:g} s: when it"
+        " changed is not known. Add a row at the time of each change, with its inputs and no"
+        " readings; or say what inputs do between rows: --hold first-order (they may change at any"
+        " time in between) or --hold zero-order (each changes at the time of its row)"
+    )
 
 
 def check_fits(found, loop):
