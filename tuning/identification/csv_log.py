@@ -18,7 +18,7 @@ from jaxtank.core.files import refusal
 from jaxtank.core.text import printable
 from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.data_checks import FLOWS, LENGTHS, VOLTS
-from tuning.identification.experiment import Log, log
+from tuning.identification.experiment import Log, check_hold, log
 
 LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
@@ -96,6 +96,7 @@ def read_log(
     [3.  3.  3.5] [1.  1.5 nan] (1,)
     """
     path = Path(path)
+    check_hold(hold)
     if decimal not in (".", ","):
         raise InputError(f"--decimal {decimal!r}: must be '.' or ','")
     text, name = _text(path), printable(path.name)

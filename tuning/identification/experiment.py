@@ -125,9 +125,8 @@ def log(
         As in `Log`, for messages.
     hold : {"", "zero-order", "first-order"}
         Inputs between samples: "zero-order", each held until the next sample; "first-order", a
-        straight line from sample to sample, the mean of an input that changed at an unknown time in
-        between. "": zero-order; `identify` refuses it where readings come at irregular times and
-        inputs change from one to the next.
+        straight line from sample to sample. "": zero-order; `identify` refuses it where readings
+        come at irregular times and inputs change from one to the next.
 
     Returns
     -------
@@ -151,8 +150,7 @@ def log(
     ...
     jaxtank.core.errors.DataError: log, sample 2: time 0 s is that of the sample before: times ...
     """
-    if hold not in HOLDS:
-        raise InputError(f"hold = {hold!r}: must be one of {', '.join(HOLDS[1:])}")
+    check_hold(hold)
     t, u, y = _arrays(name, t, u, y)
     tanks = tuple(range(y.shape[1])) if tanks is None else tuple(int(i) for i in tanks)
     in_volts = (False,) * len(tanks) if in_volts is None else tuple(bool(v) for v in in_volts)
@@ -182,6 +180,12 @@ def log(
     _check_finite(found)
     _check_times(found)
     return found
+
+
+def check_hold(hold: str) -> None:
+    """Raise InputError for what inputs cannot do between samples."""
+    if hold not in HOLDS:
+        raise InputError(f"hold = {hold!r}: must be one of {', '.join(HOLDS[1:])}")
 
 
 def _arrays(name, t, u, y):

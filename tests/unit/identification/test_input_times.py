@@ -205,3 +205,18 @@ def test_a_covariance_that_is_not_used_is_reported(tmp_path, capsys):
     code, found, _ = _identify(tmp_path, capsys)
     assert code == 0 and found["parameters"] == alone["parameters"]
     assert "[covariance] of 1 parameter of an earlier identification" in found["message"]
+
+
+def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
+    """Irregular rows, inputs that move steadily in between: a line holds the truth, steps do not."""
+    rng = np.random.default_rng(6)
+    t = np.round(np.concatenate([[0.0], np.cumsum(rng.uniform(10.0, 30.0, 200))]), 1)
+    t = t[t < 3600.0]
+    u = rng.uniform(20.0, 70.0, len(t))
+    y = _levels(t, lambda at: np.interp(at, t, u)) + NOISE * rng.standard_normal((len(t), 2))
+    _write(tmp_path, t, u, y)
+    code, line, err = _identify(tmp_path, capsys, "--gap", "2", "--hold", "first-order")
+    assert code == 0 and not _outside(line), err
+    code, steps, err = _identify(tmp_path, capsys, "--gap", "2", "--hold", "zero-order")
+    assert code == 0 and steps["fit"]["rmse"][0] > 3 * line["fit"]["rmse"][0]
+    assert main(["identify", str(tmp_path / "rig.toml"), "--data", "log.csv", "--hold", "foh"]) == 2
