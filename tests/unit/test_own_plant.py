@@ -28,7 +28,7 @@ class Cone(Plant):
     pump_gain: float = leaf("cm^3/(s V)", "flow per volt k", low=0.0, strict=True)
     drain: float = leaf("cm^2", "outlet area s", low=0.0)
     slope: float = leaf("-", "radius over level R/H", low=0.0, strict=True)
-    rim: np.ndarray = leaf("cm", "(1,) height", low=0.0, strict=True)
+    rim: np.ndarray = leaf("cm", "height", low=0.0, strict=True, shape=("tank",))
     outputs: tuple = static(doc="controlled tanks", default=(0,))
     tanks, pumps = 1, 1
 

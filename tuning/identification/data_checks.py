@@ -110,9 +110,9 @@ def check_changes(found):
     raise DataError(
         f"{found.where(k)}: an input changed in the {found.t[k] - found.t[k - 1]:g} s before"
         f" {found.t[k]:g} s, and samples come irregularly, every {low:g} to {high:g} s: when it"
-        " changed is not known, and intervals would exclude the truth. Add a row at the time of each"
-        " change, with its inputs and no readings; or state that inputs change at the times of their"
-        " rows, --hold zero-order, or along a line from row to row, --hold first-order"
+        " changed is not known, and intervals would exclude the truth. Add a row at the time of"
+        " each change, with its inputs and no readings; or state that inputs change at the times of"
+        " their rows, --hold zero-order, or along a line from row to row, --hold first-order"
     )
 
 

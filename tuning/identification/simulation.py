@@ -34,7 +34,7 @@ class Rig:
     sensor: LevelSensor
     actuator: Actuator
     disturbance: Constant | None = None
-    x0: np.ndarray = leaf("cm", "(n,) levels at the first sample", low=0.0)
+    x0: np.ndarray = leaf("cm", "levels at the first sample", low=0.0, shape=("tank",))
 
     @property
     def units(self):
@@ -164,7 +164,7 @@ def readings(rig, dt, u, channels, substeps):
             after = piece(x, state, step, inputs)
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
-                lambda new, old: jnp.where(step > 0, new, old), after, (x, state)
+                lambda new, old, step=step: jnp.where(step > 0, new, old), after, (x, state)
             )
         return (x, state), out
 

@@ -684,7 +684,7 @@ def test_uneven_times_and_logs_of_two_lengths(case, away):
 
 
 def test_a_record_shifted_by_the_delay_of_the_pumps():
-    """By hand: samples every 2 s: an input reaches the tank at its own time, the first one before."""
+    """By hand, samples every 2 s: an input reaches the tank at its own time; before, the first."""
     log = tuning.log(t=[0.0, 2, 4, 6, 8], u=[1.0, 2, 3, 4, 5], y=np.zeros(5))
     cut = simulation.padded([log], 3.0)
     np.testing.assert_array_equal(cut.u[0, 2:4, :, 0], [[1, 2], [2, 3]])

@@ -63,7 +63,7 @@ def _rate(h, u):
 def _levels(t, input_at, h=(0.4, 0.5), dt=0.05):
     """(samples, 2) levels at the times t, multiples of dt, of a plant under input_at(time)."""
     h, found, sampled = np.array(h), [], set(np.round(t / dt).astype(int))
-    for k in range(int(round(t[-1] / dt)) + 1):
+    for k in range(round(t[-1] / dt) + 1):
         if k in sampled:
             found.append(h)
         u = input_at((k + 0.5) * dt)
@@ -196,7 +196,9 @@ def test_a_piece_of_length_zero_is_none_to_pumps_with_memory(tmp_path):
 def test_a_covariance_that_is_not_used_is_reported(tmp_path, capsys):
     times, inputs = _commands(0)
     t = np.arange(0.0, 600.0, 5.0)
-    y = _levels(t, _held(times, inputs)) + NOISE * np.random.default_rng(1).standard_normal((120, 2))
+    y = _levels(t, _held(times, inputs)) + NOISE * np.random.default_rng(1).standard_normal(
+        (120, 2)
+    )
     _write(tmp_path, t, _held(times, inputs)(t), y)
     prior = '[covariance]\nnames = ["plant.drain[1]"]\nmatrix = [[1e-12]]\n'
     code, alone, _ = _identify(tmp_path, capsys)
@@ -208,7 +210,7 @@ def test_a_covariance_that_is_not_used_is_reported(tmp_path, capsys):
 
 
 def test_inputs_along_a_line_from_row_to_row(tmp_path, capsys):
-    """Irregular rows, inputs that move steadily in between: a line holds the truth, steps do not."""
+    """Irregular rows, inputs that move steadily in between: a line fits, steps do not."""
     rng = np.random.default_rng(6)
     t = np.round(np.concatenate([[0.0], np.cumsum(rng.uniform(10.0, 30.0, 200))]), 1)
     t = t[t < 3600.0]
