@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.units import DEFAULT
+from jaxtank.core.units import DEFAULT, FLOWS, LENGTHS, VOLTS, canonical
 
 RIM_MARGIN = 1.5
 """Reading, in rims of its tank, above which the column is taken to be in another unit."""
@@ -20,17 +20,6 @@ IRREGULAR = 1.25
 no longer those of a controller's own clock, at which its outputs change."""
 FEWEST = 3
 """Fewest samples of a run that can be fitted: residuals have an autocorrelation from three on."""
-
-LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254}
-VOLTS = {"V": 1.0, "mV": 1e-3}
-FLOWS = {
-    "m^3/s": 1.0,
-    "cm^3/s": 1e-6,
-    "l/min": 1e-3 / 60,
-    "l/s": 1e-3,
-    "ml/s": 1e-6,
-    "l/h": 1e-3 / 3600,
-}
 
 
 def check_float64():
@@ -159,7 +148,7 @@ def _check_input(found, loop, j, drive):
     _check_range(found, 1 + j, u, drive, ends, f"pump's upper limit is {top:g}")
     most = float(np.max(np.abs(u)))
     # limits in other units are often nominal
-    if np.isfinite(top) and 0 < most < FAINT * top and (drive in VOLTS or drive in FLOWS):
+    if np.isfinite(top) and 0 < most < FAINT * top and canonical(drive) in {**VOLTS, **FLOWS}:
         ends = (2 * FAINT * top, DRIVE_MARGIN * top)
         raise DataError(
             f"{found.where(column=1 + j)}: pump{j + 1} is never above {most:g} {drive}, where its"
@@ -209,8 +198,9 @@ def _check_range(found, index, column, unit, ends, limit):
 
 def _other_units(found, index, column, unit, ends):
     """Return a hint: the units in which a column, held in `unit`, would lie within `ends`."""
+    unit = canonical(unit)
     table = next((t for t in (LENGTHS, VOLTS, FLOWS) if unit in t), {unit: 1.0})
-    named = unit if found.units is None else found.units[index]
+    named = unit if found.units is None else canonical(found.units[index])
     written, slot = column * (table[unit] / table.get(named, table[unit])), found.slot(index)
     fits = [
         f"'{slot} [{u}]'"

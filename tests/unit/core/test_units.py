@@ -4,9 +4,12 @@ import json
 
 import pytest
 
-from jaxtank.core.units import local
+from jaxtank import rig
+from jaxtank.core.errors import InputError
+from jaxtank.core.units import flow_per_input, local
 from jaxtank.measures import MEASURES
 from jaxtank.measures import unit as measure_unit
+from tuning import read_log
 from tuning.cli import main
 
 FLOW = ("m", "m^3/s")
@@ -87,3 +90,76 @@ def test_a_rig_in_litres_per_minute_has_no_volts_in_its_files_and_measures(tmp_p
     (line,) = (row for row in capsys.readouterr().out.splitlines() if row.startswith("rms_input"))
     assert "L/min" in line and "voltage" not in line
     assert not any("voltage" in each.doc for each in MEASURES.values())
+
+
+PUMPED = """
+units = [{}]
+[[tank]]
+area = 0.5
+rim = 1.2
+drain = 4e-4
+level = 0.4
+[[pump]]
+gain = {}
+to = 1
+high = 100.0
+[plant]
+gravity = 9.81
+[law]
+kind = "pid"
+Kc = 1.0
+Ti = 100.0
+[reference]
+initial = [0.4]
+"""
+
+
+@pytest.mark.parametrize(
+    ("spellings", "size"),
+    [
+        (("m^3/h", "m3/h", "m³/h"), 1 / 3600),
+        (("L/min", "l/min"), 1e-3 / 60),
+        (("cm3/s", "cc/s", "mL/s", "ml / s"), 1e-6),
+        (("gpm",), 3.785411784e-3 / 60),  # US gallon
+        (("m3/s",), 1.0),
+    ],
+)
+def test_a_flow_in_any_spelling_is_the_same_flow(tmp_path, spellings, size):
+    """In a rig, whose gain must be the size of the unit, and in a column of a rig in another one."""
+    other = rig.loads(PUMPED.format('"m", "l/s"', 1e-3)).loop
+    for spelling in spellings:
+        case = rig.loads(PUMPED.format(f'"m", "{spelling}"', size))
+        assert rig.loads(rig.dump(case)).loop.units == case.loop.units
+        assert flow_per_input(case.loop.units) == pytest.approx(size, rel=1e-12)
+        if size < 1:
+            with pytest.raises(InputError, match=r"pump 1: gain = 1 m\^3/s per .* must be"):
+                rig.loads(PUMPED.format(f'"m", "{spelling}"', 1.0))
+        (tmp_path / "log.csv").write_text(f"t [s],pump1 [{spelling}],h1 [m]\n0,3,0.4\n1,6,0.4\n")
+        read = read_log(tmp_path / "log.csv", other)
+        assert read.u[1, 0] == pytest.approx(6 * size / 1e-3, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("units", "why"),
+    [
+        ('"m", "furlong"', "'furlong' is unknown: must be one of V, mV, "),
+        ('"m", "cm"', "'cm' is no unit of a pump input"),
+        ('"m", "s"', "'s' is no unit of a pump input"),
+        ('"m^3/h", "V"', "'m^3/h' is no unit of a level"),
+        ('"parsec", "V"', "'parsec' is unknown: must be one of m, dm, cm"),
+    ],
+)
+@pytest.mark.parametrize("command", ["simulate", "init", "show"])
+def test_a_unit_that_is_unknown_or_of_another_dimension_is_refused(
+    tmp_path, capsys, command, units, why
+):
+    (tmp_path / "rig.toml").write_text(PUMPED.format(units, 1.0))
+    assert main.main([command, str(tmp_path / "rig.toml")]) == 2
+    out, err = capsys.readouterr()
+    assert why in err and not out and err.count("\n") == 1
+
+
+def test_a_gain_that_pumps_3600_times_too_much_is_refused(tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text(PUMPED.format('"m", "m^3/h"', 1.0))
+    assert main.main(["simulate", str(tmp_path / "rig.toml")]) == 2
+    assert "must be 0.000277778 times the share that the pump delivers" in capsys.readouterr().err

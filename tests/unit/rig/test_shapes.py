@@ -39,7 +39,7 @@ kind = "pid"
 Kc = 2.0
 Ti = 40.0
 [sensor]
-kind = "levels"
+kind = "level"
 full_scale = 5.0
 gain = 6.0
 '''
