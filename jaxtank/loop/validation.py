@@ -120,6 +120,7 @@ def _check_parts(
 ) -> None:
     """Every check that looks at the loop."""
     _check_sizes(loop)
+    _check_units(loop.plant)
     _check_saturation(loop)
     _check_delay(loop.actuator, clock)
     check_shapes(loop)
@@ -156,6 +157,19 @@ def _check_sizes(loop: ClosedLoop) -> None:
         raise InputError(
             f"the disturbance has {loop.disturbance.channels} channels for {plant.tanks} tanks:"
             " give one inflow per tank"
+        )
+
+
+def _check_units(plant: Plant) -> None:
+    """Raise InputError where the levels of a plant are in a length that is not its `units`'."""
+    length, drive = plant.units
+    fields = cast(Any, getattr(plant, "__dataclass_fields__", {}))
+    unit = fields["rim"].metadata.get("unit", "cm") if "rim" in fields else "cm"
+    if unit not in ("cm", length):  # metadata in cm are translated
+        raise InputError(
+            f"plant.rim is in {unit} and {type(plant).__name__}.units = {plant.units}: must be the"
+            f' same length; write units = ("{unit}", "{drive}") in the class, with the unit of its'
+            " pump inputs second"
         )
 
 

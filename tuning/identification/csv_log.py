@@ -351,6 +351,7 @@ def _factor(kind, unit, length, drive, where):
     table = next((t for t in choices if base in t), {base: 1.0})
     if unit not in table:
         raise DataError(
-            f"{where}: unit {written!r} cannot be that of a {kind}: must be one of {', '.join(table)}"
+            f"{where}: unit {written!r} cannot be that of a {kind}: must be one of"
+            f" {', '.join(table)}"
         )
     return table[unit] / table[base], False

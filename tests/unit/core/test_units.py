@@ -1,6 +1,7 @@
 """Units as they are printed: those of the rig, with its powers."""
 
 import json
+import re
 
 import pytest
 
@@ -125,7 +126,7 @@ initial = [0.4]
     ],
 )
 def test_a_flow_in_any_spelling_is_the_same_flow(tmp_path, spellings, size):
-    """In a rig, whose gain must be the size of the unit, and in a column of a rig in another one."""
+    """In a rig, whose gain must be the size of the unit, and in a column of another rig's log."""
     other = rig.loads(PUMPED.format('"m", "l/s"', 1e-3)).loop
     for spelling in spellings:
         case = rig.loads(PUMPED.format(f'"m", "{spelling}"', size))
@@ -163,3 +164,44 @@ def test_a_gain_that_pumps_3600_times_too_much_is_refused(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(PUMPED.format('"m", "m^3/h"', 1.0))
     assert main.main(["simulate", str(tmp_path / "rig.toml")]) == 2
     assert "must be 0.000277778 times the share that the pump delivers" in capsys.readouterr().err
+
+
+def test_a_controller_is_described_in_the_units_of_its_rig(capsys):
+    for name in ("khalid/gpc", "khalid/laguerre"):
+        assert main.main(["show", name]) == 0
+        shown = capsys.readouterr().out
+        assert "[m] and du [U0]" in shown and not re.search(r"\bcm\b|\[V\]", shown)
+
+
+FLOW_RIG = PUMPED.format('"m", "m^3/h"', 1 / 3600).replace("100.0\n[plant]", "5.0\n[plant]") + (
+    'changes = [[20.0, 1, 0.5]]\n[free]\n"controller.Kc" = [0.1, 10.0]\n'
+    '[values]\n"clock.duration" = 120.0\n'
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "command",
+    [
+        "show RIG",
+        "init RIG",
+        "simulate RIG --margins",
+        "tune RIG --starts 1 --iterations 3 --validation 8 --quiet",
+        "tune RIG --nominal --starts 1 --iterations 3 --quiet",
+        "uncertainty RIG --samples 8 --vary plant.drain=0.05 --quiet",
+        "sensitivity RIG --samples 8 --quiet",
+        "attack RIG --starts 1 --quiet",
+        "export RIG --lang c",
+        "export RIG --lang m",
+        "export RIG --lang js",
+        "identify RIG --plan",
+    ],
+)
+@pytest.mark.parametrize("units", ["m^3/h", "%"])
+def test_no_command_prints_centimetres_or_volts_of_another_rig(tmp_path, capsys, command, units):
+    file = tmp_path / "rig.toml"
+    file.write_text(FLOW_RIG.replace("m^3/h", units))
+    assert main.main(command.replace("RIG", str(file)).split()) in (0, 3, 4)
+    printed = "".join(capsys.readouterr()).replace(str(tmp_path), "")
+    alien = re.findall(r".*(?:\bcm\b|(?<![\w/.])V\b).*", printed)
+    assert not alien, "\n".join(alien[:10])

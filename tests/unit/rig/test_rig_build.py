@@ -181,13 +181,7 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"law": {"kind": "pid", "Kc": "much", "Ti": 1.0}}, "law.Kc = 'much'"),
         ({"law": {"kind": "pid", "Kc": True, "Ti": 1.0}}, "law.Kc = True: must be a number"),
         ({"law": {"kind": "pid", "Kc": "3", "Ti": 1.0}}, "law.Kc = '3': must be a number"),
-        (
-            {"law": {**GPC, "r_w": [0.1, 0.2]}},
-            (
-                r"controller.r_w = \[0.1, 0.2\]: must be one number, the weight of the increments"
-                r" of all inputs"
-            ),
-        ),
+        ({"law": {**GPC, "r_w": [0.1, 0.2]}}, r"law.r_w = \[0.1, 0.2\]: must be one number"),
         (
             {"law": {"kind": "sliding-mode", "surface": 0.1, "ks": [0.1, 0.2], "phi": 0.1}},
             r"law.ks = \[0.1, 0.2\]: must be one number",
@@ -197,7 +191,7 @@ def test_the_step_task_of_the_watertank_is_met(tmp_path):
         ({"plant": {"outputs": [1]}}, "list of 1"),
         ({"plant": {"outputs": [1, 9]}}, "from 1 to 4"),
         ({"plant": {"overflow": 1}}, "true or false"),
-        ({"units": ["yd", "V"]}, "gravity"),
+        ({"units": ["yd", "V"]}, "'yd' is unknown"),
         (
             {"units": ["cm", "V\x1b[31m\n"]},
             "units: entry = 'V.x1b.31m.n': must be a text of printable characters",
