@@ -57,7 +57,7 @@ class Judged(Shown):
     measures: dict[str, np.ndarray]
     unit: str
     nominal: dict[str, np.ndarray] | None = None
-    runs: str = "validation plants"
+    runs: str = "plants"
 
     @property
     def samples(self) -> int:
@@ -227,7 +227,7 @@ def judge(setting: Setting, samples: int, seed: int, round_: int = 0) -> Judged:
         measures=by,
         nominal=found.nominal,
         unit=unit_of(setting),
-        runs=setting.runs,
+        runs="plants" if setting.plants_vary else setting.runs,
     )
 
 

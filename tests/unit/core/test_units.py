@@ -204,4 +204,6 @@ def test_no_command_prints_centimetres_or_volts_of_another_rig(tmp_path, capsys,
     assert main.main(command.replace("RIG", str(file)).split()) in (0, 3, 4)
     printed = "".join(capsys.readouterr()).replace(str(tmp_path), "")
     alien = re.findall(r".*(?:\bcm\b|(?<![\w/.])V\b).*", printed)
+    # a sensor's voltage is one in any rig
+    alien = [row for row in alien if "ADC" not in row and "sensor." not in row]
     assert not alien, "\n".join(alien[:10])
