@@ -98,22 +98,27 @@ class PID(Controller):
     """
 
     model: Plant
-    Kc: np.ndarray = leaf("V/cm", "(m,) gain Kc, not 0; below 0 where a pump lowers its output")
-    Ti: np.ndarray = leaf("s", "(m,) integral time Ti", low=0.0, strict=True)
+    Kc: np.ndarray = leaf(
+        "V/cm", "gain Kc, not 0; below 0 where a pump lowers its output", shape=("pump",)
+    )
+    Ti: np.ndarray = leaf("s", "integral time Ti", low=0.0, strict=True, shape=("pump",))
     Td: np.ndarray | None = leaf(
-        "s", "(m,) derivative time Td", low=0.0, strict=True, like="Kc", default=None
+        "s", "derivative time Td", low=0.0, strict=True, like="Kc", default=None, shape=("pump",)
     )
     order: np.ndarray | None = leaf(
         "-",
-        "(m,) order of the integral (lambda)",
+        "order of the integral (lambda)",
         low=0.0,
         high=1.0,
         strict=True,
         like="Kc",
         default=None,
+        shape=("pump",),
     )
-    Tt: np.ndarray = leaf("s", "(m,) tracking time of the anti-windup", low=0.0, strict=True)
-    bias: np.ndarray = leaf("V", "(m,) input added where there is no feed-forward")
+    Tt: np.ndarray = leaf(
+        "s", "tracking time of the anti-windup", low=0.0, strict=True, shape=("pump",)
+    )
+    bias: np.ndarray = leaf("V", "input added where there is no feed-forward", shape=("pump",))
     feed_forward: bool = static(
         "-", "add the model's input on the reference", choices=(False, True), default=False
     )

@@ -19,7 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.fields import Meta, component, is_component, is_real, leaf, number, static
+from jaxtank.core.fields import (
+    Meta,
+    component,
+    is_component,
+    is_real,
+    leaf,
+    number,
+    sizes_of_shape,
+    static,
+)
 from jaxtank.core.text import shortened
 from jaxtank.core.units import DEFAULT, local
 
@@ -32,6 +41,7 @@ __all__ = [
     "leaf",
     "number",
     "parameters",
+    "sizes_of_shape",
     "split_index",
     "static",
     "walk",

@@ -74,7 +74,7 @@ class ClosedLoop:
     disturbance: Signal | None = None
     faults: Faults | None = None
     safety_filter: SafetyFilter | None = None
-    x0: np.ndarray[Any, Any] = leaf("cm", "(n,) levels at t = 0", low=0.0)
+    x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape=("tank",))
 
     @property
     def units(self) -> tuple[str, str]:

@@ -226,7 +226,7 @@ def _key(cls, field, own, units):
         default = in_unit(FLOORS[field.name], units[0])
     changes = {}
     if field.metadata["kind"] == "leaf":
-        changes["kind"] = "scalar" if type_of(field) is float else "array"
+        changes["kind"] = "array" if field.metadata["shape"] else "scalar"
     doc = field.metadata["doc"].replace("counted from 0", "counted from 1")  # as a file has tanks
     return Key.of(cls, field.name, doc, default=default, **changes)
 

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
+from jaxtank.core.tree import parameters
 from tuning.answer.answer import Answer
 from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
@@ -70,7 +71,8 @@ def _violated(result, answer) -> Found:
         remedy = "--safety-filter keeps levels below their limits"
     yield Message(
         "limit-violated-out-of-sample",
-        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples} validation plants"
+        f"limits hold on {int(answer.after.held.sum())} of {answer.after.samples}"
+        f" {answer.setting.runs}"
         f" ({'; '.join(parts)}): {remedy}",
     )
 
@@ -160,7 +162,15 @@ def _assumed(result, answer) -> Found:
             f"sensor noise of {setting.noise:.3g} {unit} is assumed (0.1 % of the height; --set"
             " sensor.noise)",
         )
-    if not setting.stated:
+    if not setting.plants_vary:
+        plant = [f'"{n}"' for n in parameters(setting.case.loop) if n.startswith("plant.")]
+        yield Message(
+            "plants-assumed",
+            "nothing of this plant is known to vary, so that nothing is claimed on other plants:"
+            f" name it in `uncertain`, as {{{plant[0] if plant else 'NAME'}: 0.05}} for +-5 %, or"
+            f" with --vary (of {', '.join(plant)})",
+        )
+    elif not setting.stated:
         yield Message(
             "plants-assumed",
             f"the case names nothing uncertain: every flow is taken to be within"

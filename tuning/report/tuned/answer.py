@@ -84,9 +84,8 @@ def _headline(result):
     if answer.after is None:
         return f"{start}; no validation plants ({result.wall_s:.1f} s)"
     held, samples = int(answer.after.held.sum()), answer.after.samples
-    limited = (
-        f"; limits hold on {held} of {samples} validation plants" if answer.after.limits else ""
-    )
+    on = f"; limits hold on {held} of {samples} {answer.setting.runs}"
+    limited = on if answer.after.limits else ""
     tanks = [r.tank + 1 for r in answer.setting.certificates if r.certified]
     proved = f", proved for {numbered('tank', tanks)}" if tanks and limited else ""
     changed = sum(not stays for stays in answer.kept.values())
