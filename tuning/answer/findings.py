@@ -8,6 +8,7 @@ interrupted                      Ctrl-C ended the search
 limit-violated-out-of-sample     a limit is violated on a validation plant
 no-longer-follows                the answer leaves a setpoint that the start held
 not-converged                    searches disagree, and differential evolution found better points
+slope-not-usable                 runs beside the answer or the start contradict the exact slope
 limit-not-certified              the safety filter is on, and a limit is not proved
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
@@ -29,6 +30,7 @@ from tuning.answer.setting import SPREAD
 from tuning.problem.status import Status
 from tuning.problem.wording import numbered
 from tuning.search.result import Message, TuningResult
+from tuning.search.verdicts import slope_not_usable
 
 Found = Iterator[Message]
 
@@ -92,6 +94,10 @@ def _not_agreed(result, answer) -> Found:
             " evolution found better points: raise --starts or --iterations, or narrow the ranges"
             " (--free)",
         )
+
+
+def _slopes(result, answer) -> Found:
+    yield from slope_not_usable(result)
 
 
 def _certificates(result, answer) -> Found:
@@ -182,6 +188,7 @@ RULES: tuple[Callable[..., Found], ...] = (
     _violated,
     _lost,
     _not_agreed,
+    _slopes,
     _certificates,
     _bounds,
     _busier,

@@ -10,6 +10,7 @@ no-longer-follows                the answer leaves a setpoint that the start hel
 no-feasible-point-found          the search ended before a point met every limit
 infeasible                       the least violation of the limits is not zero
 interrupted                      Ctrl-C ended the search
+slope-not-usable                 runs beside the answer or the start contradict the exact slope
 objective-without-slope          the gradient of the objective is zero: it changes in steps
 gradient-not-zero                a slope of the objective is left that no active limit blocks
 kink                             the same, but no lower value was found along it

@@ -25,7 +25,7 @@ from tuning.problem.reported import run_measures, table_of
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.discrete import tune_choices
-from tuning.search.kkt import optimality
+from tuning.search.kkt import named_optimality
 from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
 from tuning.search.options import Solver, check_options, check_precision, spelled_out
@@ -192,7 +192,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
     if problem.scenarios:
         tables = {"before": table_of(problem, own), "after": table_of(problem, values)}
     lost = lost_outputs(problem, tables, values) if complete else ()
-    optimum = _optimality(found.search, best)
+    optimum = named_optimality(found.search, best)
     rows = constraint_rows(problem, tables["after"], tables["before"], optimum["multipliers"])
     return TuningResult(
         case=case,
@@ -222,6 +222,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
         problem=problem,
         lost=lost,
         probe=found.probe,
+        slopes=found.slopes,
     )
 
 
@@ -281,12 +282,3 @@ def _method(method, problem, batch):
             f" ({', '.join(ms.squares())}) in the objective: use slsqp"
         )
     return method
-
-
-def _optimality(search, best):
-    """Return the gradient norm, KKT residual and named multipliers at the best point."""
-    if best is None:
-        return {"gradient_norm": None, "kkt_residual": None, "multipliers": {}}
-    norm, residual, multipliers = optimality(search, best)
-    named = {limit.label: float(m) for limit, m in zip(search.problem.limits, multipliers) if m > 0}
-    return {"gradient_norm": norm, "kkt_residual": residual, "multipliers": named}

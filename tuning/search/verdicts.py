@@ -15,6 +15,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.change_windows import windows
 from tuning.problem.point import DIVERGED
 from tuning.problem.problem import Problem
+from tuning.problem.slopes import unusable_words
 from tuning.problem.status import Status
 from tuning.search.kkt import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Lost, Message, TuningResult
@@ -198,6 +199,23 @@ def _interrupted(result: TuningResult) -> Found:
         yield Message("interrupted", "interrupted: this is the best point so far")
 
 
+def slope_not_usable(result: TuningResult) -> Found:
+    """At the answer and at the values before tuning; once where these are the same."""
+    places = {"answer": "the answer", "start": "the values before tuning"}
+    same = all(p["before"] == p["after"] for p in result.parameters.values())
+    for where, words in places.items():
+        check = result.slopes.get(where)
+        if check is None or check.usable or (same and where == "start"):
+            continue
+        role = "judged the answer" if where == "answer" else "searched on"
+        yield Message(
+            "slope-not-usable",
+            f"the slope of the objective at {words} is that of a chaotic or exploding loop:"
+            f" {unusable_words(check)}; it was not used: other starts and differential evolution"
+            f" {role}",
+        )
+
+
 def _flat(result: TuningResult) -> bool:
     """Return True if the gradient is exactly zero at an objective that is not."""
     return result.optimality["gradient_norm"] == 0.0 and result.objective["after"] != 0.0
@@ -299,6 +317,7 @@ ENDINGS: tuple[Callable[[TuningResult], Found], ...] = (
     _infeasible,
     _no_longer_follows,
     _interrupted,
+    slope_not_usable,
     _without_slope,
     _gradient_left,
     _not_converged,

@@ -42,6 +42,7 @@ def json_of(result):
         "symmetry": clean(result.symmetry),
         "choices": clean(result.choices),
         "optimality": clean(result.optimality),
+        "slopes": {where: check.to_json() for where, check in result.slopes.items()},
         "curvature": clean(result.curvature),
         "tradeoff": clean(result.tradeoff),
         "certificate": None if result.certificate is None else result.certificate._asdict(),
