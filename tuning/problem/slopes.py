@@ -94,5 +94,3 @@ def unusable_words(check: SlopeCheck) -> str:
     shown = f"{check.secants[0]:.2g} per range of a parameter"
     by = "is not finite" if check.orders is None else f"is 1e{check.orders:.0f} times as large"
     return f"runs beside it show a slope of {shown}, the exact derivative {by}"
-
-
