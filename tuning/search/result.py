@@ -31,6 +31,7 @@ class Message:
     code : kebab-case word that does not change between versions; `tuning.search.messages` lists
         them all, for example "parameter-at-bound", "not-converged", "limit-active".
     text : the sentence that is printed.
+    headline : a few words beside the status, where the finding changes what the status is worth.
 
     Examples
     --------
@@ -40,6 +41,7 @@ class Message:
 
     code: str
     text: str
+    headline: str = ""
 
     def __str__(self) -> str:
         return self.text
@@ -241,6 +243,11 @@ class TuningResult(Result):
     def message(self) -> str:
         """The texts of `messages`, joined by semicolons."""
         return "; ".join(m.text for m in self.messages)
+
+    @property
+    def headline(self) -> str:
+        """The status, with the findings that change what it is worth."""
+        return ", ".join([self.status, *(m.headline for m in self.messages if m.headline)])
 
     @property
     def success(self) -> bool:

@@ -16,12 +16,13 @@ from jaxtank.case import Case, Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import initial
 from tuning.cluster.engine import connect
 from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
-from tuning.problem.reported import run_measures, table_of
+from tuning.problem.reported import margin_measures, run_measures, table_of
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.discrete import tune_choices
@@ -30,6 +31,7 @@ from tuning.search.messages import messages_of
 from tuning.search.methods import OFFERED, UNCONSTRAINED
 from tuning.search.options import Solver, check_options, check_precision, spelled_out
 from tuning.search.result import TuningResult, constraint_rows
+from tuning.search.screening import LARGEST_STATE
 from tuning.search.stages import Outcome, Plan, solve
 from tuning.search.verdicts import lost_outputs, status_of
 from tuning.storage.checkpoint import checkpoint_folder
@@ -202,7 +204,10 @@ def _result(problem, plan, found: Outcome, first, before, key):
         parameters=_parameters(problem, z, values, change, found.idle.tolist()),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
-        measures={"before": before, "after": after},
+        measures={
+            "before": before | _margins(case.loop, case.clock),
+            "after": after | _margins(tuned.loop, tuned.clock),
+        },
         tables=tables,
         constraints=rows,
         symmetry=diagnostics.symmetric(problem, found.starts, values) if complete else None,
@@ -224,6 +229,12 @@ def _result(problem, plan, found: Outcome, first, before, key):
         probe=found.probe,
         slopes=found.slopes,
     )
+
+
+def _margins(loop, clock):
+    """Return the margins of the linearised loop; {} for a loop with a long state."""
+    small = sum(map(np.size, jax.tree.leaves(initial(loop, clock)))) <= LARGEST_STATE
+    return margin_measures(loop, clock) if small else {}
 
 
 def _parameters(problem, z, values, change, idle):

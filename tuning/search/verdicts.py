@@ -40,6 +40,10 @@ CHECKED_RUNS = 8
 SAVED = 20_000
 """Samples of a trajectory that are compared, at most."""
 
+FRAGILE = 2.5
+"""Sensitivity peak Ms above which a loop is near the edge of its stability [-]: textbooks recommend
+1.4 to 2."""
+
 Found = Iterator[Message]
 ENDED = (Status.CONVERGED, Status.NOT_CONVERGED)
 
@@ -157,6 +161,24 @@ def first_of(parts: list[str], joint: str = ", ") -> str:
     """Return the first LISTED parts, and how many more there are."""
     more = len(parts) - LISTED
     return joint.join(parts[:LISTED]) + (f" (and {more} more)" if more > 0 else "")
+
+
+def near_the_edge(result: TuningResult) -> Found:
+    """The answer's linearised loop is unstable, or nearly so."""
+    sides = (result.measures[side] for side in ("before", "after"))
+    before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
+    if not after > FRAGILE:  # NaN: it has none
+        return
+    where = "at the edge of sampled stability"
+    peak = "the linearised loop is unstable" if np.isinf(after) else f"Ms = {after:.3g}"
+    old = "unstable" if np.isinf(before) else f"{before:.3g}"
+    yield Message(
+        "edge-of-stability",
+        f"{where}: {peak} at a plateau, {old} before (sensitivity peak of the sampled loop, at most"
+        " 2 is usual): --limit sensitivity_peak=2 bounds it, a smaller step or narrower ranges"
+        " (--free) may help",
+        f"{where} ({peak})",
+    )
 
 
 def _no_feasible_point(result: TuningResult) -> Found:
