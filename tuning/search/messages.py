@@ -118,7 +118,8 @@ def _total_variation(result: TuningResult) -> Found:
         unit = ms.unit("input_travel", result.problem.loop.units)
         yield Message(
             "input-total-variation",
-            f"the total variation of the inputs is {after:.4g} {unit}, {times}: weigh it or limit it (--objective input_travel=..., --limit"
+            f"the total variation of the inputs is {after:.4g} {unit}, {times}: weigh it or"
+            " limit it (--objective input_travel=..., --limit"
             " input_travel=...), or take a smaller step",
             f"total variation of the inputs {times}",
         )

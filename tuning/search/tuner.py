@@ -22,7 +22,7 @@ from tuning.cluster.problems import check_sent
 from tuning.problem.functions import as_measures, check_slopes, digests
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
-from tuning.problem.reported import margin_measures, run_measures, table_of
+from tuning.problem.reported import in_force, margin_measures, run_measures, table_of
 from tuning.problem.scenarios import noisy
 from tuning.search import diagnostics
 from tuning.search.discrete import tune_choices
@@ -186,6 +186,8 @@ def _result(problem, plan, found: Outcome, first, before, key):
     if best is not None and np.array_equal(z, first):
         values = dict(own)
     values |= {n: v for (n, v), idle in zip(own.items(), found.idle) if idle}
+    # what stays as it was before is no change to report
+    values |= {n: v for n, v in in_force(case.loop, values).items() if values[n] != own[n]}
     complete = best is not None and not found.interrupted
     change = found.change if complete and found.change else [None] * len(z)
     tuned = case.replace(loop=with_values(case.loop, values))
@@ -201,7 +203,7 @@ def _result(problem, plan, found: Outcome, first, before, key):
         tuned=tuned,
         method=plan.method,
         status=status_of(found, all(row.margin >= 0 for row in rows), lost),
-        parameters=_parameters(problem, z, values, change, found.idle.tolist()),
+        parameters=_parameters(problem, values, change, found.idle.tolist()),
         objective={side: problem.total(table) for side, table in tables.items()}
         | {"terms": problem.objective},
         measures={
@@ -237,8 +239,8 @@ def _margins(loop, clock):
     return margin_measures(loop, clock) if small else {}
 
 
-def _parameters(problem, z, values, change, idle):
-    """Return {name: values before and after, range, sensitivity} of the parameters at z."""
+def _parameters(problem, values, change, idle):
+    """Return {name: values before and after, range, sensitivity} of the parameters."""
     own = problem.own_values()
     return {
         b.name: {
@@ -251,7 +253,8 @@ def _parameters(problem, z, values, change, idle):
             "sensitivity_percent": percent,
             "exercised": not still,
         }
-        for b, v, percent, still in zip(problem.bounds, z, change, idle)
+        for b, percent, still in zip(problem.bounds, change, idle)
+        for v in [float(b.to_unit(values[b.name]))]
     }
 
 

@@ -169,7 +169,7 @@ def near_the_edge(result: TuningResult) -> Found:
     before, after = (float(m.get("sensitivity_peak", np.nan)) for m in sides)
     if not after > FRAGILE:  # NaN: it has none
         return
-    where = "at the edge of sampled stability"
+    where = f"{'beyond' if np.isinf(after) else 'at'} the edge of sampled stability"
     peak = "the linearised loop is unstable" if np.isinf(after) else f"Ms = {after:.3g}"
     old = "unstable" if np.isinf(before) else f"{before:.3g}"
     yield Message(

@@ -1,4 +1,4 @@
-"""More free gains than derivatives are carried of: reverse mode, on a rig whose vectors are arrays."""
+"""More free gains than derivatives are carried of: reverse mode on a rig of arrays."""
 
 import json
 
