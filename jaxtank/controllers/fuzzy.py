@@ -130,6 +130,9 @@ class FuzzyBlend(Controller):
         pairs = enumerate(PAIRINGS[self.pairing])
         return tuple(membership(size[j], self.b[i], self.w[i]) for i, j in pairs)
 
+    def in_force(self) -> dict[str, Any]:
+        return {"w": np.minimum(self.w, self.b)}
+
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return applied if self.form == "printed" else state
 

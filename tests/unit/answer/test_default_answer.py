@@ -144,7 +144,7 @@ def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     plants = setting.plants(setting.searched, 3, 0)
     a, b = (Problem(setting.searched, None, setting.objective, {}, plants) for _ in range(2))
     b.groups = [with_noise_drawn(group) for group in b.groups]
-    assert b.groups[0].keys.shape == (3, 1, case.clock.samples)
+    assert b.groups[0].noise.shape == (3, 1, case.clock.samples)
     z = a.start()
     assert a.point(z).cost == b.point(z).cost
     assert np.array_equal(a.point(z).gradient, b.point(z).gradient)

@@ -79,7 +79,7 @@ def json_parts(result) -> dict[str, Any]:
 
 def _headline(result):
     """One sentence on the outcome."""
-    answer, status = result.answer, str(result.status).replace("_", " ")
+    answer, status = result.answer, result.headline.replace("_", " ")
     start = f"{result.tuned.name}: {status}"
     if answer.after is None:
         return f"{start}; no validation plants ({result.wall_s:.1f} s)"
