@@ -116,7 +116,9 @@ _BUILT_IN: dict[str, Measure] = {
     "mean_square_error": _sum_of_squares(
         "cm^2", "output", "e2", _mean, "mean square tracking error"
     ),
-    "ise": _sum_of_squares("cm^2 s", "output", "e2", _integral, "integral of the squared error"),
+    "ise": _sum_of_squares(
+        "cm^2 s", "output", "lasting_e2", _integral, "integral of the squared error"
+    ),
     "iae": Measure(
         "cm s",
         "output",
