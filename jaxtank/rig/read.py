@@ -17,7 +17,7 @@ from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
 from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
-from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
+from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_bottom, with_models
 
 MOST = 100
 """Parts of a dotted key; the names of a rig have four."""
@@ -195,6 +195,8 @@ def from_table(table: Mapping[str, Any]) -> Case:
     for name, read in TUNING.items():
         if name in table:
             case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
+    if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
+        case = with_bottom(case)
     return filtered(validation.check(case))
 
 

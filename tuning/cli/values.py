@@ -30,6 +30,7 @@ def open_case(args):
 
     jax.config.update("jax_enable_x64", True)
     from jaxtank import rig
+    from jaxtank.loop import floor
 
     opened = rig.open_case(args.case)
     # of the file as it is: what --set changes is meant
@@ -37,8 +38,11 @@ def open_case(args):
     for sentence in of_file:
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     values, of_filter = _apart(settings(args))
-    case = rig.check(rig.set_and_schedule(opened, values, schedule(args.schedule)))
+    case = rig.set_and_schedule(opened, values, schedule(args.schedule))
     case, replaced = rig.overridden(case, values)
+    if "plant.bottom" not in values and not floor.draws(opened.loop):
+        case = rig.with_bottom(case)
+    case = rig.check(case)
     case = rig.filtered(case, args.safety_filter, of_filter)
     if not args.quiet:
         for sentence in _warnings(args, opened, case, replaced):
