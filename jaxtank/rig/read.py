@@ -251,6 +251,31 @@ FIELDS = {"scenario": "scenarios", "safety_filter": "safety"}
 """{section: field of Case}, where it has another name."""
 
 
+def _check_twice(table):
+    """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
+    they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
+    """
+    wrong = []
+    for name in ("tank", "pump"):
+        entries = table.get(name, [])
+        for key in SECTIONS[name].keys:
+            section, _, field = key.target.partition(".")
+            field = "inflow" if section == "disturbance" else field
+            if field not in table.get(section, {}):
+                continue
+            whole = table[section][field]
+            each = isinstance(whole, list) and len(whole) == len(entries)
+            for i, entry in enumerate(entries):
+                other = whole[i] if each else whole
+                if key.name in entry and entry[key.name] != other:
+                    wrong.append(
+                        f"{name} {i + 1}: {key.name} = {shortened(entry[key.name])}, and"
+                        f" [{section}] {field} has {shortened(other)} for it: give one of them"
+                    )
+    if wrong:
+        raise InputError("; ".join(wrong))
+
+
 def start_of(table):
     """Return the Case of the tables that build: case or tanks, controller, observer,
     instruments, reference, disturbance and faults; before any value is set.
@@ -260,6 +285,7 @@ def start_of(table):
         _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     )
     loop, changed = case.loop, {}
+    _check_twice(table)
     for name in ("sensor", "actuator"):
         if name in table:
             changed[name] = components.instrument_of(name, table[name], loop)
