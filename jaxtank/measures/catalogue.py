@@ -1,6 +1,8 @@
 """The measures: numbers that describe a run, each with all that is known of it.
 
-A measure reads accumulators at the end of a run. May import `jaxtank.core` and the
+A measure reads accumulators at the end of a run. Means are over its N + 1 samples, t = 0 to T.
+Integrals and volumes are over [0, T]: sums over the first N samples, each held for dt, which is
+exact for inputs and volumes, and the left rectangle rule for levels. May import `jaxtank.core` and the
 modules of `measures` that it imports only.
 """
 

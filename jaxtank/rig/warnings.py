@@ -20,9 +20,9 @@ def case_warnings(case: Case) -> list[str]:
     """Return sentences on what of a case is hardly meant.
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
-    that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside their limits, models that
-    differ from the plant, estimates of disturbances that the controller does not use. (Steps that
-    are too long: `loop.step_size`.)
+    that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
+    their limits, models that differ from the plant, estimates of disturbances that the controller
+    does not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def _unseen(case):
                 yield f"fault {k + 1} of {of} from {start:g} s to {end:g} s: {between}"
         for k, (of, *_) in enumerate(loop.faults.windows):
             if of.startswith(("rim[", "caught[")) and not loop.plant.overflow:
-                yield f"fault {k + 1} of {of}: rims are limits here and not physics: it has no effect"
+                yield f"fault {k + 1} of {of}: rims are limits here: it has no effect"
     sine = getattr(loop.reference, "second", None)
     if isinstance(sine, Sine) and not _holds_sample(sine.start, sine.end, clock):
         yield f"reference.sine from {sine.start:g} s to {sine.end:g} s: {between}"
