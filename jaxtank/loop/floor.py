@@ -4,7 +4,7 @@ below it.
 May import the folders below `jaxtank.loop`.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -47,7 +47,8 @@ def is_open(loop: ClosedLoop) -> bool:
     """Return whether levels may fall below 0: liquid can be drawn from a network without `bottom`,
     or the plant is of a user's class.
     """
-    network = type(loop.plant).derivative is TankNetwork.derivative
+    kind: Any = type(loop.plant)  # a subclass may have flows of its own
+    network = kind.derivative is cast(Any, TankNetwork).derivative
     return not loop.plant.bottom and (not network or draws(loop))
 
 
@@ -56,7 +57,8 @@ def floor_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
     volume that the tank has given without holding it.
     """
     plant: Any = loop.plant
-    x, length, found = np.asarray(run.x), loop.units[0], []
+    x, length = np.asarray(run.x), loop.units[0]
+    found: list[str] = []
     for i, limit in enumerate(lowest(plant)):
         column = np.where(np.isfinite(x[:, i]), x[:, i], 0.0)
         if not column.min() < limit:

@@ -103,7 +103,8 @@ class Faults:
 
     def _caught_twice(self, what, plant, index, time):
         """A sentence where more than all that passes a rim is caught."""
-        spills: Any = plant.spills  # type: ignore[attr-defined]
+        network: Any = plant
+        spills = network.spills
         source = spills[index][0]
         own = [i for i, spill in enumerate(spills) if spill[0] == source]
         total = sum(self._value(plant, f"caught[{i}]", time) for i in own)

@@ -10,6 +10,8 @@ from jaxtank.case import Case
 from jaxtank.core.clock import Clock
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.loop.disturbance_use import is_unused
+from jaxtank.loop.floor import is_open
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.signals import steps
 from jaxtank.signals.courses import index
 from jaxtank.signals.inflows import InflowPulses
@@ -21,8 +23,8 @@ def case_warnings(case: Case) -> list[str]:
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, changes
     that overlap, what no sample sees, levels and setpoints above a rim, pumps that start outside
-    their limits, models that differ from the plant, estimates of disturbances that the controller
-    does not use. (Steps that are too long: `loop.step_size`.)
+    their limits, levels that may fall below 0, models that differ from the plant, estimates of
+    disturbances that the controller does not use. (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -46,6 +48,7 @@ def case_warnings(case: Case) -> list[str]:
         *_unseen(case),
         *_above_rims(case),
         *_pumps(case),
+        *_open_bottoms(case),
         *model_warnings(case),
         *_unused(case),
     ]
@@ -154,14 +157,12 @@ def _holds_sample(start, end, clock):
 
 def _replaced(name, signal, clock):
     """On changes of a channel that another one follows before the next sample."""
+    if signal is None or float(signal.ramp) > 0.0:
+        return
     before = {}
-    for time, channel in () if signal is None else signal.changes:
+    for time, channel in signal.changes:
         last = before.get(channel)
-        if (
-            last is not None
-            and index(last, clock) == index(time, clock)
-            and float(signal.ramp) == 0.0
-        ):
+        if last is not None and index(last, clock) == index(time, clock):
             yield (
                 f"{name}: the change of {channel + 1} at {last:g} s is followed by another one at"
                 f" {time:g} s before the next sample, every {clock.dt:g} s: it has no effect"
@@ -209,6 +210,15 @@ def _pumps(case):
                 f"pump {j + 1} runs at {volts:g} {drive} before t = 0, outside its limits of"
                 f" {low:g} and {high:g} {drive}"
             )
+
+
+def _open_bottoms(case):
+    """On tanks without a bottom out of which liquid can be drawn."""
+    if isinstance(case.loop.plant, TankNetwork) and is_open(case.loop):
+        yield (
+            "plant.bottom = false, and liquid can be drawn out (an inflow or a pump below 0):"
+            " levels may fall below 0; true stops them there"
+        )
 
 
 def _unused(case):
