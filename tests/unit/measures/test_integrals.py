@@ -123,14 +123,16 @@ def test_a_kernel_has_the_same_integrals(chain, sums):
 
 
 def test_residuals_of_the_integral_are_those_of_its_samples(chain):
-    loop, clock, point = chain.loop, chain.clock, {"controller.Kc": chain.loop.controller.Kc}
+    loop, clock = chain.loop, chain.clock
+    point = {"reference.targets": loop.reference.targets}
     found = jaxtank.sensitivities(loop, clock, ["ise"], point, squares={"ise": 3.0})
 
-    def errors(gain):
-        return jaxtank.simulate(jaxtank.with_values(loop, {"controller.Kc": gain}), clock).e[:-1]
+    def errors(target):
+        return jaxtank.simulate(jaxtank.with_values(loop, {"reference.targets": target}), clock).e
 
-    e, slopes = errors(point["controller.Kc"]), jax.jacfwd(errors)(jnp.asarray([4.0]))[..., 0]
-    dt = clock.dt
+    e, slopes = errors(np.array([5.0])), jax.jacfwd(errors)(jnp.asarray([5.0]))[..., 0]
+    assert abs(slopes[-1, 0]) > 1e-3  # the last sample has a slope, and no part in the integral
+    e, slopes, dt = e[:-1], slopes[:-1], clock.dt
     np.testing.assert_allclose(found[1]["ise"][0, 0], 2.0 * dt * (e * slopes).sum(), rtol=1e-9)
     np.testing.assert_allclose(found[2][0, 0], 2.0 * 3.0 * dt * (slopes**2).sum(), rtol=1e-9)
 
