@@ -8,6 +8,7 @@ other modules of `loop` and the folders below.
 # pyright: reportUnknownMemberType=false
 
 import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -32,6 +33,7 @@ from jaxtank.loop.closed_loop import (
     takes_arrays,
 )
 from jaxtank.loop.derivatives import sensitivities_compiled
+from jaxtank.loop.floor import FloorWarning, floor_warnings
 from jaxtank.loop.functions import needed_by, values_of
 from jaxtank.loop.margins import run_with
 from jaxtank.loop.saved_rows import simulate_compiled
@@ -52,6 +54,9 @@ def simulate(
     loop: ClosedLoop, clock: Clock, key: jax.Array | None = None, save_every: int = 1
 ) -> Trajectory:
     """Run the loop and keep every `save_every`-th sample.
+
+    Warns (FloorWarning) where a level falls below an empty tank: liquid was drawn that was not
+    there.
 
     Parameters
     ----------
@@ -91,6 +96,9 @@ def simulate(
         )
     trajectory, broken = simulate_compiled(loop, clock, key, min(save_every, clock.samples))
     _report_broken(broken, loop, clock, key)
+    if not isinstance(trajectory.x, Tracer) and np.ndim(trajectory.x) == 2:
+        for line in floor_warnings(loop, trajectory):
+            warnings.warn(line, FloorWarning, stacklevel=2)
     return trajectory
 
 

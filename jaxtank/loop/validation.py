@@ -24,6 +24,7 @@ from jaxtank.instruments.base import Actuator
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import check_step
 from jaxtank.plants.base import Plant
+from jaxtank.plants.faults import Faults
 from jaxtank.plants.network import check_caught
 
 KEPT = 64
@@ -128,6 +129,9 @@ def _check_parts(
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, own in _plants(loop):
         check_caught(own, name)
+    faults = loop.faults if isinstance(loop.faults, Faults) else None
+    if faults and not _traced(faults, loop.plant) and (wrong := faults.problems(loop.plant, clock)):
+        raise InputError("; ".join(wrong))
     loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)

@@ -119,7 +119,8 @@ class TankNetwork(Plant):
 
     @property
     def tanks(self) -> int:
-        return np.shape(self.rim)[-1]
+        # a fault of a rim makes a tuple of traced numbers of it
+        return len(self.rim) if isinstance(self.rim, tuple) else np.shape(self.rim)[-1]
 
     @property
     def pumps(self) -> int:

@@ -95,6 +95,7 @@ from jaxtank.rig.values import (
     set_and_schedule,
     set_scenario,
     set_values,
+    with_bottom,
 )
 from jaxtank.rig.warnings import case_warnings, clock_warnings, model_warnings
 from jaxtank.rig.write import complete, dump, save, short
@@ -129,4 +130,5 @@ __all__ = [
     "toml",
     "uncovered",
     "unreachable",
+    "with_bottom",
 ]

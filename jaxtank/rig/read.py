@@ -17,7 +17,7 @@ from jaxtank.core.text import shortened
 from jaxtank.rig import components, network, signals, validation
 from jaxtank.rig.entry import Sizes, read_entry, read_value, sizes_of
 from jaxtank.rig.schema import SECTIONS, TANKWISE
-from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_models
+from jaxtank.rig.values import by_dotted_name, has, set_and_schedule, with_bottom, with_models
 
 MOST = 100
 """Parts of a dotted key; the names of a rig have four."""
@@ -195,6 +195,8 @@ def from_table(table: Mapping[str, Any]) -> Case:
     for name, read in TUNING.items():
         if name in table:
             case = case.replace(**{FIELDS.get(name, name): read(case, table[name])})
+    if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
+        case = with_bottom(case)
     return filtered(validation.check(case))
 
 
@@ -249,6 +251,31 @@ FIELDS = {"scenario": "scenarios", "safety_filter": "safety"}
 """{section: field of Case}, where it has another name."""
 
 
+def _check_twice(table):
+    """Raise InputError for numbers of tanks and pumps that their own tables and the section of what
+    they belong to, [disturbance], [sensor] or [actuator], give differently; all at once.
+    """
+    wrong = []
+    for name in ("tank", "pump"):
+        entries = table.get(name, [])
+        for key in SECTIONS[name].keys:
+            section, _, field = key.target.partition(".")
+            field = "inflow" if section == "disturbance" else field
+            if field not in table.get(section, {}):
+                continue
+            whole = table[section][field]
+            each = isinstance(whole, list) and len(whole) == len(entries)
+            for i, entry in enumerate(entries):
+                other = whole[i] if each else whole
+                if key.name in entry and entry[key.name] != other:
+                    wrong.append(
+                        f"{name} {i + 1}: {key.name} = {shortened(entry[key.name])}, and"
+                        f" [{section}] {field} has {shortened(other)} for it: give one of them"
+                    )
+    if wrong:
+        raise InputError("; ".join(wrong))
+
+
 def start_of(table):
     """Return the Case of the tables that build: case or tanks, controller, observer,
     instruments, reference, disturbance and faults; before any value is set.
@@ -258,6 +285,7 @@ def start_of(table):
         _with_parts(presets.find(table["case"]), table) if "case" in table else network.build(table)
     )
     loop, changed = case.loop, {}
+    _check_twice(table)
     for name in ("sensor", "actuator"):
         if name in table:
             changed[name] = components.instrument_of(name, table[name], loop)

@@ -18,6 +18,8 @@ from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index, walk, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.floor import draws
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import schedule
 from jaxtank.rig.entry import is_numeric, plain, static_value, unit
 
@@ -298,6 +300,34 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
         before, values = schedule.known(case.loop, values)
         case = schedule.from_table(set_values(case, before), table)
     return set_values(case, values)
+
+
+def with_bottom(case: Case) -> Case:
+    """Return the case with `plant.bottom` where liquid can be drawn out of its tanks, in its own
+    run or in a scenario: no level then falls below 0. Models of the plant follow.
+
+    Examples
+    --------
+    >>> from jaxtank import presets, rig
+    >>> case = rig.set_values(presets.find("gouta2015/ngpc"), {"actuator.low": -1.0})
+    >>> case.loop.plant.bottom, rig.with_bottom(case).loop.plant.bottom
+    (False, True)
+    """
+    plant: Any = case.loop.plant
+    if not isinstance(plant, TankNetwork) or plant.bottom or not _draws(case):
+        return case
+    return set_values(case, with_models(case.loop, {"plant.bottom": True}))
+
+
+def _draws(case):
+    """Whether liquid can be drawn out in the case's own run, or in a scenario."""
+    drawing = ("actuator.", "disturbance.")
+    for s in case.scenarios:
+        own = {name: value for name, value in s.values.items() if name.startswith(drawing)}
+        steady = any(_is_steady(name, value) for name, value in own.items())
+        if own and not steady and draws(set_scenario(case, own).loop):
+            return True
+    return draws(case.loop)
 
 
 def has(loop: ClosedLoop, name: str) -> bool:

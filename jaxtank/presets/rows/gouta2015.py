@@ -198,7 +198,7 @@ def _ise(run, near):
         moves = np.round(rates[:, output], 6)
         begins = moves[1:][np.diff(moves) != 0.0]
         closed.append(0.12 * tp**3 * float((begins**2).sum()))
-    found = (near.e**2).sum(axis=0) * case.clock.dt
+    found = (near.e[:-1] ** 2).sum(axis=0) * case.clock.dt
     apart = np.abs(found / closed - 1.0).max()
     return Claim(
         verdict(bool(apart < 0.01)),
