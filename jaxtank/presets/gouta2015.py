@@ -133,9 +133,7 @@ PUBLISHED = {
         reason="the plant is then 17 times too slow for them (notes S1)",
         ramp=rows.OWN,
     ),
-    "dead zone of 3 V": Published(
-        "'failure of the control test'", "", "Remark 4", ramp=rows.OWN
-    ),
+    "dead zone of 3 V": Published("'failure of the control test'", "", "Remark 4", ramp=rows.OWN),
     **rows.PUBLISHED,
     **robustness.PUBLISHED,
 }

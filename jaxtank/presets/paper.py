@@ -25,6 +25,8 @@ class Published(NamedTuple):
     reason : why the measured number differs, or why it cannot be measured
     fitted : the assumption of ours that was chosen to come near this number, which is then no
         evidence for the paper; "" for none
+    closed_form : the formula by which the printed number follows from other printed ones, so that
+        a measured one may equal it; "" for none, and a number that equals it is an input
     ramp : duration of the setpoint ramps of the runs it is measured in [s], where the paper prints
         none; None for a paper that does, and for what depends on no ramp
 
@@ -40,6 +42,7 @@ class Published(NamedTuple):
     tolerance: float | None = None
     reason: str = ""
     fitted: str = ""
+    closed_form: str = ""
     ramp: float | None = None
 
 

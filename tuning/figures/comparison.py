@@ -35,7 +35,8 @@ class Comparison(Shown):
     Attributes
     ----------
     pages : dict
-        {paper: {"citation", "notes", "headline", "ramps", "rows"}}, as `jaxtank compare PAPER --json` has them.
+        {paper: page}, as `jaxtank compare PAPER --json` has it: {"citation", "notes", "headline",
+        "ramps", "rows"}.
     notes : tuple of str
         Warnings of the runs.
     """

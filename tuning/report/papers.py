@@ -63,7 +63,8 @@ def verdict(published, measured):
     """Return (verdict, measured value or text, reason) of one published quantity.
 
     measured: number, tuple, Sample, Claim or None. The verdict is one of VERDICTS. A number that
-    equals the printed one is an input: no simulation agrees with a rounded number to 1e-9.
+    equals the printed one is an input, where no closed form is named: no simulation agrees with a
+    rounded number to 1e-9.
     """
     reason = published.reason
     if isinstance(measured, Claim):
@@ -77,17 +78,19 @@ def verdict(published, measured):
         return IMPOSSIBLE, None, reason
     seeds = len(measured.values) if isinstance(measured, Sample) else 0
     measured = measured.mean if isinstance(measured, Sample) else measured
-    if isinstance(published.value, str) or _same(published.value, measured):
+    same = isinstance(published.value, str) or _same(published.value, measured)
+    if same and not published.closed_form:
         return INPUT, measured, VERDICTS[INPUT]
     if published.tolerance is None:
         return DIFFERS, measured, reason
     printed, values = np.ravel(published.value).astype(float), np.ravel(measured).astype(float)
     if printed.shape != values.shape:
         return DIFFERS, measured, reason
-    apart = np.max(np.abs(values - printed) / np.abs(printed))
-    if not apart <= published.tolerance:
+    apart = np.abs(values - printed)
+    if not np.all(apart <= published.tolerance * np.abs(printed)):
         return DIFFERS, measured, reason
-    within = f"within {100 * published.tolerance:g} %: the largest difference is {100 * apart:.1f} %"
+    apart = max((a / abs(v) for a, v in zip(apart, printed) if v), default=0.0)
+    within = f"within {100 * published.tolerance:g} %: largest difference {100 * apart:.1f} %"
     if seeds:
         within += f" (mean of {seeds} seeds of the noise)"
     if published.fitted:
@@ -96,7 +99,8 @@ def verdict(published, measured):
 
 
 def measure(paper):
-    """Return the comparison of a paper: {"paper", "citation", "notes", "headline", "ramps", "rows"}.
+    """Return the comparison of a paper: {"paper", "citation", "notes", "headline", "ramps",
+    "rows"}.
 
     The keys of a row: quantity, kind ("number" or "claim"), unit, where, published, measured,
     deviation (of one run, where several were made with noise), verdict, reason, ramp_s (duration

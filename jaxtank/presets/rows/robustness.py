@@ -294,11 +294,11 @@ def _plateaus(pairs):
     ]
     return {
         "uncertain plants: steady error": Claim(
-            [low <= 0.01 for _, low, _ in sum(rest, [])],
+            [low <= 0.01 for pair in rest for _, low, _ in pair],
             f"largest error at the ends of plateaus, {_each_spread(map(_both, rest))}",
         ),
         "uncertain plants: error of h2 while r1 goes to 16 cm": Claim(
-            above_zero(sum(second, [])),
+            above_zero([t for pair in second for t in pair]),
             f"rise of the error, {_each_spread(map(_both, second))}",
         ),
     }
