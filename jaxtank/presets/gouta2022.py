@@ -119,7 +119,7 @@ PUBLISHED = {
         (25.0, 41.0), "s", "Table 3", 0.2, "pump of the ideal rig is stronger (notes S8)"
     ),
     "settling time of ENMPC, paper-like rig": Published(
-        (25.0, 41.0), "s", "Table 3", 0.2, fitted=_FITTED
+        (25.0, 41.0), "s", "Table 3", 0.2, _BAND, fitted=_FITTED
     ),
     "recovery time of ENMPC": Published(
         (8.0, 6.0), "s", "Table 3", 0.2, "no delay in the ideal rig (notes S8)"

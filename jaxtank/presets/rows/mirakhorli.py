@@ -220,7 +220,11 @@ TUNED = {
         "controller.b": [0.496406, 0.678736],
         "controller.w": [2.00124, 1.31036],
     },
-    "lqi": {},
+    "lqi": {
+        "controller.Q[4]": 0.00162565,
+        "controller.Q[5]": 0.00171357,
+        "controller.R": [4.15314, 2.67737],
+    },
 }
 
 
