@@ -3,6 +3,8 @@
 Imported by the preset of mirakhorli.
 """
 
+import dataclasses
+
 import jax
 import numpy as np
 
@@ -11,14 +13,7 @@ from jaxtank.analysis.linear_model import linearise, transmission_zeros
 from jaxtank.analysis.riccati import lqr
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.loop.run import evaluate
-from jaxtank.presets.loops.mirakhorli import (
-    CONTROLLERS,
-    GAIN,
-    SETPOINT,
-    SPLIT,
-    UNROUNDED_SPLIT,
-    plant,
-)
+from jaxtank.presets.loops.mirakhorli import CONTROLLERS, SETPOINT, UNROUNDED_SPLIT
 from jaxtank.presets.paper import Claim, Published
 
 _MISSING = (
@@ -192,7 +187,7 @@ def measured(run, assumed):
             left < 0.01, f"{left:.1e} cm after 400 s (counts if below 0.01 cm)"
         ),
         "hybrid against SMC and SFC": _once_tuned(run),
-        **_linear(),
+        **_linear(run("sfc")[0].loop),
     }
 
 
@@ -283,19 +278,18 @@ def _near(value, printed):
     return abs(value / printed - 1.0) <= 0.1
 
 
-def _linear():
+def _linear(loop):
     """What follows from the linear model at the setpoint."""
 
-    def model(split):
-        tanks = plant(split)
+    def model(tanks):
         return tuple(np.asarray(part) for part in linearise(tanks, *equilibrium(tanks, SETPOINT)))
 
-    A, B, C = model(SPLIT)
-    K = np.asarray(GAIN)
+    A, B, C = model(loop.plant)
+    K = np.asarray(loop.controller.K)
     direct = np.abs(C @ B).max(axis=1) > 0.0
     zeros = np.sort(np.real(np.asarray(transmission_zeros(A, B, C))))
     wrong, right = (float(np.linalg.eigvals(A + s * B @ K).real.max()) for s in (1.0, -1.0))
-    A_fit, B_fit, _ = model(UNROUNDED_SPLIT)
+    A_fit, B_fit, _ = model(dataclasses.replace(loop.plant, split=np.asarray(UNROUNDED_SPLIT)))
     optimal = np.asarray(lqr(A_fit, B_fit, C.T @ C, 3.0 * np.eye(2)))
     near = float(np.abs(optimal - K).max())
     return {

@@ -1,0 +1,191 @@
+"""The rows of `jaxtank compare`: a verdict follows from what was measured, and could be another."""
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxtank import presets
+from jaxtank.core.errors import InputError
+from jaxtank.core.tree import parameters, with_values
+from jaxtank.presets.paper import Claim, Published, Sample
+from jaxtank.presets.rows import robustness
+from tuning.report import papers
+
+FOLDER = Path(presets.__file__).parent
+WORDS = ("reproduced", "partly", "not reproduced", *papers.VERDICTS)
+
+
+def constant(node):
+    """Whether an expression is the same whatever was measured."""
+    return all(
+        isinstance(part, (ast.Constant, ast.Tuple, ast.List, ast.Load, ast.UnaryOp, ast.Not))
+        for part in ast.walk(node)
+    )
+
+
+def literal_verdicts(text):
+    """Lines of a module that state a verdict instead of measuring it."""
+    tree = ast.parse(text)
+    words = [n for n in ast.walk(tree) if isinstance(n, ast.Constant) and n.value in WORDS]
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and n.args]
+    claims = [n for n in calls if isinstance(n.func, ast.Name) and n.func.id == "Claim"]
+    return sorted({n.lineno for n in words} | {n.lineno for n in claims if constant(n.args[0])})
+
+
+@pytest.mark.parametrize(
+    "path", sorted(FOLDER.rglob("*.py")), ids=lambda path: str(path.relative_to(FOLDER))
+)
+def test_no_row_states_its_verdict(path):
+    if path.name != "paper.py":
+        assert literal_verdicts(path.read_text()) == []
+
+
+def test_a_stated_verdict_is_found():
+    assert literal_verdicts('a = Claim("not reproduced", "x")') == [1]
+    assert literal_verdicts("a = 1\nb = Claim((True, not False), f'{a} s')") == [2]
+    assert literal_verdicts("a = Claim(x < 1.0, f'{x} s')") == []
+    for stated in ("reproduced", None, 1.0, ()):
+        with pytest.raises(TypeError, match="holds or not"):
+            Claim(stated, "0 s")
+
+
+def test_a_number_that_equals_the_printed_one_is_an_input():
+    """Sums of inputs agree to rounding; no measurement agrees with a rounded number to 1e-9."""
+    printed = Published(0.76, "-", "sec. 3", 0.005)
+    assert papers.verdict(printed, 0.42 + 0.34)[0] == "input"
+    assert papers.verdict(printed, 0.7601)[0] == "reproduced"
+    chosen = printed._replace(fitted="chosen for it")
+    assert papers.verdict(chosen, 0.42 + 0.34)[0] == "input"
+    exact = Published(1.4, "-", "sec. III", 0.01, closed_form="0.7 x 0.6 / 0.3")
+    assert papers.verdict(exact, 1.4)[0] == "reproduced"
+
+
+def test_several_seeds_give_a_mean_and_a_deviation():
+    sample = Sample([(1.0, 10.0), (3.0, 10.0), (5.0, 10.0)])
+    assert sample.mean == (3.0, 10.0) and sample.deviation == (2.0, 0.0)
+    printed = Published((3.1, 10.5), "s", "Table 3", 0.1, fitted="chosen for it")
+    word, value, reason = papers.verdict(printed, sample)
+    assert word == "fitted" and value == (3.0, 10.0)
+    assert "largest difference 4.8 %" in reason and "3 seeds" in reason
+
+
+# ------------------------------------------------------------------- every claim can be refuted
+
+
+def scaled(case, trajectory, scale):
+    """A run whose arrays, but for time and setpoints, are scaled."""
+    names = ("x", "e", "u", "applied", "command", "d_hat")
+    return case, dataclasses.replace(
+        trajectory, **{name: scale * getattr(trajectory, name) for name in names}
+    )
+
+
+def noise(case, trajectory):
+    """A run of random numbers."""
+    rng = np.random.default_rng(3)
+    names = ("x", "e", "u", "applied", "command", "d_hat")
+    return case, dataclasses.replace(
+        trajectory, **{n: rng.normal(0.0, 20.0, getattr(trajectory, n).shape) for n in names}
+    )
+
+
+def other_rig(case, trajectory):
+    """The same run, said to be of a rig and a controller with other numbers."""
+    rng = np.random.default_rng(7)
+    changed = {
+        name: np.asarray(value) * rng.uniform(0.4, 2.5, np.shape(value))
+        for name, value in parameters(case.loop).items()
+        if name in ("plant.drain", "plant.orifice", "plant.pipe", "plant.pump_gain")
+        or name in ("controller.K", "controller.k1", "controller.Tp", "controller.surface")
+    }
+    splits = {"plant.split": 1.0 - np.asarray(case.loop.plant.split)}
+    changed |= splits if np.any(np.asarray(case.loop.plant.split) < 1.0) else {}
+    return dataclasses.replace(case, loop=with_values(case.loop, changed)), trajectory
+
+
+def exchanged(run, pairs):
+    """`run` with the cases of each pair exchanged, where the other one takes the values."""
+    partner = dict(pairs) | {b: a for a, b in pairs}
+
+    def other(name, values=None, save_every=1, seed=0):
+        try:
+            return run(partner.get(name, name), values, save_every, seed)
+        except InputError:
+            return run(name, values, save_every, seed)
+
+    return other
+
+
+PAIRS = {
+    "gouta2015": [("ngpc", "backstepping")],
+    "gouta2022": [("enmpc", "chadpc"), ("pi", "fopi-ff")],
+    "mirakhorli": [("sfc", "hybrid"), ("smc-printed", "lqi"), ("sfc-fitted", "hybrid-fitted")],
+    "khalid": [("gpc-nc2", "gpc-nc30"), ("gpc", "laguerre"), ("gpc-mimo", "laguerre-mimo")],
+    "calofir": [("backstepping", "backstepping-perturbed")],
+}
+
+
+def other_runs(run, paper):
+    """Runs that differ from those of `run` in one way each: a function of the same arguments."""
+    through = lambda change: lambda *args: change(*run(*args))
+    by_name = lambda less, more: (
+        lambda name, *args: scaled(*run(name, *args), less if sum(map(ord, name)) % 2 else more)
+    )
+    yield exchanged(run, PAIRS.get(paper, []))
+    yield through(noise)
+    yield through(lambda case, t: scaled(case, t, 0.0))
+    yield through(lambda case, t: scaled(case, t, 1e3))
+    yield by_name(0.1, 10.0)
+    yield by_name(10.0, 0.1)
+    yield through(other_rig)
+
+
+def uncertain_plants(run, seed=None):
+    """Made-up results of robustness.everything: the study itself has tests of its own."""
+    rng = np.random.default_rng(seed)
+    found, nominal = {}, {"ngpc": 0.1, "backstepping": 0.4}
+    for key in [(c, s) for c in robustness.CONTROLLERS for s in robustness.SPREADS]:
+        size = rng.uniform(0.0, 100.0 if seed else 1.0, robustness.N)
+        each = {n: size[:, None] * [1.0, 1.0] for n in robustness.MEASURES}
+        each |= {"rms_error_total": size, "max_level": size[:, None] * np.ones(4)}
+        errors = np.zeros((robustness.N, 2401, 2)) + size[:, None, None]
+        failed = np.full(robustness.N, seed is not None and seed % 2 == 0)
+        found[key] = robustness.Found(each, errors, failed)
+    return found, nominal
+
+
+FAST = ("calofir", "cascaded", "dts200", "johansson")
+
+
+@pytest.mark.parametrize(
+    "paper", [pytest.param(p, marks=() if p in FAST else pytest.mark.slow) for p in presets.PAPERS]
+)
+def test_a_claim_that_no_run_refutes_is_no_measurement(paper, monkeypatch):
+    """Whatever is measured changes with the runs, and so can each verdict."""
+    jax.config.update("jax_enable_x64", True)
+    preset, run = presets.load(paper), papers.runner(paper)
+    monkeypatch.setattr(robustness, "everything", uncertain_plants)
+    first = preset.measured(run)
+    words = {name: {v.verdict} for name, v in first.items() if isinstance(v, Claim)}
+    moved = set()
+    for number, other in enumerate(other_runs(run, paper)):
+        monkeypatch.setattr(robustness, "everything", lambda r, n=number: uncertain_plants(r, n))
+        with np.errstate(all="ignore"):
+            measured = preset.measured(other)
+        for name, value in measured.items():
+            if isinstance(value, Claim):
+                words[name].add(value.verdict)
+            elif repr(value) != repr(first[name]):
+                moved.add(name)
+    rows = {name: papers.verdict(preset.published[name], value)[0] for name, value in first.items()}
+    assert {name for name, seen in words.items() if len(seen) < 2} == set()
+    numbers = {n for n, word in rows.items() if n not in words and word != "input"}
+    assert numbers - moved - QUOTED == set()
+
+
+# numbers of a case of ours that are not the printed ones, and a count that no number changes
+QUOTED = {"pulses of H2, one pump", "pulses of H1 and H2, two pumps", "relative degree"}
