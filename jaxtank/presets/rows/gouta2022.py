@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxtank.core.tree import get_value
 from jaxtank.observers import Direct
-from jaxtank.presets.operations import sample_operations
 from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.rows.operations import sample_operations
 
 _SIMULATED = "sec. 5.2, Fig. 6"
 PUBLISHED = {

@@ -9,8 +9,8 @@ import numpy as np
 
 from jaxtank.analysis import qp
 from jaxtank.presets.loops.khalid import CLOCK, scenario
-from jaxtank.presets.operations import operations
 from jaxtank.presets.paper import Claim, Published
+from jaxtank.presets.rows.operations import operations
 
 _OURS = "at 0 m gravity alone decides: the cases run between levels that a pump can hold (notes S3)"
 _WHERE = "sec. V.A, Figs. 2-5"
