@@ -1384,4 +1384,4 @@ def test_the_verdict_on_zero_error_follows_the_numbers():
 
 
 def _hash(value):
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(map(_hash, value)) if isinstance(value, list) else value

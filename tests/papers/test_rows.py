@@ -80,35 +80,39 @@ def test_several_seeds_give_a_mean_and_a_deviation():
 # ------------------------------------------------------------------- every claim can be refuted
 
 
-def scaled(case, trajectory, scale):
-    """A run whose arrays, but for time and setpoints, are scaled."""
+def changed(case, trajectory, change):
+    """A run whose arrays, but for time and setpoints, are changed."""
     names = ("x", "e", "u", "applied", "command", "d_hat")
-    return case, dataclasses.replace(
-        trajectory, **{name: scale * getattr(trajectory, name) for name in names}
-    )
+    arrays = {name: change(np.asarray(getattr(trajectory, name))) for name in names}
+    return case, dataclasses.replace(trajectory, **arrays)
 
 
-def noise(case, trajectory):
-    """A run of random numbers."""
-    rng = np.random.default_rng(3)
-    names = ("x", "e", "u", "applied", "command", "d_hat")
-    return case, dataclasses.replace(
-        trajectory, **{n: rng.normal(0.0, 20.0, getattr(trajectory, n).shape) for n in names}
-    )
+def noise(array):
+    return np.random.default_rng(3).normal(0.0, 20.0, array.shape)
+
+
+def at_rest(array):
+    return np.repeat(array[-1:], len(array), axis=0)
+
+
+def fading(array):
+    return array * np.linspace(1.0, 0.0, len(array))[:, None]
 
 
 def other_rig(case, trajectory):
     """The same run, said to be of a rig and a controller with other numbers."""
     rng = np.random.default_rng(7)
-    changed = {
+    numbers = {
         name: np.asarray(value) * rng.uniform(0.4, 2.5, np.shape(value))
         for name, value in parameters(case.loop).items()
         if name in ("plant.drain", "plant.orifice", "plant.pipe", "plant.pump_gain")
         or name in ("controller.K", "controller.k1", "controller.Tp", "controller.surface")
     }
+    if "controller.K" in numbers:
+        numbers["controller.K"] *= -1.0
     splits = {"plant.split": 1.0 - np.asarray(case.loop.plant.split)}
-    changed |= splits if np.any(np.asarray(case.loop.plant.split) < 1.0) else {}
-    loop = with_values(case.loop, changed)
+    numbers |= splits if np.any(np.asarray(case.loop.plant.split) < 1.0) else {}
+    loop = with_values(case.loop, numbers)
     if hasattr(loop.controller, "N"):  # Laguerre functions, more than increments of GPC
         loop = dataclasses.replace(loop, controller=dataclasses.replace(loop.controller, N=30))
     return dataclasses.replace(case, loop=loop), trajectory
@@ -139,17 +143,21 @@ PAIRS = {
 
 def other_runs(run, paper):
     """Runs that differ from those of `run` in one way each: a function of the same arguments."""
-    through = lambda change: lambda *args: change(*run(*args))
-    by_name = lambda less, more: (
-        lambda name, *args: scaled(*run(name, *args), less if sum(map(ord, name)) % 2 else more)
-    )
-    yield exchanged(run, PAIRS.get(paper, []))
-    yield through(noise)
-    yield through(lambda case, t: scaled(case, t, 0.0))
-    yield through(lambda case, t: scaled(case, t, 1e3))
-    yield by_name(0.1, 10.0)
-    yield by_name(10.0, 0.1)
-    yield through(other_rig)
+    through = lambda change: lambda *args: changed(*run(*args), change)
+    pairs = PAIRS.get(paper, [])
+    seconds = {name for _, name in pairs}
+
+    def of_seconds(change, sense=True):
+        one = lambda name: change if (name in seconds) is sense else lambda a: a
+        return lambda name, *args: changed(*run(name, *args), one(name))
+
+    yield exchanged(run, pairs)
+    yield from map(through, (noise, fading, lambda a: a[::-1]))
+    yield from (through(lambda a, scale=scale: a * scale) for scale in (1e-9, 1e3))
+    yield from (through(lambda a, shift=shift: a + shift) for shift in (-5.0, 5.0))
+    yield from (of_seconds(lambda a, scale=scale: a * scale) for scale in (1e-3, 0.1, 10.0, 1e3))
+    yield from (of_seconds(at_rest, sense) for sense in (True, False))
+    yield lambda *args: other_rig(*run(*args))
 
 
 def uncertain_plants(run, seed=None):
@@ -166,6 +174,11 @@ def uncertain_plants(run, seed=None):
     return found, nominal
 
 
+def parts(claim):
+    """Which parts of a claim hold."""
+    return tuple(np.ravel(claim.holds).tolist())
+
+
 FAST = ("calofir", "cascaded", "dts200", "johansson")
 
 
@@ -173,12 +186,12 @@ FAST = ("calofir", "cascaded", "dts200", "johansson")
     "paper", [pytest.param(p, marks=() if p in FAST else pytest.mark.slow) for p in presets.PAPERS]
 )
 def test_a_claim_that_no_run_refutes_is_no_measurement(paper, monkeypatch):
-    """Whatever is measured changes with the runs, and so can each verdict."""
+    """Whatever is measured changes with the runs, and so does what holds of each claim."""
     jax.config.update("jax_enable_x64", True)
     preset, run = presets.load(paper), papers.runner(paper)
     monkeypatch.setattr(robustness, "everything", uncertain_plants)
     first = preset.measured(run)
-    words = {name: {v.verdict} for name, v in first.items() if isinstance(v, Claim)}
+    words = {name: {parts(v)} for name, v in first.items() if isinstance(v, Claim)}
     moved = set()
     for number, other in enumerate(other_runs(run, paper)):
         monkeypatch.setattr(robustness, "everything", lambda r, n=number: uncertain_plants(r, n))
@@ -187,12 +200,14 @@ def test_a_claim_that_no_run_refutes_is_no_measurement(paper, monkeypatch):
             measured = preset.measured(other)
         for name, value in measured.items():
             if isinstance(value, Claim):
-                words[name].add(value.verdict)
+                words.setdefault(name, set()).add(parts(value))
             elif repr(value) != repr(first[name]):
                 moved.add(name)
     rows = {name: papers.verdict(preset.published[name], value)[0] for name, value in first.items()}
-    assert {name for name, seen in words.items() if len(seen) < 2} - COUNTED == set()
-    numbers = {n for n, word in rows.items() if n not in words and word != "input"}
+    stuck = {name for name in words if name in rows and len(words[name]) < 2}
+    stuck = {name for name in stuck if not name.startswith("uncertain plants")}  # made up here
+    assert {name for name in stuck if isinstance(first[name], Claim)} - COUNTED == set()
+    numbers = {n for n, word in rows.items() if not isinstance(first[n], Claim) and word != "input"}
     assert numbers - moved - QUOTED == set()
 
 
