@@ -80,9 +80,11 @@ def test_several_seeds_give_a_mean_and_a_deviation():
 # ------------------------------------------------------------------- every claim can be refuted
 
 
-def changed(case, trajectory, change):
-    """A run whose arrays, but for time and setpoints, are changed."""
-    names = ("x", "e", "u", "applied", "command", "d_hat")
+ARRAYS = ("x", "e", "u", "applied", "command", "d_hat")  # all but time and setpoints
+
+
+def changed(case, trajectory, change, names=ARRAYS):
+    """A run whose arrays are changed."""
     arrays = {name: change(np.asarray(getattr(trajectory, name))) for name in names}
     return case, dataclasses.replace(trajectory, **arrays)
 
@@ -157,6 +159,11 @@ def other_runs(run, paper):
     yield from (through(lambda a, shift=shift: a + shift) for shift in (-5.0, 5.0))
     yield from (of_seconds(lambda a, scale=scale: a * scale) for scale in (1e-3, 0.1, 10.0, 1e3))
     yield from (of_seconds(at_rest, sense) for sense in (True, False))
+    yield lambda *args: changed(*run(*args), fading, ("d_hat",))
+    wide = lambda values: 0.5 if values and "actuator.high" in values else 1.0
+    yield lambda name, values=None, *args: changed(
+        *run(name, values, *args), lambda a: a * wide(values)
+    )
     yield lambda *args: other_rig(*run(*args))
 
 
