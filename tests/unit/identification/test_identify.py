@@ -1405,9 +1405,7 @@ def cascaded():
 @pytest.mark.slow
 @recorded
 def test_the_cascaded_tanks(cascaded):
-    """Residual at most 0.26 V on all 1024 samples; published errors on the other record are 0.18 to
-    0.45 V.
-    """
+    """Residual at most 0.26 V on all 1024 samples (0.45 V is published for the other record)."""
     assert cascaded.status == "converged" and cascaded.quality["rmse"][0] <= 0.26
     assert cascaded.validation["samples"] == [700]
     assert (
