@@ -90,6 +90,7 @@ def design_for(
         draw=draw,
         drawn=drawn,
         predict=predict,
+        faults=loop.faults,
     )
 
 
